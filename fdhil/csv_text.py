@@ -16,18 +16,33 @@ LINE_ENDS = "\n\r\v\f\x1c\x1d\x1e\x85\u2028\u2029"  # of str.splitlines
 
 def read_csv_text(path: Path) -> str:
     """Return a file's text; RecordingError when it cannot be read, is no text, or is larger than a recording may be."""
+    return text_of(read_content(path), str(path))
+
+
+def read_content(path: Path) -> bytes:
+    """Return a file's bytes; RecordingError when it cannot be read or is larger than a recording may be."""
     try:
         with path.open("rb") as file:
             raw = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise RecordingError(f"{path} cannot be read ({error.strerror}): check the path") from None
-    if len(raw) > MAX_BYTES or any(raw.count(end.encode()) > MAX_ROWS for end in LINE_ENDS):
-        text = f"{path} is larger than {MAX_BYTES >> 20} MiB or {MAX_ROWS} rows: cut it into parts"
-        raise RecordingError(text)
+    if len(raw) > MAX_BYTES:
+        raise _too_large(str(path))
+    return raw
+
+
+def text_of(raw: bytes, source: str, encoding: str = "utf-8-sig") -> str:
+    """Return the text of a file's bytes; RecordingError when it is none, or has more rows than a recording may have."""
+    if any(raw.count(end.encode()) > MAX_ROWS for end in LINE_ENDS):
+        raise _too_large(source)
     try:
-        return raw.decode("utf-8-sig")
+        return raw.decode(encoding)
     except UnicodeDecodeError:
-        raise RecordingError(f"{path} is no text file: export it as CSV in UTF-8") from None
+        raise RecordingError(f"{source} is no text file: export it as CSV in UTF-8") from None
+
+
+def _too_large(source: str) -> RecordingError:
+    return RecordingError(f"{source} is larger than {MAX_BYTES >> 20} MiB or {MAX_ROWS} rows: cut it into parts")
 
 
 def check_lengths(lines: Sequence[str], first: int, source: str) -> None:

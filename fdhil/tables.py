@@ -1,4 +1,4 @@
-"""The literal registries: name -> "module:factory" (a drive profile: "package:file"). Being listed is being tested.
+"""The literal registries: name -> "module:factory" (a profile: "package:file"). Being listed is being tested.
 
 Nothing registers itself. Config checks names against these tables without importing the rooms behind them.
 """
@@ -34,11 +34,29 @@ VOLTAGE_SOURCES: Mapping[str, str] = {
 }
 NC_SOURCES: Mapping[str, str] = {
     "linuxcnc": "fdhil.drivers.nc.linuxcnc:LinuxCnc",
+    "modbus_coil": "fdhil.drivers.nc.modbus_coil:ModbusCoil",
+    "mtconnect": "fdhil.drivers.nc.mtconnect:MtConnect",
+    "opcua": "fdhil.drivers.nc.opcua:OpcUa",
+}
+NC_PROFILES: Mapping[str, str] = {
+    "mtconnect": "fdhil.drivers.nc.profiles:mtconnect.toml",
+    "opc40502": "fdhil.drivers.nc.profiles:opc40502.toml",
+    "siemens": "fdhil.drivers.nc.profiles:siemens.toml",
+    "heidenhain": "fdhil.drivers.nc.profiles:heidenhain.toml",
+    "beckhoff": "fdhil.drivers.nc.profiles:beckhoff.toml",
 }
 EVENT_SOURCES: Mapping[str, str] = {
     "inferred": "fdhil.drivers.moves.inferred:InferredG0",
     "digital_input": "fdhil.drivers.moves.digital_input:DigitalInputG0",
     **dict.fromkeys(NC_SOURCES, "fdhil.drivers.moves.told:ToldG0"),
+}
+# file formats of recordings: modules that encode and decode
+RECORDING_FORMATS: Mapping[str, str] = {
+    "csv": "fdhil.store.recording_csv",
+    "parquet": "fdhil.store.recording_parquet",
+    "mat": "fdhil.store.recording_mat",
+    "mdf4": "fdhil.store.recording_mdf4",
+    "hdf5": "fdhil.store.recording_hdf5",
 }
 DRIVE_PROFILES: Mapping[str, str] = {
     "fdhil_twin": "fdhil.drivers.cia402.profiles:fdhil_twin.toml",
@@ -57,6 +75,6 @@ DRIVE_PROFILES: Mapping[str, str] = {
 
 
 def load(table: Mapping[str, str], name: str) -> Any:
-    """Import and return the factory that ``table`` lists under ``name``; KeyError when it lists none."""
+    """Import and return the factory or module that ``table`` lists under ``name``; KeyError when it lists none."""
     module, _, attribute = table[name].partition(":")
-    return getattr(import_module(module), attribute)
+    return getattr(import_module(module), attribute) if attribute else import_module(module)

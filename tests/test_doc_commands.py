@@ -18,6 +18,7 @@ from fdhil.cli.guard import guard
 from fdhil.cli.main import cli
 from fdhil.daemon.kernel_warmup import nominal_rapid
 from fdhil.daemon.outcome_store import OutcomeStore
+from fdhil.store.column_map import ColumnMap
 from fdhil.store.windows import encode_window
 from studies import bench
 from tests.bench import bench_document
@@ -178,7 +179,10 @@ def merged(document: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 def test_every_piece_of_a_configuration_can_be_put_into_one(page: Path) -> None:
     for text in blocks(page, "toml"):
         piece = tomllib.loads(text)
-        if not {"fault", "tpdos", "base"} & set(piece):  # the simulated machine's own script, a drive's profile
+        if "columns" in piece:
+            ColumnMap.model_validate(piece)
+        # not the simulated machine's own script, nor a drive's profile
+        elif not {"fault", "tpdos", "base"} & set(piece):
             assert config.parse(merged(bench_document(), piece)).axis
     for text in blocks(page, "python"):
         compile(text, str(page), "exec")

@@ -20,7 +20,8 @@ from fdhil.pipeline import analyse, pool
 from fdhil.pipeline.own_loops import explained
 from fdhil.records import Estimate, LoopEstimate, Reason, Recording, Verdict, Window, WindowOutcome
 from fdhil.store.accelerometer_csv import with_accelerometer
-from fdhil.store.recording_csv import SOURCES, read_recording
+from fdhil.store.recording_table import SOURCES
+from fdhil.store.recordings import read_recording
 
 MANY_FILES = 16  # from here on further processes pay for their start
 MANY_WINDOWS = 48
@@ -54,6 +55,7 @@ def analyse_files(
     machine: MachineConfig | None = None,
     progress: Progress = unseen,
     accelerometer: Path | None = None,
+    columns: Path | None = None,
 ) -> Iterator[FileResult]:
     """Yield the result of each recording in order, also of those that cannot be read.
 
@@ -63,10 +65,10 @@ def analyse_files(
     """
     if len(paths) < MANY_FILES or _cores() < 2:
         for path in paths:
-            yield analyse_file(path, settings, machine, progress, accelerometer)
+            yield analyse_file(path, settings, machine, progress, accelerometer, columns)
         return
     forewarn("identify")
-    work = partial(analyse_file, settings=settings, machine=machine)
+    work = partial(analyse_file, settings=settings, machine=machine, columns=columns)
     with _processes() as executor:
         for result in executor.map(work, paths, chunksize=CHUNK):
             progress(1.0)
@@ -79,10 +81,11 @@ def analyse_file(
     machine: MachineConfig | None = None,
     progress: Progress = unseen,
     accelerometer: Path | None = None,
+    columns: Path | None = None,
 ) -> FileResult:
     """Return the windows of one recording analysed, and their pool, or why it cannot be read."""
     try:
-        recording = read_recording(path)
+        recording = read_recording(path, columns)
         if accelerometer is not None:
             recording = with_accelerometer(recording, accelerometer)
     except FdhilError as error:

@@ -1,12 +1,10 @@
-"""``fdhil scan``, ``check`` and ``commission``: list a bus, compare it with the config, and set its drives up."""
+"""``fdhil scan`` and ``check``: list a bus, and compare it with the config. Nothing moves."""
 
 from __future__ import annotations
 
 import json
-import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import config as machine_config
-from fdhil.errors import ConfigError, ConfigFault, DeviceError, DriveFault
+from fdhil.errors import DeviceError
 from fdhil.guard.protocol import SOCKET_NAME
 
 if TYPE_CHECKING:
@@ -29,25 +27,6 @@ STATES: Mapping[bool | None, tuple[str, str]] = {
     True: ("ok", "green"),
     False: ("differs", "red"),
     None: ("not compared", "yellow"),
-}
-STEPS: Mapping[str, str] = {
-    "listen": "Listening: the NC must be off. A bus on which nothing is heard is asked whether the drive is there; "
-    "nothing else is sent.",
-    "compare": "Reading identity, PDO mapping, scale, option codes and following-error window, and comparing them with "
-    "the config. Nothing moves.",
-    "enable": "Starting SYNC and switching the drive on, held where it stands.",
-    "sign test": "Moving the axis by +10 um with the offset 0x60B0: it must be held, added to the demand, and the "
-    "position must follow, in this direction and by this much.",
-    "feed-forward test": "Ramping the offset to and fro: does its slope reach the speed feed-forward? The correction "
-    "depends on the answer.",
-    "watchdog test": "Sending our heartbeat, then keeping it back: the drive must stop by itself, as it must when "
-    "fdhil dies.",
-    "restore": "Taking the offset to zero, switching the drive off and giving back what was changed.",
-}
-FEEDFORWARD: Mapping[bool | None, str] = {
-    True: "the speed feed-forward sees the offset",
-    False: "the speed feed-forward does not see the offset",
-    None: "whether the speed feed-forward sees the offset could not be told, and arming will be refused",
 }
 
 
@@ -244,133 +223,3 @@ def _open_points(found: Sequence[Place]) -> dict[tuple[str, str, str], list[str]
         if finding.ok is None:
             points.setdefault((place, finding.cause, finding.advice), []).append(finding.point)
     return points
-
-
-@click.command()
-@CONFIG
-@click.option("--axis", "only", help="Commission this axis; left out: all, one after the other.")
-@click.option(
-    "--set-pdos", is_flag=True, help="Write the PDOs of the drives' profiles, save them in the drives; no more."
-)
-@click.option("--yes", is_flag=True, help="Do not ask before an axis moves, or PDOs are written.")
-@AS_JSON
-def commission(config: Path, only: str | None, set_pdos: bool, yes: bool, as_json: bool) -> int:
-    """Commission the drives of CONFIG, step by step: what arming a correction asks for.
-
-    The NC must be off, the axis free to move a tenth of a millimetre, and the machine's own safety functions effective.
-    Reads and compares the drive's set-up, asks, switches the drive on, moves the axis by 10 um, finds out where the
-    offset acts, proves the drive's watchdog, and writes the signed record into the store. Whatever fails, also Ctrl-C,
-    the offset goes back to zero and the drive is switched off. With --set-pdos nothing moves: what differs from the
-    profile in the drive's PDOs is written and saved, and that is all. Exit codes: 0 commissioned, 1 refused, by you or
-    because the drive is not set up as it must be, 2 wrong option or configuration, 3 the drive or the bus cannot be
-    reached.
-    """
-    machine = machine_config.load(config)
-    axes = [only] if only else list(machine.axis)
-    if axes[0] not in machine.axis:
-        fault = ConfigFault("--axis", f"there is no axis {only}", f"one of {', '.join(machine.axis)}")
-        raise ConfigError(str(config), [fault])
-    done: dict[str, Any] = {}
-    refused = None
-    with _stopped_like_ctrl_c():
-        for axis in axes:
-            try:
-                step = _set_pdos if set_pdos else _commission_axis
-                done[axis] = step(machine, axis, yes, as_json)
-            except DriveFault as fault_found:
-                refused = str(fault_found)
-                break
-    if as_json:
-        click.echo(json.dumps({"schema": "fdhil-commission-1", "axes": done, "refused": refused}))
-    if refused is not None:
-        click.echo(f"refused: {refused}", err=True)
-    return int(refused is not None)
-
-
-@contextmanager
-def _stopped_like_ctrl_c() -> Iterator[None]:
-    """A terminal that closes, or a kill, must leave the drive as Ctrl-C does: offset zero, switched off."""
-    before = {number: signal.signal(number, signal.default_int_handler) for number in (signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _commission_axis(machine: MachineConfig, axis: str, yes: bool, quiet: bool) -> dict[str, Any]:
-    """Run all steps for one axis and save its record; DriveFault when it is refused."""
-    from fdhil.cli.bus_lock import lock_bus
-    from fdhil.commissioning import steps
-    from fdhil.commissioning.record import save_record
-
-    with lock_bus(machine.bus[machine.axis[axis].drive.bus]):  # the guard reads the record when it starts
-        record = steps.commission(machine, axis, _guide(machine, axis, yes, quiet))
-    path = save_record(record, machine.store.directory, machine.store.commissioning_key)
-    if not quiet:
-        click.echo(
-            f"axis {axis} is commissioned: moved {record.sign_test_um:+.1f} um, "
-            f"{FEEDFORWARD[record.offset_in_feedforward]}, watchdog {record.watchdog}; record {path}"
-        )
-    return {**asdict(record), "record": str(path), "digest": record.digest}
-
-
-def _set_pdos(machine: MachineConfig, axis: str, yes: bool, quiet: bool) -> dict[str, Any]:
-    """Set the PDOs of one drive up; DriveFault when it refuses, or the operator does."""
-    from fdhil.cli.bus_lock import lock_bus
-    from fdhil.commissioning.master import Master
-    from fdhil.commissioning.pdo_setup import set_up_pdos
-    from fdhil.drivers.cia402.profile_file import load_profile
-
-    profile = load_profile(machine.axis[axis].drive)
-    if not yes:
-        question = (
-            f"The PDOs of drive {axis} are written as profile {profile.name} has them, and saved in it. May they?"
-        )
-        _confirm(axis, question, "nothing was written; start again with --yes where nobody can be asked")
-    with lock_bus(machine.bus[machine.axis[axis].drive.bus]), Master(machine, axis) as master:
-        done = set_up_pdos(master)
-    written = ", ".join(done.written) or "none, all were right"
-    kept = {True: ", saved in the drive", False: ", NOT saved: lost when the drive is off", None: ""}[done.saved]
-    if not quiet:
-        click.echo(f"axis {axis}: PDOs written: {written}{kept}")
-    return {"pdos_written": list(done.written), "saved": done.saved}
-
-
-def _guide(machine: MachineConfig, axis: str, yes: bool, quiet: bool) -> Callable[[str], None]:
-    """Return the function that tells, and asks, before each step."""
-    numbers = {step: number for number, step in enumerate(STEPS, 1)}
-
-    def guide(step: str) -> None:
-        if step == "enable" and not yes:
-            _ask(machine, axis)
-        text = f"axis {axis}, step {numbers[step]} of {len(STEPS)}, {step}: {STEPS[step]}"
-        if quiet:
-            _progress(text)
-        else:
-            click.echo(text)
-
-    return guide
-
-
-def _ask(machine: MachineConfig, axis: str) -> None:
-    """Ask before anything moves; DriveFault when the answer is no, or nobody is there to give one."""
-    from fdhil.commissioning.steps import largest_move_um
-
-    question = (
-        f"The set-up of axis {axis} is as it must be. Now the drive is switched on and the axis moves by 10 um, "
-        f"then up to {largest_move_um(machine, axis):.0f} um to and fro. Is it free to move, and may it?"
-    )
-    advice = "nothing was moved or written; start again when it may move, with --yes where nobody can be asked"
-    _confirm(axis, question, advice)
-
-
-def _confirm(axis: str, question: str, advice: str) -> None:
-    try:
-        agreed = click.confirm(question, err=True)
-    except click.Abort:
-        if sys.stdin.isatty():
-            raise  # Ctrl-C
-        agreed = False
-    if not agreed:
-        raise DriveFault(f"drive {axis}", f"nobody said yes; {advice}")

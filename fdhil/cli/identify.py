@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import tables
-from fdhil.cli.options import OutputFile, Writing
+from fdhil.cli.options import COLUMNS, OutputFile, Writing
 from fdhil.cli.parameter_view import MEANING, cell, head
 from fdhil.records import INTERVAL_95, unit_of
 
@@ -43,6 +43,7 @@ UNREADABLE = 3
     type=click.Path(path_type=Path),
     help="What an accelerometer at the table recorded of the same run (CSV, as Klipper writes it); for one RECORDING.",
 )
+@COLUMNS
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
 def identify(
     recordings: tuple[Path, ...],
@@ -51,24 +52,25 @@ def identify(
     model: Path | None,
     with_loops: bool,
     accelerometer: Path | None,
+    columns: Path | None,
     as_json: bool,
 ) -> int:
-    """Identify a drive from the rapid moves in each RECORDING (CSV).
+    """Identify a drive from the rapid moves in each RECORDING.
 
     Each rapid is a window: it is checked, the six parameters are estimated from it, and the model is validated. The
     accepted windows of a file together give its pooled parameters. With --config they are also compared with the axis'
     nominal values: a sensor whose gain is wrong all along shows in no other way. A recording may have no voltage: then
     K is the one in its header torque_constant_nm_per_a, else the nominal one of --config. Where the configured
     regulators do not explain the rapids, and with --loops always, the drive's own are identified; those that explain
-    more are used. Exit codes: 0 every file's
-    pool is validated, 1 some pool is not, 2 wrong option or configuration, 3 a recording cannot be read (the others
-    are identified all the same).
+    more are used. A RECORDING is CSV, Parquet, MATLAB, MDF 4 or HDF5; with --columns it is what another program wrote.
+    Exit codes: 0 every file's pool is validated, 1 some pool is not, 2 wrong option or configuration, 3 a recording
+    cannot be read (the others are identified all the same).
     """
     if accelerometer is not None and len(recordings) > 1:
         raise click.UsageError("--accelerometer belongs to one recording: give each with its own")
     settings, machine = _settings(config_path, method)
     axes = machine.axis if machine is not None else {}
-    results = [_against_data_sheet(r, axes) for r in _analyse(recordings, settings, machine, accelerometer)]
+    results = [_against_data_sheet(r, axes) for r in _analyse(recordings, settings, machine, accelerometer, columns)]
     if model is not None:
         from fdhil.cli.model_file import write_model
 
@@ -112,7 +114,11 @@ def _against_data_sheet(result: FileResult, axes: Mapping[str, Axis]) -> FileRes
 
 
 def _analyse(
-    paths: Sequence[Path], settings: Identification, machine: MachineConfig | None, accelerometer: Path | None
+    paths: Sequence[Path],
+    settings: Identification,
+    machine: MachineConfig | None,
+    accelerometer: Path | None,
+    columns: Path | None,
 ) -> list[FileResult]:
     """Analyse the files, with a progress bar on stderr when that is a terminal."""
     from rich.console import Console
@@ -121,11 +127,11 @@ def _analyse(
     from fdhil.cli.batch import analyse_files
 
     if not sys.stderr.isatty():
-        return list(analyse_files(paths, settings, machine, accelerometer=accelerometer))
-    columns = (TextColumn("identifying"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        return list(analyse_files(paths, settings, machine, accelerometer=accelerometer, columns=columns))
+    shown = (TextColumn("identifying"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*shown, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("identifying", total=len(paths))
-        return list(analyse_files(paths, settings, machine, partial(progress.advance, task), accelerometer))
+        return list(analyse_files(paths, settings, machine, partial(progress.advance, task), accelerometer, columns))
 
 
 def _file_document(result: FileResult, axes: Mapping[str, Axis], with_loops: bool) -> dict[str, Any]:

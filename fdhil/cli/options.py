@@ -11,6 +11,12 @@ import click
 
 from fdhil.store.output import check_output
 
+COLUMNS = click.option(
+    "--columns",
+    type=click.Path(path_type=Path),
+    help="Column map (TOML): which column of another program's file is which signal, in which unit.",
+)
+
 
 class Positive(click.FloatRange):
     """A finite number above 0: nan, which no range refuses, and infinity are wrong too."""

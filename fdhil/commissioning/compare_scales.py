@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 
 from fdhil.cia402 import Object
 from fdhil.commissioning.finding import Finding, lacks, read_optional
@@ -10,30 +11,36 @@ from fdhil.commissioning.master import Master
 from fdhil.drivers.cia402.profile import speed_unit_of
 
 DC_LINK_TOLERANCE = 0.05
+Read = Callable[[int, int], int | None]
+"""Read an unsigned object by index and sub-index; None where the drive does not tell it."""
 
 
 def compare_scale(master: Master) -> Iterator[Finding]:
     """Position increments per motor revolution from 0x6091 and 0x6092 (else 0x608F) must be the configured ones."""
     expected = master.config.axis[master.axis].drive.increments_per_rev
-    feed = _ratio(master, Object.FEED_CONSTANT)
-    gear = _ratio(master, Object.GEAR_RATIO)
-    encoder = _ratio(master, Object.POSITION_ENCODER_RESOLUTION)
     wanted = f"{expected} per revolution"
-    if feed is not None:
-        per_rev, source = feed / (gear or 1.0), "0x6092 and 0x6091"
-    elif encoder is not None:
-        per_rev, source = encoder, "0x608F"
-    else:
+    told = increments_told(partial(read_optional, master))
+    if told is None:
         yield lacks("scale", wanted, "0x6092", "0x608F")
         return
+    per_rev, source = told
     found = f"{per_rev:g} per revolution"
     same = abs(per_rev - expected) <= 1e-6 * expected
     cause = f"its position counts {per_rev:g} per motor revolution ({source}) where the config has {expected}"
     yield Finding("scale", wanted, found, same, cause, "correct the drive's factors or drive.increments_per_rev")
 
 
-def _ratio(master: Master, index: int) -> float | None:
-    upper, lower = read_optional(master, index, 1), read_optional(master, index, 2)
+def increments_told(read: Read) -> tuple[float, str] | None:
+    """Return the position increments per motor revolution that a drive tells, and by which objects; None without."""
+    feed, gear = _ratio(read, Object.FEED_CONSTANT), _ratio(read, Object.GEAR_RATIO)
+    if feed is not None:
+        return feed / (gear or 1.0), "0x6092 and 0x6091"
+    encoder = _ratio(read, Object.POSITION_ENCODER_RESOLUTION)
+    return None if encoder is None else (encoder, "0x608F")
+
+
+def _ratio(read: Read, index: int) -> float | None:
+    upper, lower = read(index, 1), read(index, 2)
     return None if upper is None or not lower else upper / lower
 
 

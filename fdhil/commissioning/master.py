@@ -1,7 +1,6 @@
-"""Runs the bus for the commissioning: produces SYNC, sends one drive its set-points, asks by SDO and hears the drive.
+"""Leads one drive for the commissioning and for what is played: asks it by SDO, gives it its set-points and hears it.
 
-One thread turns the cycle: it sends what is due (heartbeat, SYNC, set-points), drains the bus and keeps what came.
-Everything that is sent leaves from this turn, so a program that hangs sends nothing more.
+What is sent in time leaves from the turn of the :class:`Cycle` that runs its bus.
 """
 
 from __future__ import annotations
@@ -9,19 +8,19 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Self
 
 from fdhil import cia402
 from fdhil.commissioning.bus_listener import shows_master
-from fdhil.commissioning.transmit import TransmitBus
+from fdhil.commissioning.cycle import Cycle
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.frames import ERROR_FLAG
 from fdhil.drivers.can.sdo import SdoLink
 from fdhil.drivers.cia402.profile import DriveProfile
 from fdhil.drivers.cia402.profile_file import load_profile
-from fdhil.errors import DeviceError, DeviceTimeout
+from fdhil.errors import DeviceTimeout
 
 
 @dataclass(slots=True)
@@ -40,7 +39,6 @@ class Heard:
     errors: int = 0
 
 
-LOCKSTEP_WAIT_S = 8.0
 LOCKSTEP_PATIENCE = 20.0  # times as long as on a real machine: a simulated one shares its computer
 
 
@@ -59,9 +57,15 @@ class AxisSdo(SdoLink):
 
 
 class Master:
-    """A context manager around one bus and one drive; nothing is sent before ``produce_sync`` or an SDO call."""
+    """A context manager around one drive; nothing is sent before ``produce_sync`` or an SDO call.
 
-    def __init__(self, config: MachineConfig, axis: str) -> None:
+    Without a ``cycle`` that is shared with other drives it runs the drive's bus itself. The offset is sent, too, but
+    where a guard does that (``beside_guard``).
+    """
+
+    def __init__(
+        self, config: MachineConfig, axis: str, cycle: Cycle | None = None, *, beside_guard: bool = False
+    ) -> None:
         settings = config.axis[axis]
         self.config, self.axis = config, axis
         self.node_id = config.node_id(axis)
@@ -69,67 +73,41 @@ class Master:
         self.profile: DriveProfile = profile.with_feedforward() if settings.feedforward else profile
         self.period_s = config.machine.sync_period_s
         self.device = f"drive {axis}"
-        self.bus = TransmitBus(settings.drive.bus, config.bus[settings.drive.bus])
-        self._lockstep = config.guard.clock == "sync"
-        self._patience = LOCKSTEP_PATIENCE if self._lockstep else 1.0
+        self.loop = cycle or Cycle(config, (settings.drive.bus,))
+        self.bus = self.loop.buses[settings.drive.bus]
+        self._own_loop = cycle is None
+        self._patience = LOCKSTEP_PATIENCE if self.loop.lockstep else 1.0
         self.sdo = AxisSdo(self.device, self.node_id, self.bus.send, self._patience)
         self.sdo.profile = self.profile
         self.heard = Heard()
-        self.cycle = 0
         self.controlword = 0
         self.target: int | None = None
         self.offset = 0
-        self.heartbeat = False
         self.fed: tuple[int, int] | None = None
+        self._beside_guard = beside_guard
+        self._guarded = frozenset(self._offset_ids()) if beside_guard else frozenset()
+        self._tpdos = {spec.cob_base + self.node_id: spec for spec in self.profile.tpdos}
         self._plan: deque[int] = deque()
-        self._sync_counter = 0
-        self._sync_overflow: int | None = None
-        self._answered, self._wait_until = 0, 0.0
-        self._heartbeat_due = 0.0
+        self._answered = 0
         self._lock = threading.Lock()
-        self._failure: DeviceError | None = None
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._turn, name="fdhil-commissioning", daemon=True)
-        self._thread.start()
+        self.loop.members.append(self)
+        if self._own_loop:
+            self.loop.start()
 
     # the cycle ------------------------------------------------------------------------------------------------
 
-    def _turn(self) -> None:
-        due = time.monotonic()
-        try:
-            while not self._stopping.is_set():
-                self._receive()
-                self._send_heartbeat()
-                if self._sync_overflow is not None and not self._awaits_drive():
-                    self._send_cycle()
-                due = max(due + self.period_s, time.monotonic() - self.period_s)
-                time.sleep(max(0.0, due - time.monotonic()))
-        except DeviceError as error:
-            self._failure = error
+    @property
+    def behind(self) -> int:
+        """How many SYNCs the drive has not answered."""
+        return self.cycle - self._answered
 
-    def _awaits_drive(self) -> bool:
-        """Whether a simulated drive has yet to answer the last SYNC: its process may sleep, and time is the SYNC count.
+    @property
+    def position(self) -> int | None:
+        """The drive's newest position; None before the first, and when the last SYNC but one brought none."""
+        return self.heard.objects.get(self.profile.position) if self.behind <= 2 else None
 
-        One that has not answered in ``LOCKSTEP_WAIT_S`` is not waited for until it answers again.
-        """
-        behind = self.cycle - self._answered
-        return self._lockstep and 0 < behind <= 1 and time.monotonic() < self._wait_until
-
-    def _send_heartbeat(self) -> None:
-        now = time.monotonic()
-        if self.heartbeat and now >= self._heartbeat_due:
-            self._heartbeat_due = now + self.config.guard.heartbeat_s
-            self.bus.send(cia402.COB_HEARTBEAT + self.config.guard.node_id, bytes([cia402.Nmt.OPERATIONAL]))
-
-    def _send_cycle(self) -> None:
-        """SYNC, then the set-points that the next SYNC latches."""
-        if self._sync_overflow:
-            self._sync_counter = self._sync_counter % self._sync_overflow + 1
-            self.bus.send(cia402.COB_SYNC, bytes([self._sync_counter]))
-        else:
-            self.bus.send(cia402.COB_SYNC, b"")
-        self.cycle += 1
-        self._wait_until = time.monotonic() + LOCKSTEP_WAIT_S
+    def send_set_points(self) -> None:
+        """Send the set-points that the next SYNC latches."""
         with self._lock:
             if self._plan:
                 self.offset = self._plan.popleft()
@@ -141,46 +119,65 @@ class Master:
         if fed is not None:
             values |= zip((profile.speed_offset, profile.torque_offset), fed, strict=True)
         for spec in profile.rpdos:
-            if spec.valid and all((e.index, e.sub) in values for e in spec.entries):
-                data = cia402.pack(spec.entries, [values[e.index, e.sub] for e in spec.entries])
-                self.bus.send(spec.cob_base + self.node_id, data)
+            cob_id = spec.cob_base + self.node_id
+            if spec.valid and cob_id not in self._guarded and all((e.index, e.sub) in values for e in spec.entries):
+                self.bus.send(cob_id, cia402.pack(spec.entries, [values[e.index, e.sub] for e in spec.entries]))
 
-    def _receive(self) -> None:
-        node, heard = self.node_id, self.heard
-        tpdos = {spec.cob_base + node: spec for spec in self.profile.tpdos}
-        for frame in self.bus.drain():
-            can_id, length = int(frame["id"]), int(frame["dlc"])
-            data = int(frame["data"]).to_bytes(8, "little")[:length]
-            error = bool(can_id & ERROR_FLAG)
-            heard.errors, heard.frames = heard.errors + error, heard.frames + (not error)
-            if (sign := shows_master(can_id)) is not None:
-                heard.master = heard.master or sign
-            elif can_id in tpdos and length >= tpdos[can_id].length:
-                spec, self._answered = tpdos[can_id], self.cycle
-                for entry, value in zip(spec.entries, cia402.unpack(spec.entries, data), strict=True):
-                    heard.objects[entry.index, entry.sub] = value
-                    heard.cycle[entry.index, entry.sub] = self.cycle
-            elif can_id == self.sdo.response_id:
-                self.sdo.deliver(data)
-            elif can_id == cia402.COB_EMCY + node:
-                heard.emergencies.append(data)
-            elif can_id == cia402.COB_HEARTBEAT + node and data:
-                heard.nmt = data[0] & 0x7F
+    def _offset_ids(self) -> Iterator[int]:
+        """COB-IDs of the RPDOs that carry no target, but what a guard sends."""
+        profile = self.profile
+        for spec in profile.rpdos:
+            keys = {(entry.index, entry.sub) for entry in spec.entries}
+            if keys & {profile.offset, profile.speed_offset, profile.torque_offset} and profile.target not in keys:
+                yield spec.cob_base + self.node_id
+
+    def take(self, can_id: int, data: bytes) -> None:
+        """Take a frame of the bus."""
+        node, heard, spec = self.node_id, self.heard, self._tpdos.get(can_id)
+        error = bool(can_id & ERROR_FLAG)
+        heard.errors, heard.frames = heard.errors + error, heard.frames + (not error)
+        if spec is not None and len(data) >= spec.length:
+            self._answered = self.cycle
+            for entry, value in zip(spec.entries, cia402.unpack(spec.entries, data), strict=True):
+                heard.objects[entry.index, entry.sub] = value
+                heard.cycle[entry.index, entry.sub] = self.cycle
+        elif can_id == self.sdo.response_id:
+            self.sdo.deliver(data)
+        elif can_id == cia402.COB_EMCY + node:
+            heard.emergencies.append(data)
+        elif can_id == cia402.COB_HEARTBEAT + node and data:
+            heard.nmt = data[0] & 0x7F
+        elif can_id not in self._guarded and (sign := shows_master(can_id)) is not None:
+            heard.master = heard.master or sign
 
     # what the steps use ---------------------------------------------------------------------------------------
 
+    @property
+    def cycle(self) -> int:
+        """The number of SYNCs that were sent."""
+        return self.loop.count
+
+    @property
+    def heartbeat(self) -> bool:
+        """Whether our heartbeat is sent."""
+        return self.loop.heartbeat is not None
+
+    @heartbeat.setter
+    def heartbeat(self, on: bool) -> None:
+        self.loop.heartbeat = self.config.guard.node_id if on else None
+
     def produce_sync(self, overflow: int) -> None:
         """Send SYNC from now on, with a counter up to ``overflow`` (0: without)."""
-        self._sync_overflow = overflow
+        self.loop.produce_sync(overflow)
 
     @property
     def producing(self) -> bool:
         """Whether SYNC is being sent."""
-        return self._sync_overflow is not None
+        return self.loop.producing
 
     def stop_sync(self) -> None:
         """Send SYNC and set-points no more."""
-        self._sync_overflow = None
+        self.loop.stop_sync()
 
     def nmt(self, command: cia402.NmtCommand) -> None:
         """Send an NMT command to the drive."""
@@ -198,11 +195,8 @@ class Master:
         return bool(self._plan)
 
     def check(self) -> None:
-        """Raise what ended the cycle thread or the bus."""
-        if self._failure is not None:
-            raise self._failure
-        if self.bus.ended is not None:
-            raise DeviceError(f"bus {self.bus.name}", f"{self.bus.ended}; start again when the bus is back")
+        """Raise what ended the cycle or the bus."""
+        self.loop.check()
 
     def wait(self, condition: Callable[[], bool], timeout_s: float, otherwise: str) -> None:
         """Wait until ``condition`` holds; DeviceTimeout with the sentence ``otherwise`` when it does not in time."""
@@ -245,10 +239,9 @@ class Master:
         return cia402.state_of(self.heard.objects.get(self.profile.statusword, 0))
 
     def close(self) -> None:
-        """Stop sending and release the bus."""
-        self._stopping.set()
-        self._thread.join(timeout=2.0)
-        self.bus.close()
+        """Stop sending and release the bus, unless others share it."""
+        if self._own_loop:
+            self.loop.close()
 
     def __enter__(self) -> Self:
         return self

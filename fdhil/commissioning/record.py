@@ -97,9 +97,10 @@ def holds(record: CommissioningRecord | None, config: MachineConfig, axis: str) 
 def axis_digest(config: MachineConfig, axis: str) -> str:
     """SHA-256, 16 hexadecimal digits, of all in the configuration that a commissioning depends on.
 
-    Where sensors are reached and what the motor's data sheet says may change without commissioning again.
+    Where sensors are reached, what the motor's data sheet says and what room there is may change without commissioning
+    again.
     """
-    settings = config.axis[axis].model_dump(mode="json", exclude={"voltage", "nominal", "regulators"})
+    settings = config.axis[axis].model_dump(mode="json", exclude={"voltage", "nominal", "regulators", "setpoints"})
     if settings["feedforward"] is None:
         del settings["feedforward"]
     settings["drive"] = _described(config.axis[axis].drive)
@@ -132,7 +133,7 @@ def save_record(record: CommissioningRecord, directory: Path, key: Path | None =
     path = record_path(directory, record.axis)
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        seal = record.seal(_made_key(key or directory / KEY_NAME))
+        seal = record.seal(sealing_key(key or directory / KEY_NAME))
         document = {"schema": SCHEMA, **asdict(record), "digest": record.digest, "seal": seal}
         temporary = path.with_suffix(".tmp")
         with temporary.open("w", encoding="utf-8") as file:
@@ -178,8 +179,8 @@ def load_record(
     return record
 
 
-def _made_key(path: Path) -> bytes:
-    """Return the sealing key; make one where there is none."""
+def sealing_key(path: Path) -> bytes:
+    """Return the key that seals records; make one where there is none. StoreError."""
     with contextlib.suppress(FileExistsError):
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
         with os.fdopen(descriptor, "wb") as file:

@@ -7,7 +7,7 @@ written, no NMT command and no SYNC leaves from here.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from fdhil.commissioning.bus_listener import LISTEN_S, BusListener, Traffic
 from fdhil.commissioning.device_type import is_drive
 from fdhil.commissioning.survey import Identity
 from fdhil.commissioning.transmit import TransmitBus
-from fdhil.config import MachineConfig
+from fdhil.config import CanBus, MachineConfig
 from fdhil.drivers.can.frames import Frames
 from fdhil.drivers.can.node_watch import emcy_text
 from fdhil.drivers.can.sdo import SdoLink
@@ -33,9 +33,9 @@ _READ_DEVICE_TYPE = bytes([0x40, 0x00, 0x10, 0, 0, 0, 0, 0])
 class BusScanner(BusListener):
     """A bus that is listened to and, where no master is heard, asked; a context manager."""
 
-    def __init__(self, name: str, config: MachineConfig) -> None:
+    def __init__(self, name: str, settings: CanBus) -> None:
         self._links: dict[int, SdoLink] = {}
-        self._sending = TransmitBus(name, config.bus[name])
+        self._sending = TransmitBus(name, settings)
         super().__init__(self._sending)
 
     def take(self, frames: Frames) -> None:
@@ -149,18 +149,23 @@ class BusScan:
 def scan_bus(name: str, config: MachineConfig, descriptions: Sequence[Description]) -> BusScan:
     """Listen, then ask where no master is heard. ConnectError when the bus cannot be reached or is silent."""
     axes = {config.node_id(axis): axis for axis, settings in config.axis.items() if settings.drive.bus == name}
-    with BusScanner(name, config) as bus:
-        bus.listen(LISTEN_S)
-        bus.require_readable()
-        master = bus.traffic.master
-        answering = set() if master else bus.answering()
-        found = sorted(bus.traffic.nodes | answering)
-        if not found and master is None:
-            text = "no node was heard and none answered; check the drives' supply, wiring and bit rate"
-            raise ConnectError(f"bus {name}", text)
-        asked = {node_id: _ask(bus, node_id, descriptions) for node_id in sorted(answering)}
-        nodes = [_node(bus.traffic, node_id, axes.get(node_id), asked.get(node_id)) for node_id in found]
-        return BusScan(name, master, bus.traffic.sync_period_s, tuple(nodes))
+    with BusScanner(name, config.bus[name]) as bus:
+        return scan_nodes(bus, axes, descriptions)
+
+
+def scan_nodes(bus: BusScanner, axes: Mapping[int, str], descriptions: Sequence[Description]) -> BusScan:
+    """Listen to an open bus, then ask where no master is heard; ``axes`` by node-ID. Raises as ``scan_bus``."""
+    bus.listen(LISTEN_S)
+    bus.require_readable()
+    master = bus.traffic.master
+    answering = set() if master else bus.answering()
+    found = sorted(bus.traffic.nodes | answering)
+    if not found and master is None:
+        text = "no node was heard and none answered; check the drives' supply, wiring and bit rate"
+        raise ConnectError(f"bus {bus.name}", text)
+    asked = {node_id: _ask(bus, node_id, descriptions) for node_id in sorted(answering)}
+    nodes = [_node(bus.traffic, node_id, axes.get(node_id), asked.get(node_id)) for node_id in found]
+    return BusScan(bus.name, master, bus.traffic.sync_period_s, tuple(nodes))
 
 
 def _node(traffic: Traffic, node_id: int, axis: str | None, answers: Answers | None) -> Node:
@@ -179,9 +184,7 @@ def _ask(bus: BusScanner, node_id: int, descriptions: Sequence[Description]) -> 
         return None if data is None else printable(data)
 
     identity = Identity(*(number(Object.IDENTITY, sub) or 0 for sub in (1, 2, 3, 4)))
-    fits = [(description.fits(identity), description.path.name) for description in descriptions]
-    matches = [EdsMatch(name, fit) for fit, name in fits if fit is not None]
-    best = min(matches, key=lambda match: FITS.index(match.fit), default=None)
+    best = best_description(identity, descriptions)
     period_ms = number(Object.PRODUCER_HEARTBEAT)
     return Answers(
         identity=identity,
@@ -191,8 +194,14 @@ def _ask(bus: BusScanner, node_id: int, descriptions: Sequence[Description]) -> 
         software=text(Object.SOFTWARE_VERSION),
         heartbeat_s=None if period_ms is None else period_ms * 1e-3,
         supported_modes=number(Object.SUPPORTED_MODES),
-        eds=best,
+        eds=None if best is None else EdsMatch(best[0].path.name, best[1]),
     )
+
+
+def best_description(identity: Identity, descriptions: Sequence[Description]) -> tuple[Description, str] | None:
+    """Return the description that fits a node best, and how: one of ``FITS``; None where none is for it."""
+    fits = [(description, fit) for description in descriptions if (fit := description.fits(identity)) is not None]
+    return min(fits, key=lambda found: FITS.index(found[1]), default=None)
 
 
 def printable(data: bytes) -> str:

@@ -9,15 +9,17 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
 
 from fdhil import cia402
 from fdhil.cia402 import Mode, NmtCommand, Object, State
+from fdhil.commissioning.compare import found_fingerprint
 from fdhil.commissioning.feedforward import feedforward_open, prove_feedforward
 from fdhil.commissioning.finding import read_optional
 from fdhil.commissioning.master import Master
+from fdhil.commissioning.progress import Found, Progress
 from fdhil.commissioning.record import CommissioningRecord, axis_digest
 from fdhil.commissioning.survey import (
     Survey,
@@ -243,16 +245,28 @@ def check_axis(master: Master) -> Survey:
     return found
 
 
+PROOFS: Mapping[str, Callable[[Master], Found]] = {
+    "sign test": lambda master: {"moved_um": round(sign_test(master), 2)},
+    "feed-forward test": lambda master: {"in_feedforward": tell_feedforward(master)},
+    "watchdog test": lambda master: {"watchdog": watchdog_test(master, enable)},
+}
+"""The steps that are done with the drive switched on; what they found goes into the record."""
+
+
 def commission(
-    config: MachineConfig, axis: str, report: Callable[[str], None] = lambda _step: None
+    config: MachineConfig,
+    axis: str,
+    report: Callable[[str], None] = lambda _step: None,
+    progress: Progress | None = None,
 ) -> CommissioningRecord:
     """Commission one axis and return the signed-off record (not saved yet); ``report`` gets each step's name.
 
     Nothing moves before ``report`` returns from ``enable``, and nothing is written but the RPDO of the feed-forward,
-    which is given back: what ``report`` raises there ends it with no trace.
+    which is given back: what ``report`` raises there ends it with no trace. With ``progress`` each step that is done is
+    kept, and one that was kept for this drive, as it is now, is not done again.
 
     DriveFault (also for a drive that takes no offset), ProtocolError, DeviceTimeout or ConnectError, one sentence each,
-    after everything was rolled back.
+    after everything was rolled back; StoreError when a step cannot be kept.
     """
     profile = load_profile(config.axis[axis].drive)
     if not profile.takes_offset:
@@ -263,19 +277,7 @@ def commission(
         with feedforward_open(master) as feeding:
             report("compare")
             found = check_axis(master)
-            report("enable")
-            require_alone(master)
-            with rolled_back(master):
-                prepare(master)
-                prove_feedforward(master)
-                enable(master)
-                report("sign test")
-                moved_um = sign_test(master)
-                report("feed-forward test")
-                in_feedforward = tell_feedforward(master)
-                report("watchdog test")
-                watchdog = watchdog_test(master, enable)
-                report("restore")
+            proven = _proven(master, found, report, progress)
     return CommissioningRecord(
         axis=axis,
         **asdict(found.identity),
@@ -283,12 +285,41 @@ def commission(
         mapping_fingerprint=found.fingerprint,
         options={**found.options, **feeding},
         following_error_window_um=found.window_um,
-        offset_in_feedforward=in_feedforward,
-        sign_test_um=round(moved_um, 2),
+        offset_in_feedforward=proven["feed-forward test"]["in_feedforward"],
+        sign_test_um=proven["sign test"]["moved_um"],
         readback_ok=True,
-        watchdog=watchdog,
+        watchdog=proven["watchdog test"]["watchdog"],
         created_utc=datetime.now(UTC).isoformat(timespec="seconds"),
     )
+
+
+def holds_for(config: MachineConfig, axis: str, found: Survey) -> str:
+    """Return the fingerprint of a drive, as it was just read, with its configuration."""
+    return f"{axis_digest(config, axis)} {found_fingerprint(found)}"
+
+
+def _proven(
+    master: Master, found: Survey, report: Callable[[str], None], progress: Progress | None
+) -> Mapping[str, Found]:
+    """Return what each of the ``PROOFS`` found; the drive is switched on only where one is not kept."""
+    now = holds_for(master.config, master.axis, found)
+    done = {name: progress.kept(name, now) if progress else None for name in PROOFS}
+    proven = {name: kept for name, kept in done.items() if kept is not None}
+    if len(proven) == len(PROOFS):
+        return proven
+    report("enable")
+    require_alone(master)
+    with rolled_back(master):
+        prepare(master)
+        prove_feedforward(master)
+        enable(master)
+        for name in (name for name in PROOFS if name not in proven):
+            report(name)
+            proven[name] = PROOFS[name](master)
+            if progress is not None:
+                progress.keep(name, now, proven[name])
+        report("restore")
+    return proven
 
 
 @contextlib.contextmanager

@@ -7,9 +7,10 @@ import logging
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
+from pydantic.fields import FieldInfo
 
 from fdhil.config.machine import MachineConfig
 from fdhil.config.plausible import doubts
@@ -20,6 +21,7 @@ MAX_CONFIG_BYTES = 256 * 1024
 MOST_FAULTS = 50
 MOST_DOTS = 100  # in a line
 SHOWN_CHARS = 60
+S = TypeVar("S", bound=Section)
 OUT_OF_RANGE = {"greater_than", "greater_than_equal", "less_than", "less_than_equal", "finite_number"}
 
 
@@ -83,7 +85,8 @@ def parse(
     }
     sim = config.sim.model_copy(update={"axis": worn})
     axes = {name: axis.model_copy(update={"drive": axis.drive.placed(folder)}) for name, axis in config.axis.items()}
-    return config.model_copy(update={"store": store, "guard": guard, "axis": axes, "sim": sim})
+    nc_source = config.nc_source.placed(folder)
+    return config.model_copy(update={"store": store, "guard": guard, "axis": axes, "sim": sim, "nc_source": nc_source})
 
 
 def unlikely(config: MachineConfig) -> list[str]:
@@ -92,11 +95,32 @@ def unlikely(config: MachineConfig) -> list[str]:
     return [f"axis.{name}.{doubt.key} is unlikely: {doubt.text}" for name, doubt in found]
 
 
-def _faults(error: ValidationError) -> list[ConfigFault]:
+def checked(section: type[S], values: Mapping[str, Any], path: str) -> S:
+    """Check the values of one table, ``path`` in the file, without the rest of it; ConfigError."""
+    try:
+        return section.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(path, _faults(error, tuple(path.split(".")))) from None
+
+
+def checked_value(path: str, value: Any) -> Any:
+    """Check the value of one key, as ``axis.X.nominal.R``, and return it as it is used; ConfigError."""
+    field, (*outer, key) = field_at(path), path.split(".")
+    if field is None:
+        near = _near_key(_section(tuple(outer)), key)
+        raise ConfigError(path, [ConfigFault(path, "is no key of this section", near)])
+    kind: Any = Annotated[(field.annotation, *field.metadata)] if field.metadata else field.annotation
+    try:
+        return TypeAdapter(kind).validate_python(value)
+    except ValidationError as error:
+        raise ConfigError(path, _faults(error, tuple(path.split(".")))) from None
+
+
+def _faults(error: ValidationError, place: tuple[str, ...] = ()) -> list[ConfigFault]:
     faults = []
     items = error.errors(include_url=False)
     for item in items[:MOST_FAULTS]:
-        loc = item["loc"]
+        loc = (*place, *item["loc"])
         path = ".".join(_short(str(part)) for part in loc) or "config"
         section, key = _section(loc[:-1]), str(loc[-1]) if loc else ""
         field = section.model_fields.get(key)
@@ -165,6 +189,12 @@ def _section(loc: tuple[int | str, ...]) -> type[Section]:
             return section
         section = inner[0]
     return section
+
+
+def field_at(path: str) -> FieldInfo | None:
+    """Return the field of a key, as ``axis.X.nominal.R``; None where there is none."""
+    *outer, key = path.split(".")
+    return _section(tuple(outer)).model_fields.get(key)
 
 
 def _arguments(annotation: Any) -> list[Any]:

@@ -1,23 +1,21 @@
-"""A stored window as CSV of the recording format, which ``fdhil identify`` and any other program read."""
+"""A stored window as a recording, which ``fdhil identify`` and other programs read, in every file format there is."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
+from fdhil import tables
 from fdhil.errors import RecordingError
 from fdhil.records import Float, SlowVoltage, Window
 from fdhil.store.output import open_output
-
-TABLE = ("table_mm", "table_m_s2")
-TIME, VOLTAGE, OTHERS = "time_s", "voltage_V", "current_A,speed_rad_per_s,position_m,demand_m"
+from fdhil.store.recording_table import FORMAT, SAMPLING, TABLE, VOLTAGE, RecordingTable
 
 
-def csv_lines(window: Window) -> Iterator[str]:
-    """Yield the lines of a recording without line ends; a lost sample is a missing row, which readers see as a gap.
+def table_of(window: Window) -> RecordingTable:
+    """Return a window as a recording; a lost sample is a missing row, which readers see as a gap.
 
     The samples of a voltage sensor slower than the rows stand in headers, on their own grid and to the last bit; their
     column holds the sample under way, for programs that know no other. Without a voltage there is no such column, nor
@@ -25,31 +23,38 @@ def csv_lines(window: Window) -> Iterator[str]:
     """
     slow = window.slow_voltage
     voltage = _held(window, slow) if slow is not None else window.voltage_v
-    rapid_m_s = window.rapid_speed_rad_s / (2 * math.pi) * window.pitch_mm / 1000
+    signals = {
+        VOLTAGE: voltage,
+        "current_A": window.current_a,
+        "speed_rad_per_s": window.speed_rad_s,
+        "position_m": window.position_mm / 1000,
+        "demand_m": window.demand_mm / 1000,
+    }
+    known = {name: values for name, values in signals.items() if values is not None}
+    whole = np.isfinite(np.column_stack([*known.values()])).all(axis=1)
+    seen = {name: values for name in TABLE if (values := getattr(window, name)) is not None}
+    time_s = {"time_s": np.round(np.arange(window.n) * window.dt_s, 9)}
+    columns = {name: values[whole] for name, values in (time_s | known | seen).items()}
+    return RecordingTable(_headers(window), columns)
+
+
+def _headers(window: Window) -> dict[str, str]:
+    slow, rapid_m_s = window.slow_voltage, window.rapid_speed_rad_s / (2 * math.pi) * window.pitch_mm / 1000
+    deaf = window.voltage_v is None and slow is None
     headers = {
-        "format": "fdhil-recording-1",
+        "format": FORMAT,
         "sample_rate_hz": f"{1 / window.dt_s:.12g}",
-        "voltage_sampling": window.voltage_sampling,
+        SAMPLING: None if deaf else window.voltage_sampling,
         "axis": window.axis,
         "pitch_m_per_rev": f"{window.pitch_mm / 1000:.12g}",
         "rapid_speed_m_per_s": f"{rapid_m_s:.12g}",
         "temperature_C": _number(window.temperature_c),
-        "voltage_delay_s": None if window.voltage_delay_s is None else repr(window.voltage_delay_s),
+        "voltage_delay_s": None if deaf or window.voltage_delay_s is None else repr(window.voltage_delay_s),
         "torque_constant_nm_per_a": _number(window.torque_constant_nm_per_a),
         "start_tick": str(window.start_tick),
         "source": window.source or None,
     } | (_samples(slow) if slow is not None else {})
-    left_out = () if voltage is not None else ("voltage_sampling", "voltage_delay_s")
-    yield from (f"# {key}: {value}" for key, value in headers.items() if value is not None and key not in left_out)
-    seen = {name: values for name in TABLE if (values := getattr(window, name)) is not None}
-    yield ",".join((*((TIME, OTHERS) if voltage is None else (TIME, VOLTAGE, OTHERS)), *seen))
-    path_m = (window.position_mm / 1000, window.demand_mm / 1000)
-    signals = (window.current_a, window.speed_rad_s, *path_m)
-    rows = np.column_stack(signals if voltage is None else (voltage, *signals))
-    whole = np.isfinite(rows).all(axis=1)
-    rows = np.column_stack([rows, *seen.values()])  # of which a row may lack what the table's sensors tell
-    for k in np.flatnonzero(whole):
-        yield f"{k * window.dt_s:.9g}," + ",".join(repr(float(value)) for value in rows[k])
+    return {key: value for key, value in headers.items() if value is not None}
 
 
 def _number(value: float | None) -> str | None:
@@ -58,12 +63,12 @@ def _number(value: float | None) -> str | None:
 
 def _samples(slow: SlowVoltage) -> dict[str, str]:
     """Return the headers that hold a slow sensor's samples; times are those of the rows, the first at 0 s."""
-    late = {} if slow.late_s is None else {"voltage_late_s": " ".join(repr(float(value)) for value in slow.late_s)}
+    late = {} if slow.late_s is None else {"voltage_late_s": " ".join(map(repr, slow.late_s.tolist()))}
     return late | {
         "voltage_begin_s": repr(slow.begin_s),
         "voltage_period_s": repr(slow.period_s),
         "voltage_error_s": repr(slow.error_s),
-        "voltage_samples_V": " ".join(repr(float(value)) for value in slow.voltage_v),
+        "voltage_samples_V": " ".join(map(repr, slow.voltage_v.tolist())),
     }
 
 
@@ -78,8 +83,11 @@ def _held(window: Window, slow: SlowVoltage) -> Float:
     return held
 
 
-def export_csv(window: Window, path: Path) -> None:
-    """Write a window as CSV, whole or not at all. OutputError when it cannot be written."""
-    content = "\n".join(csv_lines(window)) + "\n"
+def export_table(table: RecordingTable, path: Path, format_name: str = "csv") -> None:
+    """Write a recording in one of ``tables.RECORDING_FORMATS``, whole or not at all.
+
+    OutputError when it cannot be written, FdhilError where the format's library is not installed.
+    """
+    content: bytes = tables.load(tables.RECORDING_FORMATS, format_name).encode(table)
     with open_output(path) as file:
-        file.write(content.encode())
+        file.write(content)

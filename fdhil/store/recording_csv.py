@@ -1,158 +1,62 @@
-"""Recordings as CSV: header lines ``# key: value``, then columns; a step of time off by more than 1 % is a gap.
-
-A recording may have no voltage: then it may tell the motor's torque constant.
-"""
+"""Recordings as CSV text: header lines ``# key: value``, then a line of names, then rows of numbers."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 
-from fdhil.csv_text import MAX_ROWS, check_lengths, read_csv_text, shown
+from fdhil.csv_text import check_lengths, shown, text_of
 from fdhil.errors import RecordingError
-from fdhil.records import Float, Recording, SlowVoltage, VoltageSampling, frozen
-
-FORMAT = "fdhil-recording-1"
-COLUMNS = ("time_s", "current_A", "speed_rad_per_s", "position_m", "demand_m")
-VOLTAGE = "voltage_V"
-TABLE = ("table_mm", "table_m_s2")  # sensors at the table, which may have lost rows
-REQUIRED = ("format", "sample_rate_hz", "axis", "pitch_m_per_rev")
-SAMPLING = "voltage_sampling"  # required where there is a voltage
-SOURCES: Mapping[str, tuple[str, ...]] = {
-    "speed_source": ("sensor", "difference", "filtered"),
-    "voltage_source": ("terminals", "command"),
-}
-STEP_TOLERANCE = 0.01
-MIN_ROWS = 16
-MAX_SAMPLES_CHARS = 16 * 1024 * 1024
-PITCH_M = (1e-5, 0.8)
-RATE_HZ = (1.0, 1e6)
-RAPID_M_S = (1e-4, 20.0)
-CONSTANT_NM_A = (1e-3, 100.0)
-
-
-def read_recording(path: Path) -> Recording:
-    """Read one CSV recording; RecordingError names what is wrong with the file and what to do about it."""
-    return parse_recording(read_csv_text(path), str(path))
+from fdhil.records import Float, Recording
+from fdhil.store.recording_table import MIN_ROWS, TABLE, RecordingTable, check_headers, recording_of
 
 
 def parse_recording(text: str, source: str = "recording") -> Recording:
-    """Parse the text of a CSV recording; ``source`` names it in errors. RecordingError as :func:`read_recording`."""
+    """Return the recording that a text is; ``source`` names it in errors. RecordingError as :func:`recording_of`."""
+    return recording_of(parse_table(text, source), source)
+
+
+def decode(content: bytes, source: str) -> RecordingTable:
+    """Return the table of a file's bytes; RecordingError names the line that is wrong."""
+    return parse_table(text_of(content, source), source)
+
+
+def parse_table(text: str, source: str) -> RecordingTable:
+    """Return the table of a text; RecordingError names the line that is wrong."""
     if not text.strip():
         raise RecordingError(f"{source} is empty: record it again")
-    headers, first_row, lines = _split(text, source)
-    dt = 1.0 / _within(headers, "sample_rate_hz", RATE_HZ, source)
+    lines = text.splitlines()
+    k = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
+    if k == len(lines):
+        raise RecordingError(f"{source} is truncated: it has headers but no columns; record it again")
+    check_lengths(lines[k:], k + 1, source)
+    names = [name.strip() for name in lines[k].split(",")]
+    headers = check_headers(_headers(lines[:k]), dict.fromkeys(names), source)
     if not text.endswith("\n"):
         raise RecordingError(
             f"{source} is truncated: line {len(lines)} has no end of line, so its last number may be cut; copy it again"
         )
-    names, table = _numbers(lines, first_row, source)
-    rows, gaps = _place(table[:, 0], dt, source)
-    columns = _spread(table, rows)
-    sampling = _sampling(headers, source) if SAMPLING in headers else "interval_mean"
-    _check_sources(headers, source)
-    pitch_m = _within(headers, "pitch_m_per_rev", PITCH_M, source)
-    rapid_m_s = _within(headers, "rapid_speed_m_per_s", RAPID_M_S, source) if "rapid_speed_m_per_s" in headers else None
-    return Recording(
-        axis=headers["axis"],
-        dt_s=dt,
-        time_s=frozen(table[0, 0] + dt * np.arange(columns.shape[0])),
-        voltage_v=_told(VOLTAGE, names, columns),
-        current_a=frozen(columns[:, 1]),
-        speed_rad_s=frozen(columns[:, 2]),
-        position_mm=frozen(columns[:, 3] * 1e3),
-        demand_mm=frozen(columns[:, 4] * 1e3),
-        voltage_sampling=sampling,
-        pitch_mm=pitch_m * 1e3,
-        rapid_speed_rad_s=None if rapid_m_s is None else rapid_m_s / pitch_m * 2 * math.pi,
-        temperature_c=_optional(headers, "temperature_C", source),
-        gaps=gaps,
-        headers=headers,
-        slow_voltage=_slow_voltage(headers, float(table[0, 0]), dt, source),
-        torque_constant_nm_per_a=_torque_constant(headers, source),
-        table_mm=_told("table_mm", names, columns),
-        table_m_s2=_told("table_m_s2", names, columns),
-    )
+    table = _numbers(lines, k + 1, names, source)
+    return RecordingTable(headers, {name: table[:, k] for k, name in reversed([*enumerate(names)])})
 
 
-def _told(name: str, names: list[str], columns: Float) -> Float | None:
-    return frozen(columns[:, names.index(name)]) if name in names else None
+def _headers(lines: list[str]) -> dict[str, str]:
+    told = (line[1:].partition(":") for line in lines)
+    return {key.strip(): value.strip() for key, colon, value in told if colon}
 
 
-def _slow_voltage(headers: dict[str, str], start_s: float, dt_s: float, source: str) -> SlowVoltage | None:
-    """Return the samples of a voltage sensor that is slower than the rows, where the headers hold them.
-
-    Sample j begins ``voltage_begin_s`` + j ``voltage_period_s`` on the time axis of the rows, whose first is at
-    ``start_s`` and which are ``dt_s`` apart; a lost one is ``nan`` among ``voltage_samples_V``.
-    """
-    if "voltage_samples_V" not in headers:
-        return None
-    period, begin = _positive(headers, "voltage_period_s", source), _optional(headers, "voltage_begin_s", source)
-    if period < dt_s / 2:  # the place of finer samples among the rows would be sought for hours
-        raise RecordingError(
-            f"{source} has voltage samples {period:g} s apart, closer than its rows: give voltage_period_s in seconds"
-        )
-    if len(headers["voltage_samples_V"]) > MAX_SAMPLES_CHARS:
-        raise RecordingError(f"{source} has more voltage samples than a recording has: cut it into parts")
-    try:
-        told = np.array(headers["voltage_samples_V"].split(), dtype=np.float64)
-    except ValueError:
-        raise RecordingError(f"{source} has a voltage sample that is no number: copy or export it again") from None
-    if begin is None or not told.size or np.isinf(told).any() or np.isnan(told).all():
-        raise RecordingError(
-            f"{source} has voltage samples of a slower sensor without voltage_begin_s or without a finite value: "
-            "export it again"
-        )
-    error = _optional(headers, "voltage_error_s", source) or 0.0
-    return SlowVoltage(begin - start_s, period, abs(error), frozen(told), _late(headers, told.size, period, source))
+def encode(table: RecordingTable) -> bytes:
+    """Return a table as the bytes of a CSV file, every number to its last bit."""
+    lines = [f"# {key}: {value}" for key, value in table.headers.items()]
+    lines.append(",".join(table.columns))
+    columns = [map(repr, values.tolist()) for values in table.columns.values()]
+    lines += map(",".join, zip(*columns, strict=True))
+    return ("\n".join(lines) + "\n").encode()
 
 
-def _late(headers: dict[str, str], samples: int, period: float, source: str) -> Float | None:
-    """Return by how much later than its place each sample of a slow sensor was true, where the headers hold it."""
-    if "voltage_late_s" not in headers:
-        return None
-    try:
-        late = np.array(headers["voltage_late_s"][:MAX_SAMPLES_CHARS].split(), dtype=np.float64)
-    except ValueError:
-        late = np.zeros(0)
-    if late.size != samples or not (np.abs(late) < period / 2).all():
-        raise RecordingError(f"{source} has voltage_late_s that do not fit its voltage samples: export it again")
-    return frozen(late)
-
-
-def _split(text: str, source: str) -> tuple[dict[str, str], int, list[str]]:
-    """Return the headers, the index of the first row of numbers, and all lines."""
-    lines = text.splitlines()
-    headers: dict[str, str] = {}
-    k = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
-    for line in lines[:k]:
-        key, colon, value = line[1:].partition(":")
-        if colon:
-            headers[key.strip()] = value.strip()
-    if k == len(lines):
-        raise RecordingError(f"{source} is truncated: it has headers but no columns; record it again")
-    check_lengths(lines[k:], k + 1, source)
-    names = tuple(name.strip() for name in lines[k].split(","))
-    required = (*REQUIRED, SAMPLING) if VOLTAGE in names else REQUIRED
-    missing = [key for key in required if not headers.get(key)]
-    if missing:
-        raise RecordingError(f"{source} has no header {', '.join(missing)}: add a line such as '# {missing[0]}: ...'")
-    if headers["format"] != FORMAT:
-        raise RecordingError(
-            f"{source} has format {shown(headers['format'])}, which is not {FORMAT!r}: convert it first"
-        )
-    absent = [name for name in COLUMNS if name not in names]
-    if absent:
-        raise RecordingError(f"{source} has no column {', '.join(absent)}: it needs {','.join(COLUMNS)}")
-    return headers, k + 1, lines
-
-
-def _numbers(lines: list[str], first_row: int, source: str) -> tuple[list[str], Float]:
-    """Return the columns there are, ``COLUMNS`` first, and their rows (n, k): all finite but what the table tells."""
-    names = [name.strip() for name in lines[first_row - 1].split(",")]
+def _numbers(lines: list[str], first_row: int, names: list[str], source: str) -> Float:
+    """Return the rows (n, k): all finite but what the table tells."""
     rows = [line for line in lines[first_row:] if line.strip()]
     if len(rows) < MIN_ROWS:
         raise RecordingError(f"{source} is truncated: {len(rows)} rows are no recording; record it again")
@@ -162,8 +66,7 @@ def _numbers(lines: list[str], first_row: int, source: str) -> tuple[list[str], 
         raise _bad_row(lines, first_row, names, source) from None
     if table.shape[1] != len(names) or not (np.isfinite(table) | (np.isnan(table) & np.isin(names, TABLE))).all():
         raise _bad_row(lines, first_row, names, source)
-    wanted = [name for name in (*COLUMNS, VOLTAGE, *TABLE) if name in names]
-    return wanted, table[:, [names.index(name) for name in wanted]]
+    return table
 
 
 def _bad_row(lines: list[str], first_row: int, names: list[str], source: str) -> RecordingError:
@@ -188,86 +91,3 @@ def _bad_row(lines: list[str], first_row: int, names: list[str], source: str) ->
                 what = f"{source} line {k + 1} has the non-finite value {shown(cell.strip())}"
                 return RecordingError(f"{what}: leave a lost sample's row out")
     return RecordingError(f"{source} cannot be read as numbers: export it again")
-
-
-def _place(
-    time_s: Float, dt: float, source: str
-) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], tuple[tuple[int, int], ...]]:
-    """Return the grid row (n,) of each sample and the half-open gaps between them."""
-    steps = np.diff(time_s)
-    if (steps <= 0).any():
-        k = int(np.argmax(steps <= 0))
-        raise RecordingError(
-            f"{source}: time stands still or runs back at {time_s[k + 1]:g} s: sort or record it again"
-        )
-    if time_s[-1] - time_s[0] > MAX_ROWS * dt:
-        raise RecordingError(f"{source}: a gap of {steps.max():g} s is no recording of one run: cut the file there")
-    off = np.abs(steps - dt) > STEP_TOLERANCE * dt
-    if off.mean() > 0.5:
-        raise RecordingError(
-            f"{source}: rows are {np.median(steps):g} s apart, but sample_rate_hz says {dt:g} s: correct the header"
-        )
-    # a step that is off is a gap even where it rounds to one sample: at least one row is then missing or misplaced
-    counts = np.where(off, np.maximum(np.rint(steps / dt), 2), 1).astype(np.int64)
-    rows = np.concatenate([[0], np.cumsum(counts)])
-    gaps = tuple((int(rows[k]) + 1, int(rows[k + 1])) for k in np.flatnonzero(off))
-    return rows, gaps
-
-
-def _spread(table: Float, rows: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Float:
-    columns = np.full((int(rows[-1]) + 1, table.shape[1]), np.nan)
-    columns[rows] = table
-    return columns
-
-
-def _sampling(headers: dict[str, str], source: str) -> VoltageSampling:
-    value = headers["voltage_sampling"]
-    if value == "interval_mean":
-        return "interval_mean"
-    if value == "instant":
-        return "instant"
-    raise RecordingError(f"{source} has voltage_sampling {shown(value)}: it must be interval_mean or instant")
-
-
-def _check_sources(headers: dict[str, str], source: str) -> None:
-    """Refuse a word for where speed or voltage come from that is none."""
-    for key, words in SOURCES.items():
-        if key in headers and headers[key] not in words:
-            raise RecordingError(f"{source} has {key} {shown(headers[key])}: it must be {' or '.join(words)}")
-
-
-def _torque_constant(headers: dict[str, str], source: str) -> float | None:
-    key = "torque_constant_nm_per_a"
-    return _within(headers, key, CONSTANT_NM_A, source) if key in headers else None
-
-
-def _positive(headers: dict[str, str], key: str, source: str) -> float:
-    value = _optional(headers, key, source)
-    if value is None or not value > 0:
-        raise RecordingError(f"{source} has header {key} = {shown(str(headers.get(key)))}: it must be a number above 0")
-    return value
-
-
-def _within(headers: dict[str, str], key: str, bounds: tuple[float, float], source: str) -> float:
-    """Return a header's number; RecordingError beyond what machines have, with the unit that was likely meant."""
-    value, (low, high) = _positive(headers, key, source), bounds
-    if low <= value <= high:
-        return value
-    length = key in ("pitch_m_per_rev", "rapid_speed_m_per_s")
-    guess = f" (is {value:g} in mm? then write {value / 1e3:g})" if length and value > high else ""
-    text = f"{source} has header {key} = {value:g}, machines have {low:g} to {high:g}: correct it{guess}"
-    raise RecordingError(text)
-
-
-def _optional(headers: dict[str, str], key: str, source: str) -> float | None:
-    if key not in headers:
-        return None
-    try:
-        value = float(headers[key])
-    except ValueError:
-        raise RecordingError(
-            f"{source} has header {key} = {shown(headers[key])} where a number belongs: correct it"
-        ) from None
-    if not math.isfinite(value):
-        raise RecordingError(f"{source} has the non-finite header {key} = {shown(headers[key])}: correct it")
-    return value

@@ -9,9 +9,11 @@ from typing import Any
 import pytest
 from click.testing import CliRunner, Result
 
+from fdhil import tables
 from fdhil.cli.identify import identify
 from fdhil.cli.main import cli, run_safely
-from fdhil.store.export import export_csv
+from fdhil.store import suffixes
+from fdhil.store.export import export_table, table_of
 from studies import bench
 from studies.slow_sensor import slow_windows
 from tests.bench import bench_toml
@@ -65,7 +67,7 @@ def test_json_holds_every_window_and_the_pool(shuttle: Path) -> None:
 
 def test_the_delay_of_a_slow_sensor_is_told_with_its_deviation(tmp_path: Path) -> None:
     path = tmp_path / "slow.csv"
-    export_csv(slow_windows(0.005, delay_s=0.0012)[0], path)
+    export_table(table_of(slow_windows(0.005, delay_s=0.0012)[0]), path)
     result = invoke(path, "--json")
     assert result.return_value == 0
     (window,) = told_document(result)["files"][0]["windows"]
@@ -161,3 +163,14 @@ def test_unreadable_recording_is_exit_3_in_one_sentence(
 def test_unknown_method_is_exit_2(shuttle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.argv", ["fdhil-identify", str(shuttle), "--method", "guess"])
     assert run_safely(identify) == 2
+
+
+def test_every_file_format_gives_the_same_answer(tmp_path: Path) -> None:
+    table = table_of(slow_windows(0.005)[0])
+    answers = []
+    for name in tables.RECORDING_FORMATS:
+        path = tmp_path / f"rapid{suffixes.suffix_of(suffixes.RECORDINGS, name)}"
+        export_table(table, path, name)
+        answers.append(told_document(invoke("--json", path))["files"][0]["pooled"])
+    assert answers[0]["validated"]
+    assert answers == [answers[0]] * len(answers)

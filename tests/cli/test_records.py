@@ -16,7 +16,7 @@ from fdhil.cli.records import read_windows
 from fdhil.daemon.kernel_warmup import nominal_rapid
 from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.records import frozen
-from fdhil.store.recording_csv import read_recording
+from fdhil.store.recordings import read_recording
 from fdhil.store.windows import encode_window
 from studies.slow_sensor import slow_windows
 from tests.daemon.machine import config_of
@@ -192,7 +192,8 @@ def test_a_report_is_one_page_without_anything_from_elsewhere(machine: Path, tmp
     page = out.read_text()
     assert "Axis X" in page
     assert "<svg" in page
-    assert "<script" not in page
+    assert "<script " not in page  # none with an address
+    assert "default-src 'none'" in page  # and the browser is told to load nothing
 
 
 @pytest.mark.parametrize("command", ["replay", "history", "report", "export", "run", "status", "arm", "disarm"])

@@ -142,14 +142,17 @@ def test_a_node_that_lacks_objects_is_listed_all_the_same(peer: tuple[DrivePeer,
     assert answers is not None
     assert answers.eds == EdsMatch("b.eds", "exact")
     assert answers.is_drive
-    with BusScanner("can0", settings) as bus:
+    with BusScanner("can0", settings.bus["can0"]) as bus:
         assert bus.read(1, 0x5FFF) is None
         assert bus.read(9, 0x1000) is None
 
 
 def test_nothing_is_asked_once_a_master_is_heard(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
-    with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as nc, BusScanner("can0", settings) as bus:
+    with (
+        can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as nc,
+        BusScanner("can0", settings.bus["can0"]) as bus,
+    ):
         nc.send(can.Message(arbitration_id=0x80, is_extended_id=False))
         bus.listen(0.1)
         with pytest.raises(ProtocolError, match=r"an NC came on the bus \(SYNC\)"):

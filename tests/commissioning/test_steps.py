@@ -12,6 +12,7 @@ import pytest
 
 from fdhil.cia402 import Object, State
 from fdhil.commissioning import steps, survey
+from fdhil.commissioning.cycle import Cycle
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.steps import (
     check_axis,
@@ -217,55 +218,59 @@ def test_a_watchdog_that_does_nothing_is_refused(
     assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
 
 
-class LateMaster(Master):
-    """A master on a computer that is held up: in the first ``late`` feedings no heartbeat follows the first one."""
+class LateCycle(Cycle):
+    """A cycle on a computer that is held up: in the first ``late`` feedings no heartbeat follows the first one."""
 
+    master: Master
     late = 0
     trip: Callable[[], None] | None = None
     feedings = 0
     _beating = False
 
     def _send_heartbeat(self) -> None:
-        if self.heartbeat and not self._beating:
+        beats = self.heartbeat is not None
+        if beats and not self._beating:
             self.feedings += 1
             if self.trip is not None:
                 self.trip()
             super()._send_heartbeat()
-        self._beating = self.heartbeat
+        self._beating = beats
         if self.feedings > self.late:
             super()._send_heartbeat()
 
 
 @pytest.fixture
-def fed(peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch) -> Iterator[LateMaster]:
+def fed(peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch) -> Iterator[LateCycle]:
     """A master that feeds the drive for a short time; afterwards the drive watches nobody any more, and is off."""
     monkeypatch.setattr("fdhil.commissioning.watchdog.FEEDING_S", 0.15)
     drive, settings = peer
-    with LateMaster(settings, "X") as master:
-        yield master
+    cycle = LateCycle(settings, settings.bus)
+    cycle.master = Master(settings, "X", cycle)
+    with cycle:
+        yield cycle
     assert drive.drive.power.state.name in ("SWITCH_ON_DISABLED", "FAULT")
     assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
 
 
-def test_a_feeding_that_this_computer_missed_is_tried_again(fed: LateMaster) -> None:
+def test_a_feeding_that_this_computer_missed_is_tried_again(fed: LateCycle) -> None:
     fed.late = 2
-    run_steps(fed, lambda m: watchdog(m) == "proven" or pytest.fail("not proven"))
+    run_steps(fed.master, lambda m: watchdog(m) == "proven" or pytest.fail("not proven"))
     assert 2 < fed.feedings <= FEEDING_TRIES  # this computer may be late once by itself
 
 
-def test_a_computer_that_is_always_late_is_told(fed: LateMaster) -> None:
+def test_a_computer_that_is_always_late_is_told(fed: LateCycle) -> None:
     fed.late = 99
     with pytest.raises(DriveFault, match="missed our heartbeat 4 times; take load off this computer"):
-        run_steps(fed, watchdog)
+        run_steps(fed.master, watchdog)
     assert fed.feedings == FEEDING_TRIES
 
 
 def test_a_drive_that_trips_while_it_is_fed_is_not_tried_again(
-    fed: LateMaster, peer: tuple[DrivePeer, MachineConfig]
+    fed: LateCycle, peer: tuple[DrivePeer, MachineConfig]
 ) -> None:
     fed.trip = lambda: peer[0].drive.trip(0x3210)
     with pytest.raises(DriveFault, match="it fell from Operation enabled to Fault"):
-        run_steps(fed, watchdog)
+        run_steps(fed.master, watchdog)
     assert fed.feedings == 1
 
 

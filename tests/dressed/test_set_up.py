@@ -31,7 +31,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fdhil.commissioning.config_check.LISTEN_S", 0.15)
     monkeypatch.setattr("fdhil.drivers.can.sdo.QUIET_S", 0.1)
     monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.2)
-    monkeypatch.setattr("fdhil.commissioning.master.LOCKSTEP_WAIT_S", 1.0)
+    monkeypatch.setattr("fdhil.commissioning.cycle.LOCKSTEP_WAIT_S", 1.0)
     monkeypatch.setattr("fdhil.commissioning.steps.SETTLE_CYCLES", 120)
     monkeypatch.setattr("fdhil.commissioning.steps.AVERAGE_CYCLES", 60)
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from fdhil.records import frozen
-from fdhil.store.export import export_csv
-from fdhil.store.recording_csv import read_recording
+from fdhil.store.export import export_table, table_of
+from fdhil.store.recordings import read_recording
 from fdhil.store.windows import decode_window, encode_window
 from tests.store.made import window
 
@@ -17,7 +17,7 @@ from tests.store.made import window
 def test_the_csv_has_every_sample_to_the_last_bit_and_no_row_for_a_lost_one(tmp_path: Path) -> None:
     made = window()
     path = tmp_path / "out.csv"
-    export_csv(made, path)
+    export_table(table_of(made), path)
     lines = path.read_text().splitlines()
     headers = dict(line[2:].split(": ", 1) for line in lines if line.startswith("# "))
     body = np.loadtxt(lines, delimiter=",", skiprows=len(headers) + 1)
@@ -36,7 +36,7 @@ def test_the_csv_has_every_sample_to_the_last_bit_and_no_row_for_a_lost_one(tmp_
 def test_a_window_without_a_voltage_is_exported_and_read_again(tmp_path: Path) -> None:
     made = replace(window(), voltage_v=None, torque_constant_nm_per_a=0.3)
     path = tmp_path / "deaf.csv"
-    export_csv(made, path)
+    export_table(table_of(made), path)
     assert "voltage" not in path.read_text()
     read = read_recording(path)
     kept = np.isfinite(made.speed_rad_s)
@@ -55,7 +55,7 @@ def test_what_sensors_at_the_table_told_is_exported_with_its_lost_rows(tmp_path:
     place = np.where(np.arange(made.n) % 7 == 0, np.nan, made.position_mm + 0.01)
     made = replace(made, table_mm=frozen(place), table_m_s2=frozen(np.linspace(-1.0, 1.0, made.n)))
     path = tmp_path / "table.csv"
-    export_csv(made, path)
+    export_table(table_of(made), path)
     read = read_recording(path)
     kept = np.isfinite(made.speed_rad_s)
     assert read.table_mm is not None

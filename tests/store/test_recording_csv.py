@@ -10,7 +10,8 @@ import pytest
 
 from fdhil import csv_text
 from fdhil.errors import RecordingError
-from fdhil.store.recording_csv import parse_recording, read_recording
+from fdhil.store.recording_csv import parse_recording
+from fdhil.store.recordings import read_recording
 from studies import bench
 
 COLUMNS = ("voltage_V", "current_A", "speed_rad_per_s", "position_m", "demand_m")

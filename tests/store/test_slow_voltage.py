@@ -11,8 +11,9 @@ from fdhil.config import Identification
 from fdhil.daemon.outcome_json import as_document
 from fdhil.errors import RecordingError
 from fdhil.pipeline import analyse
-from fdhil.store.export import csv_lines
-from fdhil.store.recording_csv import parse_recording
+from fdhil.records import Window
+from fdhil.store.export import table_of
+from fdhil.store.recording_csv import encode, parse_recording
 from fdhil.store.windows import decode_window, encode_window
 from studies.slow_sensor import slow_windows
 from tests.asked import asked_windows
@@ -47,9 +48,13 @@ def test_what_current_and_speed_alone_tell_has_its_units_in_the_document() -> No
     assert "there is no voltage" in told["L"]["reason"]
 
 
+def _lines(window: Window) -> list[str]:
+    return encode(table_of(window)).decode().splitlines()
+
+
 @pytest.mark.parametrize("period", ["5e-6", "1e-320"])
 def test_samples_closer_than_the_rows_are_refused(period: str) -> None:
-    lines = [line for line in csv_lines(slow_windows(0.005)[0]) if not line.startswith("# voltage_period_s")]
+    lines = [line for line in _lines(slow_windows(0.005)[0]) if not line.startswith("# voltage_period_s")]
     with pytest.raises(RecordingError, match="closer than its rows"):
         parse_recording("\n".join([f"# voltage_period_s: {period}", *lines]) + "\n")
 
@@ -62,7 +67,7 @@ def test_when_each_value_of_a_meter_was_true_is_kept_too() -> None:
     assert back is not None
     assert back.late_s is not None
     np.testing.assert_array_equal(back.late_s, window.slow_voltage.late_s)
-    told = parse_recording("\n".join(csv_lines(window)) + "\n").slow_voltage
+    told = parse_recording(encode(table_of(window)).decode()).slow_voltage
     assert told is not None
     assert told.late_s is not None
     np.testing.assert_array_equal(told.late_s, window.slow_voltage.late_s)
@@ -70,6 +75,6 @@ def test_when_each_value_of_a_meter_was_true_is_kept_too() -> None:
 
 @pytest.mark.parametrize("late", ["0.001", "nonsense", "0.009 " * 500])
 def test_times_that_do_not_fit_the_values_are_refused(late: str) -> None:
-    lines = [line for line in csv_lines(asked_windows()[0]) if not line.startswith("# voltage_late_s")]
+    lines = [line for line in _lines(asked_windows()[0]) if not line.startswith("# voltage_late_s")]
     with pytest.raises(RecordingError, match="do not fit its voltage samples"):
         parse_recording("\n".join([f"# voltage_late_s: {late}", *lines]) + "\n")

@@ -1,0 +1,205 @@
+"""``fdhil commission``: set the drives up step by step, and try them by moving them where the operator allows it."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fdhil import config as machine_config
+from fdhil.cli.commission_guide import Asked, Guide, confirm, room_of, told
+from fdhil.cli.commission_steps import FEEDFORWARD, STEPS, moves_of, planned, trial_moves
+from fdhil.cli.commission_trial import try_commissioned
+from fdhil.errors import ConfigError, ConfigFault, DriveFault
+
+if TYPE_CHECKING:
+    from types import FrameType
+
+    from fdhil.commissioning.progress import Progress
+    from fdhil.config import MachineConfig
+
+SCHEMA = "fdhil-commission-1"
+
+
+@click.command()
+@click.argument("config", type=click.Path(path_type=Path))
+@click.option("--axis", "only", help="Commission this axis; left out: all, one after the other.")
+@click.option("--room", nargs=2, type=float, metavar="BACK FORWARD",
+              help="How far, mm, each axis may go from where it stands: -20 200. It is then tried by a jog and rapids, "
+              "and identified; left out, you are asked, and with --yes it is not tried.")  # fmt: skip
+@click.option("--dry-run", is_flag=True, help="Say what each step does and moves, and send nothing.")
+@click.option("--again", is_flag=True, help="Do all steps anew, also those that were done with this very drive.")
+@click.option(
+    "--set-pdos", is_flag=True, help="Write the PDOs of the drives' profiles, save them in the drives; no more."
+)
+@click.option("--yes", is_flag=True, help="Do not ask before an axis moves, or PDOs are written.")
+@click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
+def commission(
+    config: Path,
+    only: str | None,
+    room: tuple[float, float] | None,
+    dry_run: bool,
+    again: bool,
+    set_pdos: bool,
+    yes: bool,
+    as_json: bool,
+) -> int:
+    """Commission the drives of CONFIG, step by step: what arming a correction asks for.
+
+    The NC must be off, the axis free to move a tenth of a millimetre, and the machine's own safety functions effective.
+    Reads and compares the drive's set-up, asks, switches the drive on, moves the axis by 10 um, finds out where the
+    offset acts, proves the drive's watchdog, and writes the signed record into the store. Where --room allows it, the
+    axis is then jogged, moved as by G0, identified, and compared with what the identified model predicts; each step
+    says before what it moves. A step that was done is not done again while drive and configuration are the same, so
+    what was stopped goes on where it ended. Whatever fails, also Ctrl-C, the axis is braked, the offset goes back to
+    zero and the drive is switched off. With --set-pdos nothing moves: what differs from the profile in the drive's PDOs
+    is written and saved, and that is all. Exit codes: 0 commissioned, 1 refused, by you or because the drive is not set
+    up as it must be, 2 wrong option or configuration, 3 the drive or the bus cannot be reached.
+    """
+    machine = machine_config.load(config)
+    axes = [only] if only else list(machine.axis)
+    if axes[0] not in machine.axis:
+        fault = ConfigFault("--axis", f"there is no axis {only}", f"one of {', '.join(machine.axis)}")
+        raise ConfigError(str(config), [fault])
+    asked = Asked(room_of(room), yes, again, as_json)
+    if dry_run:
+        return _tell_plan(machine, axes, asked)
+    done: dict[str, Any] = {}
+    refused = None
+    with _stopped_like_ctrl_c():
+        for axis in axes:
+            try:
+                done[axis] = _set_pdos(machine, axis, asked) if set_pdos else _commission_axis(machine, axis, asked)
+            except DriveFault as fault_found:
+                refused = str(fault_found)
+                break
+    if as_json:
+        click.echo(json.dumps({"schema": SCHEMA, "axes": done, "refused": refused}))
+    if refused is not None:
+        click.echo(f"refused: {refused}", err=True)
+    return int(refused is not None)
+
+
+@contextmanager
+def _stopped_like_ctrl_c() -> Iterator[None]:
+    """A terminal that closes, or a kill, must leave the drive as Ctrl-C does: braked, offset zero, switched off.
+
+    Only the first of them counts: a second one must not end what brings the axis to a stand.
+    """
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+    def stop(_number: int, _frame: FrameType | None) -> None:
+        for number in numbers:
+            signal.signal(number, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, stop) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _progress_of(machine: MachineConfig, axis: str) -> Progress:
+    from fdhil.commissioning.progress import Progress
+
+    return Progress(machine.store.directory, axis, machine.store.commissioning_key)
+
+
+def _tell_plan(machine: MachineConfig, axes: list[str], asked: Asked) -> int:
+    """Say what would be done; 1 where the room is too small for it."""
+    plans: dict[str, list[dict[str, Any]]] = {}
+    refused = None
+    for axis in axes:
+        try:
+            plans[axis] = planned(machine, axis, asked.room, _progress_of(machine, axis))
+        except DriveFault as fault:
+            refused = str(fault)
+            break
+    if asked.quiet:
+        click.echo(json.dumps({"schema": SCHEMA, "dry_run": True, "axes": plans, "refused": refused}))
+    for axis, steps in plans.items():
+        asked.say(f"axis {axis}, nothing is sent now:")
+        for number, step in enumerate(steps, 1):
+            done = f" Done {step['done_utc']}, kept if the drive is the same." if step["done_utc"] else ""
+            asked.say(f"  {number} {step['step']}: {told(step['does'], step['moves'])}{done}")
+    if refused is not None:
+        click.echo(f"refused: {refused}", err=True)
+    return int(refused is not None)
+
+
+def _commission_axis(machine: MachineConfig, axis: str, asked: Asked) -> dict[str, Any]:
+    """Run all steps for one axis and save its record; DriveFault when it is refused."""
+    from fdhil.cli.bus_lock import lock_bus
+    from fdhil.commissioning import steps
+    from fdhil.commissioning.record import save_record
+
+    progress = _progress_of(machine, axis)
+    if progress.doubt:
+        click.echo(progress.doubt, err=True)
+    if asked.again:
+        progress.forget()
+    if asked.room is not None:
+        trial_moves(machine, axis, asked.room)  # a room that is too small is told before anything is sent
+    with lock_bus(machine.bus[machine.axis[axis].drive.bus]):  # the guard reads the record when it starts
+        record = steps.commission(machine, axis, _commissioning_guide(machine, axis, asked, progress), progress)
+        path = save_record(record, machine.store.directory, machine.store.commissioning_key)
+        asked.say(
+            f"axis {axis} is commissioned: moved {record.sign_test_um:+.1f} um, "
+            f"{FEEDFORWARD[record.offset_in_feedforward]}, watchdog {record.watchdog}; record {path}"
+        )
+        tried = try_commissioned(machine, record, asked, progress)
+    return {**asdict(record), "record": str(path), "digest": record.digest, "trial": tried}
+
+
+def _commissioning_guide(machine: MachineConfig, axis: str, asked: Asked, progress: Progress) -> Callable[[str], None]:
+    """Return the function that tells of each step, and asks before the drive is switched on."""
+    guide = Guide(axis, asked, STEPS, moves_of(machine, axis), progress)
+
+    def report(step: str) -> None:
+        if step == "enable" and not asked.yes:
+            _ask(machine, axis)
+        guide(step)
+
+    return report
+
+
+def _set_pdos(machine: MachineConfig, axis: str, asked: Asked) -> dict[str, Any]:
+    """Set the PDOs of one drive up; DriveFault when it refuses, or the operator does."""
+    from fdhil.cli.bus_lock import lock_bus
+    from fdhil.commissioning.master import Master
+    from fdhil.commissioning.pdo_setup import set_up_pdos
+    from fdhil.drivers.cia402.profile_file import load_profile
+
+    profile = load_profile(machine.axis[axis].drive)
+    if not asked.yes:
+        question = (
+            f"The PDOs of drive {axis} are written as profile {profile.name} has them, and saved in it. May they?"
+        )
+        confirm(axis, question, "nothing was written; start again with --yes where nobody can be asked")
+    with lock_bus(machine.bus[machine.axis[axis].drive.bus]), Master(machine, axis) as master:
+        done = set_up_pdos(master)
+    written = ", ".join(done.written) or "none, all were right"
+    kept = {True: ", saved in the drive", False: ", NOT saved: lost when the drive is off", None: ""}[done.saved]
+    if not asked.quiet:
+        click.echo(f"axis {axis}: PDOs written: {written}{kept}")
+    return {"pdos_written": list(done.written), "saved": done.saved}
+
+
+def _ask(machine: MachineConfig, axis: str) -> None:
+    """Ask before anything moves; DriveFault when the answer is no, or nobody is there to give one."""
+    from fdhil.commissioning.steps import largest_move_um
+
+    question = (
+        f"The set-up of axis {axis} is as it must be. Now the drive is switched on and the axis moves by 10 um, "
+        f"then up to {largest_move_um(machine, axis):.0f} um to and fro. Is it free to move, and may it?"
+    )
+    advice = "nothing was moved or written; start again when it may move, with --yes where nobody can be asked"
+    confirm(axis, question, advice)

@@ -1,0 +1,83 @@
+"""What each step of a commissioning does and moves, in words: said before it, and all together by ``--dry-run``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from fdhil.commissioning.progress import Progress
+    from fdhil.commissioning.strokes import Room
+    from fdhil.config import MachineConfig
+
+STEPS: Mapping[str, str] = {
+    "listen": "Listening: the NC must be off. A bus on which nothing is heard is asked whether the drive is there; "
+    "nothing else is sent.",
+    "compare": "Reading identity, PDO mapping, scale, option codes and following-error window, and comparing them with "
+    "the config. Nothing moves.",
+    "enable": "Starting SYNC and switching the drive on, held where it stands.",
+    "sign test": "Moving the axis by +10 um with the offset 0x60B0: it must be held, added to the demand, and the "
+    "position must follow, in this direction and by this much.",
+    "feed-forward test": "Ramping the offset to and fro: does its slope reach the speed feed-forward? The correction "
+    "depends on the answer.",
+    "watchdog test": "Sending our heartbeat, then keeping it back: the drive must stop by itself, as it must when "
+    "fdhil dies.",
+    "restore": "Taking the offset to zero, switching the drive off and giving back what was changed.",
+}
+FEEDFORWARD: Mapping[bool | None, str] = {
+    True: "the speed feed-forward sees the offset",
+    False: "the speed feed-forward does not see the offset",
+    None: "whether the speed feed-forward sees the offset could not be told, and arming will be refused",
+}
+NOTHING = "nothing"
+
+
+TRIAL: Mapping[str, str] = {
+    "timing": "Starting SYNC, the drive switched off: how evenly does it come, and how soon does the drive answer?",
+    "jog": "Switching the drive on and moving the axis slowly: its way, and the unit and sign of speed, current and "
+    "voltage must be right.",
+    "test rapids": "Moving the axis as fast as G0, and listening as the daemon does; while it accelerates the motor "
+    "must take power.",
+    "restore": "Switching the drive off and giving back what was changed.",
+    "identification": "Identifying the drive from them.",
+    "acceptance": "Comparing the last two with what the identified model predicts.",
+}
+
+
+def moves_of(machine: MachineConfig, axis: str) -> dict[str, str]:
+    """Return what each of the ``STEPS`` moves."""
+    from fdhil.commissioning.steps import RAMPS, SIGN_TEST_UM, largest_move_um
+
+    largest = largest_move_um(machine, axis)
+    return dict.fromkeys(STEPS, NOTHING) | {
+        "enable": "nothing but what holding it takes",
+        "sign test": f"{SIGN_TEST_UM:g} um toward plus and back, by the offset",
+        "feed-forward test": f"{largest:.0f} um toward plus and back, by the offset, {RAMPS // 2} times",
+        "watchdog test": "nothing; the drive stops by itself and is switched on again",
+    }
+
+
+def trial_moves(machine: MachineConfig, axis: str, room: Room) -> dict[str, str]:
+    """Return what each step of the ``TRIAL`` moves; DriveFault where the room is too small."""
+    from fdhil.commissioning.strokes import plan_jog, plan_rapid
+    from fdhil.commissioning.trial import RAPIDS
+
+    settings = machine.axis[axis]
+    jog, rapid = plan_jog(axis, settings, room), plan_rapid(axis, settings, room)
+    return dict.fromkeys(TRIAL, NOTHING) | {
+        "jog": f"{jog}, and back",
+        "test rapids": f"{rapid} with {rapid.acceleration_mm_s2:g} mm/s2, and back, {RAPIDS // 2} times",
+    }
+
+
+def planned(machine: MachineConfig, axis: str, room: Room | None, progress: Progress) -> list[dict[str, Any]]:
+    """Return all steps of an axis, what each does and moves, and when it was done if it was; nothing is sent."""
+    done = progress.done()
+    steps = [(STEPS, moves_of(machine, axis))]
+    if room is not None:
+        steps.append((TRIAL, trial_moves(machine, axis, room)))
+    return [
+        {"step": step, "does": texts[step], "moves": moved, "done_utc": done.get(step)}
+        for texts, moves in steps
+        for step, moved in moves.items()
+    ]

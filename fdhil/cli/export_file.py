@@ -1,0 +1,36 @@
+"""Which way a file goes from one format to another: a recording, or a log of the bus."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fdhil import tables
+from fdhil.store import suffixes
+from fdhil.store.export import export_table
+from fdhil.store.output import open_output
+from fdhil.store.recordings import read_table
+
+
+def export_file(recording: Path, out: Path, format_name: str | None, columns: Path | None) -> dict[str, Any]:
+    """Write ``recording`` to ``out`` and return what ``--json`` tells of it; click.BadParameter for what cannot be."""
+    suffix = out.suffix.lower()
+    name = format_name or suffixes.RECORDINGS.get(suffix) or suffixes.BUS_LOGS.get(suffix) or "csv"
+    is_log = recording.suffix.lower() in suffixes.BUS_LOGS
+    if is_log != (name in suffixes.BUS_LOGS.values()):
+        what, others = "a recording", [*tables.RECORDING_FORMATS]
+        if is_log:
+            what, others = "a log of the bus", [*suffixes.BUS_LOGS.values()]
+        raise click.BadParameter(f"{recording} is {what}, which becomes {', '.join(others)}", param_hint="--format")
+    if is_log:
+        from fdhil.drivers.can.bus_log import converted_log
+
+        content, frames = converted_log(recording, suffixes.suffix_of(suffixes.BUS_LOGS, name))
+        with open_output(out) as file:
+            file.write(content)
+        return {"format": name, "frames": frames}
+    table = read_table(recording, columns)
+    export_table(table, out, name)
+    return {"format": name, "axis": table.headers.get("axis"), "rows": next(iter(table.columns.values())).size}

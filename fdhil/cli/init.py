@@ -1,0 +1,172 @@
+"""``fdhil init``: from nothing to a machine's configuration, by asking the NC's files, the drives and the operator."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fdhil import config as machine_config
+from fdhil.cli.options import OutputFile, Writing
+from fdhil.errors import ConfigError, ConfigFault, OutputError
+
+if TYPE_CHECKING:
+    from fdhil.commissioning.init.draft import Asked, Draft
+    from fdhil.commissioning.init.drives import FoundBus
+    from fdhil.commissioning.init.making import Look
+    from fdhil.commissioning.init.told import Told
+
+SCHEMA = "fdhil-init-1"
+MAX_ANSWER_BYTES = 256 * 1024
+INTERFACES = Path("/sys/class/net")
+CAN_TYPE = "280"  # ARPHRD_CAN of the kernel
+NEXT = (
+    ("doctor", "what is still wrong with this PC, bus and drives"),
+    ("check", "whether the drives are as the file says"),
+    ("commission", "prove what a correction needs; nothing is sent before"),
+    ("run", "listen, identify, predict"),
+)
+
+
+@click.command(cls=Writing)
+@click.argument("file", type=OutputFile(".toml"))
+@click.option("--answers", type=click.Path(path_type=Path),
+              help="TOML with answers, its keys those of the configuration; then nothing is asked.")  # fmt: skip
+@click.option("--from-linuxcnc", "ini", type=click.Path(path_type=Path), metavar="INI",
+              help="Take axes, speeds and scales from this LinuxCNC machine and its HAL files.")  # fmt: skip
+@click.option("--eds", "places", multiple=True, type=click.Path(path_type=Path),
+              help="EDS or DCF file, or a folder of them; left out: the folder of FILE.")  # fmt: skip
+@click.option("--offline", is_flag=True, help="Look at no bus: what drives would tell is asked.")
+@click.option("--dry-run", is_flag=True, help="Write no file; print what it would be.")
+@click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
+def init(
+    file: Path,
+    answers: Path | None,
+    ini: Path | None,
+    places: tuple[Path, ...],
+    offline: bool,
+    dry_run: bool,
+    as_json: bool,
+) -> None:
+    """Make the configuration FILE of a machine, from nothing: an NC's own files, the drives, then questions.
+
+    Reads LinuxCNC's files where they are named, listens to the CAN bus and, where no NC runs it, asks the drives for
+    their scales and ratings; what nobody tells is asked, with a proposal where one can be made. Nothing is written to a
+    drive, nothing moves, and a file that is there is never overwritten. Each value stands in FILE with who said so.
+    Exit codes: 0 made, 2 something is not known or cannot be, 3 a bus, drive or file cannot be reached.
+    """
+    if file.exists() and not dry_run:
+        raise OutputError(f"{file} is there already, and init never overwrites; name another file, or move it away")
+    given = _answers(answers) if answers is not None else {}
+    from fdhil.commissioning.init.linuxcnc import read_linuxcnc  # late: --help imports nothing heavy
+    from fdhil.commissioning.init.making import conclude, make
+
+    nc = read_linuxcnc(ini) if ini is not None else None
+    ask = _ask if answers is None and not as_json else None
+    draft = make(file, given, nc, ask, None if offline else _look(places, file.parent), _can_interface())
+    text = conclude(draft, file)
+    if not dry_run:
+        with file.open("x", encoding="utf-8") as out:  # whatever came there meanwhile is kept
+            out.write(text)
+    if as_json:
+        click.echo(json.dumps(_document(draft, file, text, dry_run)))
+    elif dry_run:
+        click.echo(text, nl=False)
+    _tell(draft, file, dry_run, as_json)
+
+
+def _answers(path: Path) -> Mapping[str, Any]:
+    try:
+        with path.open("rb") as file:
+            raw = file.read(MAX_ANSWER_BYTES + 1)
+    except OSError as error:
+        fault = ConfigFault("--answers", f"cannot be read: {error.strerror}", "check the path")
+        raise ConfigError(str(path), [fault]) from None
+    if len(raw) > MAX_ANSWER_BYTES:
+        raise ConfigError(str(path), [ConfigFault("--answers", "is larger than 256 KiB", "answers are a few kB")])
+    return machine_config.toml_document(raw, str(path))
+
+
+def _look(places: Sequence[Path], folder: Path) -> Look:
+    """Return what looks at a bus, with the EDS files that were named, or lie in the folder."""
+    from fdhil.commissioning.init.drives import find_drives
+    from fdhil.commissioning.scan import read_descriptions
+
+    descriptions, faults = read_descriptions(places or [folder])
+    if faults and places:
+        raise faults[0]
+
+    def look(name: str, settings: machine_config.CanBus) -> FoundBus:
+        click.echo(f"listening on bus {name}, then asking the drives; nothing is written to them", err=True)
+        found = find_drives(name, settings, descriptions)
+        for drive in found.drives:
+            click.echo(f"  {drive.name}: profile {drive.profile or 'not known'}", err=True)
+        return found
+
+    return look
+
+
+def _can_interface() -> Told | None:
+    """Return the name of this PC's CAN interface, None where it has none; of several, the first."""
+    from fdhil.commissioning.init.told import Told
+
+    found = [place.parent.name for place in sorted(INTERFACES.glob("*/type")) if place.read_text().strip() == CAN_TYPE]
+    source = "this PC's CAN interface" if len(found) == 1 else f"guessed: the first of {', '.join(found)}"
+    return Told(found[0], source, len(found) > 1) if found else None
+
+
+def _ask(asked: Asked) -> Any:
+    """Ask the operator until the answer is a possible value; None where the proposal is taken."""
+    click.echo(f"\n{asked.path}: {asked.meaning}" if asked.meaning else f"\n{asked.path}", err=True)
+    click.echo(f"  where: {asked.where}", err=True)
+    if asked.proposal is not None:
+        click.echo(f"  proposed: {asked.proposal.value} ({asked.proposal.source})", err=True)
+    while True:
+        default = None if asked.proposal is None else str(asked.proposal.value)
+        said = str(click.prompt("  value", default=default, show_default=default is not None, err=True)).strip()
+        if said == default:
+            return None
+        try:
+            return asked.check(said)
+        except ConfigError as error:
+            click.echo(f"  {error.faults[0].what}; once more", err=True)
+
+
+def _document(draft: Draft, file: Path, text: str, dry_run: bool) -> dict[str, Any]:
+    values = [
+        {"path": path, "value": told.value, "source": told.source, "guessed": told.guessed}
+        for path, told in draft.values.items()
+    ]
+    return {
+        "schema": SCHEMA,
+        "file": str(file),
+        "written": not dry_run,
+        "values": values,
+        "notes": draft.notes,
+        "text": text,
+    }
+
+
+def _tell(draft: Draft, file: Path, dry_run: bool, quiet: bool) -> None:
+    """Say what is guessed, what was noticed, and how it goes on; on stderr where stdout has the file or JSON."""
+    from fdhil.commissioning.init.making import guessed
+
+    if quiet:
+        return
+
+    def say(line: str) -> None:
+        click.echo(line, err=dry_run)
+
+    done = "would be written" if dry_run else "is written"
+    say(f"{file} {done}: {len(draft.values)} values, {len(guessed(draft))} of them guessed")
+    for path in guessed(draft):
+        say(f"  check {path} = {draft.get(path)}: {draft.values[path].source}")
+    for note in draft.notes:
+        say(f"note: {note}")
+    for command, why in NEXT:
+        say(f"next: fdhil {command} {file}  ({why})")
+    sys.stdout.flush()

@@ -1,0 +1,228 @@
+"""Turns the cycle of the buses that fdhil runs itself: SYNC, the set-points that the next SYNC latches, what came.
+
+One thread does it all by absolute deadlines, and everything that is sent in time leaves from its turn, so a program
+that hangs sends nothing more: the drives' own watchdogs see that.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterable
+from typing import Protocol, Self
+
+from fdhil import cia402
+from fdhil.commissioning.realtime import prioritise
+from fdhil.commissioning.set_points import SetPoints
+from fdhil.commissioning.transmit import TransmitBus
+from fdhil.config import MachineConfig
+from fdhil.errors import DeviceError
+
+LOCKSTEP_WAIT_S = 8.0
+MOST_CYCLE_US = 20_000
+
+
+class Member(Protocol):
+    """A drive that takes part in the cycle."""
+
+    bus: TransmitBus
+    axis: str
+    target: int | None
+
+    @property
+    def behind(self) -> int:
+        """How many SYNCs it has not answered."""
+
+    @property
+    def position(self) -> int | None:
+        """Its newest position in increments."""
+
+    def take(self, can_id: int, data: bytes) -> None:
+        """Take a frame that was heard on its bus."""
+
+    def send_set_points(self) -> None:
+        """Send what the next SYNC latches."""
+
+
+class Lateness:
+    """How late each SYNC left after its deadline, counted by microseconds; ``skipped``: cycles the computer missed."""
+
+    def __init__(self) -> None:
+        self.counts = [0] * (MOST_CYCLE_US + 1)
+        self.cycles = self.skipped = 0
+        self.most_us = 0.0
+
+    def add(self, late_s: float) -> None:
+        """Count one SYNC."""
+        late_us = max(0.0, late_s * 1e6)
+        self.counts[min(int(late_us), MOST_CYCLE_US)] += 1
+        self.cycles += 1
+        self.most_us = max(self.most_us, late_us)
+
+    def quantile_us(self, share: float) -> float:
+        """Return the lateness that this share of the SYNCs kept."""
+        wanted, seen = share * self.cycles, 0
+        for late_us, count in enumerate(self.counts):
+            seen += count
+            if seen >= wanted and seen:
+                return float(late_us)
+        return self.most_us
+
+
+class Cycle:
+    """The thread that runs some buses; a context manager. Nothing is sent before ``produce_sync`` or by the members.
+
+    ``path`` gives the members' set-points while it is there, in their order; ``failure`` is what ended the thread.
+    ``realtime``: it asks for a real-time priority; ``scheduling`` says what it was given.
+    """
+
+    def __init__(self, config: MachineConfig, buses: Iterable[str], *, realtime: bool = False) -> None:
+        self.config = config
+        self.period_s = config.machine.sync_period_s
+        self.buses = {name: TransmitBus(name, config.bus[name]) for name in buses}
+        self.members: list[Member] = []
+        self.path: SetPoints | None = None
+        self.heartbeat: int | None = None
+        self.heartbeat_s = config.guard.heartbeat_s
+        self.count = 0
+        self.lateness = Lateness()
+        self.failure: DeviceError | None = None
+        self.scheduling = ""
+        self._realtime = realtime
+        self.lockstep = config.guard.clock == "sync"
+        self._sync_counter = 0
+        self._sync_overflow: int | None = None
+        self._wait_until = 0.0
+        self._heartbeat_due = 0.0
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="fdhil-cycle", daemon=True)
+
+    def start(self) -> None:
+        """Begin to turn."""
+        self._thread.start()
+
+    def _run(self) -> None:
+        if self._realtime:
+            self.scheduling = prioritise()
+        due = time.monotonic()
+        try:
+            while not self._stopping.is_set():
+                due = self._turn(due)
+        except DeviceError as error:
+            self.failure = error
+
+    def _turn(self, due: float) -> float:
+        """Send what is due at ``due``, take what came, and return the next deadline after having waited for it."""
+        if self.lockstep:
+            self._receive()
+        self._send_heartbeat()
+        if self._sync_overflow is not None and not self._awaits_drive():
+            self._send_sync()
+            self.lateness.add(time.monotonic() - due)
+            self._send_set_points()
+        if not self.lockstep:
+            self._receive()
+        due += self.period_s
+        now = time.monotonic()
+        if now > due + self.period_s:  # no SYNC is sent twice as fast to catch up
+            self.lateness.skipped += int((now - due) / self.period_s)
+            due = now
+        time.sleep(max(0.0, due - now))
+        return due
+
+    def _awaits_drive(self) -> bool:
+        """Whether a simulated drive has yet to answer the last SYNC: its process may sleep, and time is the SYNC count.
+
+        One that has not answered in ``LOCKSTEP_WAIT_S`` is not waited for until it answers again.
+        """
+        return (
+            self.lockstep
+            and any(0 < member.behind <= 1 for member in self.members)
+            and time.monotonic() < self._wait_until
+        )
+
+    def _send_heartbeat(self) -> None:
+        now = time.monotonic()
+        if self.heartbeat is not None and now >= self._heartbeat_due:
+            self._heartbeat_due = now + self.heartbeat_s
+            for bus in self.buses.values():
+                bus.send(cia402.COB_HEARTBEAT + self.heartbeat, bytes([cia402.Nmt.OPERATIONAL]))
+
+    def _send_sync(self) -> None:
+        data = b""
+        if self._sync_overflow:
+            self._sync_counter = self._sync_counter % self._sync_overflow + 1
+            data = bytes([self._sync_counter])
+        for bus in self.buses.values():
+            bus.send(cia402.COB_SYNC, data)
+        self.count += 1
+        self._wait_until = time.monotonic() + LOCKSTEP_WAIT_S
+
+    def _send_set_points(self) -> None:
+        """Send what the next SYNC latches."""
+        path = self.path
+        if path is not None:
+            targets = path.step([member.position for member in self.members])
+            for member, target in zip(self.members, targets, strict=True):
+                member.target = target
+        for member in self.members:
+            member.send_set_points()
+
+    def _receive(self) -> None:
+        for bus in self.buses.values():
+            frames = bus.drain()
+            if not frames.size:
+                continue
+            members = [member for member in self.members if member.bus is bus]
+            columns = (frames[name].tolist() for name in ("id", "dlc", "data"))
+            for can_id, length, data in zip(*columns, strict=True):
+                payload = data.to_bytes(8, "little")[:length]
+                for member in members:
+                    member.take(can_id, payload)
+
+    # what is asked of it --------------------------------------------------------------------------------------
+
+    def produce_sync(self, overflow: int) -> None:
+        """Send SYNC from now on, with a counter up to ``overflow`` (0: without)."""
+        self._sync_overflow = overflow
+
+    @property
+    def producing(self) -> bool:
+        """Whether SYNC is being sent."""
+        return self._sync_overflow is not None
+
+    @property
+    def turning(self) -> bool:
+        """Whether set-points leave."""
+        return self.producing and not self.lost and self._thread.is_alive()
+
+    def stop_sync(self) -> None:
+        """Send SYNC and set-points no more."""
+        self._sync_overflow = None
+
+    @property
+    def lost(self) -> bool:
+        """Whether a bus has ended, or takes nothing more."""
+        return self.failure is not None or any(bus.ended is not None for bus in self.buses.values())
+
+    def check(self) -> None:
+        """Raise what ended the thread or a bus."""
+        if self.failure is not None:
+            raise self.failure
+        for bus in self.buses.values():
+            if bus.ended is not None:
+                raise DeviceError(f"bus {bus.name}", f"{bus.ended}; start again when the bus is back")
+
+    def close(self) -> None:
+        """Stop sending and release the buses."""
+        self._stopping.set()
+        self._thread.join(timeout=2.0)
+        for bus in self.buses.values():
+            bus.close()
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()

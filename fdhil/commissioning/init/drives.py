@@ -1,0 +1,167 @@
+"""Finds the drives on a bus and asks each, by SDO, for what a configuration has of it. Nothing is written to a drive.
+
+Where an NC runs the bus nothing is sent at all; the drives are then known by their node-IDs alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+from fdhil import tables
+from fdhil.cia402 import LOGICAL_AXIS_STEP, Object
+from fdhil.commissioning.compare_scales import Read, increments_told
+from fdhil.commissioning.init.told import Told, rounded
+from fdhil.commissioning.scan import Answers, BusScanner, Description, best_description, scan_nodes
+from fdhil.config import CanBus
+from fdhil.drivers.cia402.abilities import GENERIC, suggest_profile
+from fdhil.drivers.cia402.device import read_device
+from fdhil.drivers.cia402.profile import DriveProfile, speed_unit_of
+from fdhil.drivers.cia402.profile_file import read_profile
+
+TWIN, TWIN_VENDOR = "fdhil_twin", 0x46444849
+MOST_AXES = 8
+MAX_CURRENT, DC_LINK_VOLTAGE = 0x6073, 0x6079
+NO_WINDOW = (0, 0xFFFFFFFF)
+
+
+@dataclass(frozen=True, slots=True)
+class FoundDrive:
+    """A drive, or one axis of a device with several; ``told`` by key within [axis.X], its window and cycle apart."""
+
+    bus: str
+    node_id: int
+    label: str
+    logical_axis: int = 1
+    profile: str | None = None
+    eds: Path | None = None
+    told: Mapping[str, Told] = field(default_factory=dict)
+    window_increments: int | None = None
+    cycle_s: float | None = None
+
+    @property
+    def name(self) -> str:
+        """How it is shown: its node-ID and what it says it is."""
+        axis = f", axis {self.logical_axis} of it" if self.logical_axis > 1 else ""
+        return f"node {self.node_id}{axis} ({self.label})"
+
+
+@dataclass(frozen=True, slots=True)
+class FoundBus:
+    """A bus; ``master`` shows that an NC runs it, None where nothing does."""
+
+    name: str
+    master: str | None
+    sync_period_s: float | None
+    drives: tuple[FoundDrive, ...]
+
+
+def find_drives(name: str, settings: CanBus, descriptions: Sequence[Description]) -> FoundBus:
+    """Listen to a bus, then ask its nodes; ConnectError when it cannot be reached or is silent."""
+    with BusScanner(name, settings) as bus:
+        scan = scan_nodes(bus, {}, descriptions)
+        drives: list[FoundDrive] = []
+        for node in scan.nodes:
+            if node.answers is not None:
+                drives += _asked(bus, node.node_id, node.answers, descriptions)
+            elif scan.master is not None:
+                drives.append(FoundDrive(name, node.node_id, "heard beside the NC, not asked"))
+        return FoundBus(name, scan.master, scan.sync_period_s, tuple(drives))
+
+
+def _asked(bus: BusScanner, node_id: int, said: Answers, descriptions: Sequence[Description]) -> Iterator[FoundDrive]:
+    """Yield the axes of a node that is a drive; nothing for any other node."""
+    best = best_description(said.identity, descriptions)
+    eds = best[0].path if best else None
+    profile = suggested(said, eds, partial(_number, bus, node_id, 1))
+    label = f"{said.name or 'unnamed'}, vendor {said.identity.vendor_id:08X}, serial {said.identity.serial}"
+    for axis in range(1, MOST_AXES + 1):
+        read = partial(_number, bus, node_id, axis)
+        if read(Object.STATUSWORD, 0) is None:
+            return
+        told = dict(told_by(read, None if profile is None else read_profile(profile, _needed(profile, eds))))
+        window = read(Object.FOLLOWING_ERROR_WINDOW, 0)
+        yield FoundDrive(bus.name, node_id, label, axis, profile, eds, told, window, _cycle_s(read))
+
+
+def _number(bus: BusScanner, node_id: int, axis: int, index: int, sub: int) -> int | None:
+    up = (axis - 1) * LOGICAL_AXIS_STEP if 0x6000 <= index < 0x6800 else 0
+    data = bus.read(node_id, index + up, sub)
+    return None if data is None else int.from_bytes(data, "little")
+
+
+def _cycle_s(read: Read) -> float | None:
+    """The period over which it interpolates set-points (0x60C2), None where it does not tell a possible one."""
+    count, exponent = read(Object.INTERPOLATION_PERIOD, 1), read(Object.INTERPOLATION_PERIOD, 2)
+    if not count or exponent is None:
+        return None
+    period_s = float(count * 10.0 ** ((exponent ^ 0x80) - 0x80))
+    return rounded(period_s) if 1e-4 <= period_s <= 0.02 else None
+
+
+def _needed(profile: str, eds: Path | None) -> Path | None:
+    return eds if profile == GENERIC else None
+
+
+def suggested(said: Answers, eds: Path | None, read: Read) -> str | None:
+    """Return the profile for a drive: by its EDS, else of its maker's the one whose objects it has; None without."""
+    who = said.identity
+    if who.vendor_id == TWIN_VENDOR:
+        return TWIN
+    if eds is not None:
+        return suggest_profile(read_device(eds))
+    if not who.vendor_id:
+        return None
+    profiles = {name: read_profile(name) for name in tables.DRIVE_PROFILES if name != GENERIC}
+    own = {name: profile for name, profile in profiles.items() if profile.vendor_id == who.vendor_id}
+    if len(own) < 2:
+        return next(iter(own), None)
+    return min(own, key=lambda name: sum(read(*key) is None for key in _mapped(own[name])))
+
+
+def _mapped(profile: DriveProfile) -> list[tuple[int, int]]:
+    return [(entry.index, entry.sub) for spec in profile.tpdos for entry in spec.entries]
+
+
+def told_by(read: Read, profile: DriveProfile | None) -> Iterator[tuple[str, Told]]:
+    """Yield what a drive tells of its scales and limits, by key within [axis.X]."""
+    if (turn := increments_told(read)) is not None and turn[0] >= 4:
+        yield "drive.increments_per_rev", Told(round(turn[0]), f"the drive: {turn[1]}")
+    unit = speed_unit_of(read(Object.VELOCITY_UNIT, 0))
+    if profile is not None and unit is not None and unit != profile.speed_unit:
+        yield "drive.speed_unit", Told(unit, "the drive: 0x60A9")
+    yield from _ratings(read, "permille_of_rated" if profile is None else profile.current_unit)
+    yield from _dc_link(read, profile)
+
+
+def _ratings(read: Read, current_unit: str) -> Iterator[tuple[str, Told]]:
+    """Yield the rated values that the drive's current is counted in, the largest current, and K by both of them."""
+    rated_ma, rated_mnm = read(Object.RATED_CURRENT, 0), read(Object.RATED_TORQUE, 0)
+    if rated_ma and current_unit in ("permille_of_rated", "share_of_rated"):
+        yield "drive.rated_current_a", Told(rounded(rated_ma / 1e3), "the drive: 0x6075")
+    if rated_ma and (share := read(MAX_CURRENT, 0)):
+        yield "regulators.current_limit_a", Told(rounded(share * rated_ma / 1e6), "the drive: 0x6073 of 0x6075")
+    if rated_mnm and current_unit == "permille_of_rated_torque":
+        yield "drive.rated_torque_nm", Told(rounded(rated_mnm / 1e3), "the drive: 0x6076")
+    if rated_ma and rated_mnm:
+        source = "guessed: the drive's rated torque over rated current, 0x6076 over 0x6075"
+        yield "nominal.K", Told(rounded(rated_mnm / rated_ma), source, guessed=True)
+
+
+def _dc_link(read: Read, profile: DriveProfile | None) -> Iterator[tuple[str, Told]]:
+    """Yield the DC link's volts, which bound the motor's voltage, from the maker's object or 0x6079 (mV)."""
+    own = profile.dc_link if profile is not None else None
+    for key, volts in ((own, profile.dc_link_v_per_count if profile else 0.0), ((DC_LINK_VOLTAGE, 0), 1e-3)):
+        if key is not None and (counts := read(*key)):
+            link = Told(rounded(counts * volts), f"the drive: its DC link now, {key[0]:04X}:{key[1]:02X}")
+            yield "regulators.voltage_limit_v", link
+            if needs_dc_link(profile):
+                yield "drive.dc_link_v", link
+            return
+
+
+def needs_dc_link(profile: DriveProfile | None) -> bool:
+    """Whether the configuration must say the DC link's volts: the voltage is a duty, and no TPDO tells them."""
+    return profile is not None and profile.duty_per_count > 0 and len(profile.voltage_objects) == 1

@@ -1,0 +1,260 @@
+"""Makes the values of a machine: takes what files and drives tell, asks for the rest, proposes what can be guessed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from fdhil.commissioning.init.draft import OPERATOR, Draft
+from fdhil.commissioning.init.drives import FoundBus, FoundDrive, needs_dc_link
+from fdhil.commissioning.init.linuxcnc import Machine, Scale
+from fdhil.commissioning.init.questions import QUESTIONS, Question
+from fdhil.commissioning.init.told import Told, rounded
+from fdhil.config import Drive
+from fdhil.config.reading import checked
+from fdhil.drivers.cia402.abilities import GENERIC
+from fdhil.drivers.cia402.profile import DriveProfile
+from fdhil.drivers.cia402.profile_file import NO_OFFSET_ADVICE, load_profile, no_offset
+from fdhil.errors import ConfigError, ConfigFault
+
+UNITS_OF_CURRENT = {
+    "drive.rated_current_a": ("permille_of_rated", "share_of_rated"),
+    "drive.rated_torque_nm": ("permille_of_rated_torque",),
+}
+NO_OTHER_WINDOW = (0, 0xFFFFFFFF)
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """The drives that were found; ``complete``: there are no others, for the nodes of every bus were asked."""
+
+    drives: Sequence[FoundDrive]
+    complete: bool
+
+
+def settle_machine(draft: Draft, buses: Sequence[FoundBus], name: str) -> None:
+    """Settle [machine]: its name, and the SYNC period that files, answers or the bus tell."""
+    draft.settle("machine.name", "any name", Told(name, "guessed: the file's name", guessed=True))
+    for bus in buses:
+        if bus.master is not None:
+            draft.notes.append(
+                f"bus {bus.name}: an NC runs it ({bus.master} heard), so no drive was asked; with the NC off init "
+                "takes scales and ratings from the drives"
+            )
+        if bus.sync_period_s is not None:
+            draft.tell("machine.sync_period_s", Told(_cycle(bus.sync_period_s), "heard: SYNC on the bus"))
+    cycles = {drive.cycle_s for bus in buses for drive in bus.drives} - {None}
+    usual = Told(0.001, "guessed: usual; it is the NC's cycle", guessed=True)
+    if len(cycles) == 1:
+        usual = Told(cycles.pop(), "guessed: the drives' own cycle, 0x60C2; it must be the NC's", guessed=True)
+    draft.settle("machine.sync_period_s", "the NC's cycle: how often it sends SYNC", usual)
+
+
+def _cycle(heard_s: float) -> float:
+    """Return the period that an NC is set to, a multiple of a quarter of a millisecond, where one is near.
+
+    >>> _cycle(0.000993), _cycle(0.0011)
+    (0.001, 0.0011)
+    """
+    usual_s = max(1, round(heard_s / 0.00025)) * 0.00025
+    return rounded(usual_s if abs(heard_s - usual_s) < 0.05 * usual_s else round(heard_s, 5))
+
+
+def axis_names(draft: Draft, nc: Machine | None, drives: Sequence[FoundDrive]) -> list[str]:
+    """Return the axes' letters: the NC's and the answers', else those that the operator gives."""
+    named = [path.split(".")[1] for path in draft.values if path.startswith("axis.")]
+    names = list(dict.fromkeys([*(nc.axes if nc else ()), *named]))
+    if names:
+        return names
+    usual = "XYZUVW"[: len(drives)] or "X"
+    draft.settle("axes", "their letters in the NC's programs", Told(usual, "one for each drive", True), _letters)
+    told = draft.values.pop("axes")
+    return list(dict.fromkeys(told.value))
+
+
+def _letters(said: str) -> str:
+    letters = "".join(said.upper().replace(",", " ").split())
+    if not (letters.isascii() and letters.isalpha()):
+        raise ConfigError("axes", [ConfigFault("axes", "must be letters, as X Y Z")])
+    return letters
+
+
+def _one_of(path: str, words: Sequence[str], said: str) -> str:
+    if said not in words:
+        raise ConfigError(path, [ConfigFault(path, f"must be {' or '.join(words)}")])
+    return said
+
+
+def settle_axis(
+    draft: Draft,
+    axis: str,
+    others: Sequence[str],
+    found: Found,
+    nc: Machine | None,
+    folder: Path,
+) -> None:
+    """Settle [axis.X]; ``others`` are the axes before it, ``found`` what is on the buses."""
+    drive = _settle_drive(draft, axis, others, found)
+    profile = _settle_profile(draft, axis, drive, folder)
+    for key, told in (drive.told if drive is not None else {}).items():
+        draft.tell(f"axis.{axis}.{key}", told)
+    _settle_scale(draft, axis, nc.scales.get(axis) if nc else None, others)
+    for question in QUESTIONS[1:]:
+        if _applies(question.key, profile):
+            _settle(draft, axis, question, others)
+    if drive is not None:
+        _tell_window(draft, axis, drive.window_increments)
+    _settle_correction(draft, axis, profile)
+    if profile is not None and not profile.voltage_objects and not draft.has_table(f"axis.{axis}.voltage"):
+        draft.notes.append(
+            f"axis {axis}: profile {profile.name} tells no voltage of the motor; K, inertia and friction are "
+            "identified, R and L stay as given, until a sensor is wired (docs/how-to/voltage-sensor.md)"
+        )
+
+
+def _settle_drive(draft: Draft, axis: str, others: Sequence[str], found: Found) -> FoundDrive | None:
+    """Settle which drive moves the axis; return it where it was found on a bus."""
+    path = f"axis.{axis}.drive"
+    taken = [_place(draft, other) for other in others]
+    free = [drive for drive in found.drives if (drive.bus, drive.node_id, drive.logical_axis) not in taken]
+    if f"{path}.node_id" not in draft.values:
+        next_id = Told(max((place[1] for place in taken), default=0) + 1, "guessed: in the order of the axes", True)
+        if found.complete and not free:
+            what = f"has no drive: {len(found.drives)} found, {len(others)} given to other axes"
+            advice = "check its supply and wiring, or leave the axis out; --offline looks at no bus"
+            draft.missing.append(ConfigFault(path, what, advice))
+            return None
+        only = found.complete and len(found.drives) == 1
+        first = (
+            Told(free[0].node_id, "the drive on the bus" if only else "guessed: in the order on the bus", not only)
+            if free
+            else next_id
+        )
+        where = "found: " + "; ".join(drive.name for drive in free) if free else "the drive's switches or tool"
+        draft.settle(f"{path}.node_id", where, first)
+    chosen = _place(draft, axis)
+    alike = [drive for drive in free if drive.node_id == chosen[1]]
+    exact = [drive for drive in alike if drive.logical_axis == chosen[2]]
+    drive = next(iter(exact or ([] if f"{path}.logical_axis" in draft.values else alike)), None)
+    if drive is None and found.complete:
+        what = f"is {chosen[1]}, which is not on the bus"
+        draft.missing.append(ConfigFault(f"{path}.node_id", what, "; ".join(d.name for d in free) or "none is left"))
+    if drive is not None:
+        _tell_place(draft, path, drive)
+    return drive
+
+
+def _place(draft: Draft, axis: str) -> tuple[str, int, int]:
+    path = f"axis.{axis}.drive"
+    return draft.get(f"{path}.bus") or "can0", draft.get(f"{path}.node_id") or 0, draft.get(f"{path}.logical_axis") or 1
+
+
+def _tell_place(draft: Draft, path: str, drive: FoundDrive) -> None:
+    if drive.bus != "can0":
+        draft.tell(f"{path}.bus", Told(drive.bus, "found on the bus"))
+    if drive.logical_axis != 1:
+        draft.tell(f"{path}.logical_axis", Told(drive.logical_axis, "found on the bus"))
+
+
+def _settle_profile(draft: Draft, axis: str, drive: FoundDrive | None, folder: Path) -> DriveProfile | None:
+    """Settle the drive's profile, and its EDS where that is needed; return it, None where it is not known."""
+    path = f"axis.{axis}.drive"
+    if drive is not None and drive.profile is not None:
+        by = f"by its EDS {drive.eds.name}" if drive.eds else "by its vendor number"
+        draft.tell(f"{path}.profile", Told(drive.profile, f"{by}: {drive.label}"))
+    draft.settle(f"{path}.profile", "`fdhil eds` suggests one by the drive's EDS; cia402 takes what that offers")
+    if draft.get(f"{path}.profile") == GENERIC:
+        if drive is not None and drive.eds is not None:
+            draft.tell(f"{path}.eds", Told(_from(drive.eds, folder), "fits the drive on the bus"))
+        draft.settle(f"{path}.eds", "the drive's maker has it on his pages; put it beside this file, or give --eds")
+    keys = ("profile", "eds", "logical_axis")
+    given = {key: value for key in keys if (value := draft.get(f"{path}.{key}")) is not None}
+    if "profile" not in given or (given["profile"] == GENERIC and "eds" not in given):
+        return None
+    return load_profile(checked(Drive, given, path).placed(folder))
+
+
+def _from(path: Path, folder: Path) -> str:
+    """Return a path as it is written into a file of ``folder``."""
+    path, folder = path.resolve(), folder.resolve()
+    return str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
+
+
+def _settle_scale(draft: Draft, axis: str, scale: Scale | None, others: Sequence[str]) -> None:
+    """Of the NC's scale, the drive's increments and the pitch two tell the third; all three must agree."""
+    turn, pitch = f"axis.{axis}.drive.increments_per_rev", f"axis.{axis}.screw_pitch_mm"
+    if scale is not None:
+        per_mm = abs(scale.increments_per_mm)
+        if draft.get(turn) and pitch not in draft.values:
+            draft.tell(pitch, Told(rounded(draft.get(turn) / per_mm), f"{scale.source}, and the drive's increments"))
+        if scale.increments_per_mm < 0:
+            draft.tell(f"axis.{axis}.drive.sign", Told(-1, f"{scale.source} is negative"))
+    _settle(draft, axis, QUESTIONS[0], others)
+    if scale is None or draft.get(pitch) is None:
+        return
+    if turn not in draft.values:
+        draft.tell(turn, Told(round(per_mm * draft.get(pitch)), f"{scale.source}, times the pitch"))
+    found = draft.get(turn) / draft.get(pitch)
+    if abs(found - per_mm) > 1e-3 * per_mm:
+        draft.notes.append(
+            f"axis {axis}: {scale.source} is {per_mm:g} increments/mm, the drive and the pitch make {found:g}: one of "
+            "the three is wrong, or the NC's scale counts something else; measure before anything moves"
+        )
+
+
+def _applies(key: str, profile: DriveProfile | None) -> bool:
+    if key in UNITS_OF_CURRENT:
+        return profile is not None and profile.current_unit in UNITS_OF_CURRENT[key]
+    return key != "drive.dc_link_v" or needs_dc_link(profile)
+
+
+def _settle(draft: Draft, axis: str, question: Question, others: Sequence[str]) -> None:
+    """Settle one key; where nothing tells or guesses it, a former axis' value is proposed to whoever is asked."""
+    path = f"axis.{axis}.{question.key}"
+    proposal = _guess(draft, axis, question)
+    if proposal is None and draft.ask is not None:
+        former = [(other, told) for other in others if (told := draft.values.get(f"axis.{other}.{question.key}"))]
+        if former:
+            proposal = Told(former[-1][1].value, f"guessed: as axis {former[-1][0]}", guessed=True)
+    if proposal is None and question.guess is not None and question.follows and path not in draft.values:
+        return  # what it follows from is missing, and is told
+    draft.settle(path, question.where, proposal)
+
+
+def _guess(draft: Draft, axis: str, question: Question) -> Told | None:
+    here = f"axis.{axis}."
+    known = {path.removeprefix(here): told.value for path, told in draft.values.items() if path.startswith(here)}
+    try:
+        value: Any = question.guess(known) if question.guess is not None else None
+    except (KeyError, TypeError, ZeroDivisionError):  # too little is known, or an answer is no number
+        return None
+    return None if value is None else Told(rounded(value), f"guessed: {question.how}", guessed=True)
+
+
+def _tell_window(draft: Draft, axis: str, increments: int | None) -> None:
+    """The drive's own following-error window goes before that of the NC."""
+    turn, pitch = draft.get(f"axis.{axis}.drive.increments_per_rev"), draft.get(f"axis.{axis}.screw_pitch_mm")
+    path = f"axis.{axis}.drive.following_error_window_mm"
+    if increments in (None, *NO_OTHER_WINDOW) or not turn or not pitch:
+        return
+    told = Told(rounded(increments * pitch / turn), "the drive: 0x6065")
+    known = draft.values.get(path)
+    if known is not None and known.source.startswith("LinuxCNC"):
+        del draft.values[path]
+    draft.tell(path, told)
+
+
+def _settle_correction(draft: Draft, axis: str, profile: DriveProfile | None) -> None:
+    """Writing stays off unless somebody asks for it; even then nothing is sent before commissioning and arming."""
+    path = f"axis.{axis}.correction"
+    if not draft.has_table(path) and draft.ask is not None:
+        where = "yes or no; even with yes nothing is sent before `fdhil commission` and `fdhil arm`"
+        no = Told("no", "nothing is written to a drive unless it is asked for", guessed=True)
+        draft.settle(path, where, no, partial(_one_of, path, ("yes", "no")))
+        if draft.values.pop(path).value == "yes":
+            draft.values[path] = Told({}, OPERATOR)
+    if draft.has_table(path) and profile is not None and not profile.takes_offset:
+        draft.notes.append(f"axis {axis}: {no_offset(profile)}; {NO_OFFSET_ADVICE}")

@@ -1,0 +1,217 @@
+"""Takes from a LinuxCNC machine's own INI and HAL files what a configuration needs: axes, speeds, scales, the period.
+
+Units: the INI's own ([TRAJ] LINEAR_UNITS) are taken to millimetres. The smaller of [JOINT_n], [AXIS_x] and [TRAJ]
+holds, as it does in LinuxCNC's motion controller. Rotary axes and the second joint of a gantry are told and left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from fdhil.commissioning.init.linuxcnc_text import Hal, Ini, finite, parse_hal, parse_ini
+from fdhil.commissioning.init.told import Told, rounded
+from fdhil.errors import ConfigError, ConfigFault
+
+HAL_LIBRARY = Path("/usr/share/linuxcnc/hallib")
+MAX_BYTES = 1024 * 1024
+UNITS_MM = {"mm": 1.0, "metric": 1.0, "inch": 25.4, "in": 25.4, "imperial": 25.4}
+ROTARY = "ABC"
+_SCALE_PINS = ("position-scale", "pos-scale", "scale")
+_SCALE_KEYS = ("SCALE", "INPUT_SCALE", "ENCODER_SCALE", "STEP_SCALE")
+LARGEST_OFFSET_MM = 0.25  # the ceiling of [axis.X.correction]
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """Increments per millimetre, negative where the drive counts against the axis, and where it was read."""
+
+    increments_per_mm: float
+    source: str
+
+
+@dataclass(slots=True)
+class Machine:
+    """What the files tell: values by their key in the configuration, scales by axis, the axes' letters, remarks."""
+
+    told: dict[str, Told] = field(default_factory=dict)
+    scales: dict[str, Scale] = field(default_factory=dict)
+    axes: tuple[str, ...] = ()
+    notes: list[str] = field(default_factory=list)
+
+
+def read_linuxcnc(path: Path) -> Machine:
+    """Read a machine's INI and the HAL files that it names; ConfigError where the INI tells no machine."""
+    folder = path.parent
+    try:
+        ini = parse_ini(_text(path), lambda name: _text(folder / name))
+    except (OSError, ValueError) as error:
+        name = Path(getattr(error, "filename", None) or path).name
+        what = f"{name} cannot be read: {getattr(error, 'strerror', None) or error}"
+        raise _fault(path, "file", what, "give the INI with which LinuxCNC is started") from None
+    hal, notes = _read_hal(ini, folder)
+    machine = machine_of(ini, hal, path)
+    machine.notes = notes + machine.notes
+    return machine
+
+
+def _text(path: Path) -> str:
+    with path.open("rb") as file:
+        raw = file.read(MAX_BYTES + 1)
+    if len(raw) > MAX_BYTES:
+        raise ValueError("it is larger than 1 MiB")
+    return raw.decode("utf-8", "replace")
+
+
+def _read_hal(ini: Ini, folder: Path) -> tuple[Hal, list[str]]:
+    """Read the HAL files in their order; one that cannot be read, or is Tcl, is told."""
+    hal, notes = Hal(), []
+    for line in ini.all("HAL", "HALFILE"):
+        name = line.split()[0] if line.split() else ""
+        place = folder / name
+        if name.startswith("LIB:") or not place.exists():  # as LinuxCNC looks for them
+            place = HAL_LIBRARY / name.removeprefix("LIB:")
+        if not name.endswith(".hal"):
+            notes.append(f"HALFILE {name} was not read: it is no plain HAL file; scales set there are asked for")
+            continue
+        try:
+            parse_hal(_text(place), ini, lambda other: _text(folder / other), hal)
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
+            notes.append(f"HALFILE {name} was not read ({reason}); scales set there are asked for")
+    for line in ini.all("HAL", "HALCMD"):
+        parse_hal(line, ini, lambda _name: "", hal)
+    return hal, notes
+
+
+def machine_of(ini: Ini, hal: Hal, path: Path) -> Machine:
+    """Return what the parsed files tell; ConfigError where they tell no machine with linear axes."""
+    if "AXIS_0" in ini.sections and "JOINT_0" not in ini.sections:
+        what = "is of a LinuxCNC before 2.8: it has [AXIS_0] and no [JOINT_0]"
+        raise _fault(path, "AXIS_0", what, "convert it with LinuxCNC's update_ini")
+    unit_mm = _unit_mm(ini, path)
+    machine = Machine()
+    joints = _joints(ini, machine.notes)
+    if not joints:
+        advice = "[TRAJ] COORDINATES names the axes and [JOINT_n] describes each"
+        raise _fault(path, "TRAJ.COORDINATES", "names no linear axis with a joint", advice)
+    machine.axes = tuple(joints)
+    _common(ini, machine)
+    for letter, joint in joints.items():
+        _axis(ini, hal, letter, joint, unit_mm, machine)
+    return machine
+
+
+def _unit_mm(ini: Ini, path: Path) -> float:
+    """Return the machine's unit of length in millimetres; LinuxCNC also takes the number of units in a millimetre."""
+    named = ini.text("TRAJ", "LINEAR_UNITS").lower() or "mm"
+    per_mm = finite(named)
+    if named not in UNITS_MM and not (per_mm and per_mm > 0):
+        raise _fault(path, "TRAJ.LINEAR_UNITS", f"is {named[:40]!r}", f"one of {', '.join(UNITS_MM)}")
+    return 1.0 / per_mm if per_mm else UNITS_MM[named]
+
+
+def _joints(ini: Ini, notes: list[str]) -> dict[str, int]:
+    """Return the joint of each linear axis."""
+    kinematics = ini.text("KINS", "KINEMATICS").split()
+    told = next((word[12:] for word in kinematics if word.lower().startswith("coordinates=")), "")
+    letters = "".join((told or ini.text("TRAJ", "COORDINATES")).upper().split())
+    if kinematics and kinematics[0] != "trivkins":
+        notes.append(f"KINEMATICS {kinematics[0]}: fdhil takes each joint for the axis of its place in {letters}")
+    joints: dict[str, int] = {}
+    for joint, letter in enumerate(letters):
+        section = f"JOINT_{joint}"
+        if letter in ROTARY or ini.text(section, "TYPE").upper() == "ANGULAR":
+            notes.append(f"axis {letter} (joint {joint}) is rotary and left out: fdhil knows linear feed drives")
+        elif letter in joints:
+            notes.append(
+                f"axis {letter} has joint {joint} besides joint {joints[letter]} (a gantry); it is left out: "
+                "give its drive an axis of its own, by another letter, to watch it; correct none of the two"
+            )
+        elif letter.isalpha() and letter.isascii() and section in ini.sections:
+            joints[letter] = joint
+    return joints
+
+
+def _common(ini: Ini, machine: Machine) -> None:
+    if name := "".join(letter for letter in ini.text("EMC", "MACHINE") if letter.isprintable())[:64].strip():
+        machine.told["machine.name"] = Told(name, "LinuxCNC: [EMC] MACHINE")
+    period_ns = ini.number("EMCMOT", "SERVO_PERIOD")
+    if period_ns:
+        machine.told["machine.sync_period_s"] = Told(rounded(period_ns * 1e-9), "LinuxCNC: [EMCMOT] SERVO_PERIOD")
+    machine.told["nc.profile"] = Told("linuxcnc", "LinuxCNC plans the moves")
+
+
+def _axis(ini: Ini, hal: Hal, letter: str, joint: int, unit_mm: float, machine: Machine) -> None:
+    told, here = machine.told, f"axis.{letter}"
+    for key, name, path_name in (
+        ("rapid_speed_mm_s", "MAX_VELOCITY", "MAX_LINEAR_VELOCITY"),
+        ("max_acceleration_mm_s2", "MAX_ACCELERATION", "MAX_LINEAR_ACCELERATION"),
+    ):
+        places = ((f"JOINT_{joint}", name), (f"AXIS_{letter}", name), ("TRAJ", path_name))
+        found = [(value, place) for place in places if (value := ini.number(*place)) is not None and value > 0]
+        if found:
+            value, (section, used) = min(found, key=lambda one: one[0])
+            told[f"{here}.{key}"] = Told(rounded(value * unit_mm), f"LinuxCNC: [{section}] {used}")
+    ferror = ini.number(f"JOINT_{joint}", "FERROR")
+    if ferror is not None and ferror > 0:
+        source = f"LinuxCNC: [JOINT_{joint}] FERROR; the drive's own 0x6065 is compared by fdhil check"
+        told[f"{here}.drive.following_error_window_mm"] = Told(rounded(ferror * unit_mm), source)
+    scale = _scale(ini, hal, joint, unit_mm)
+    if scale is not None:
+        machine.scales[letter] = scale
+    machine.notes += _beside(ini, hal, letter, joint, unit_mm)
+
+
+def _scale(ini: Ini, hal: Hal, joint: int, unit_mm: float) -> Scale | None:
+    """Return the scale that HAL sets on what is wired to the joint's feedback or command, else the INI's."""
+    for pin in (f"joint.{joint}.motor-pos-fb", f"joint.{joint}.motor-pos-cmd"):
+        for component in hal.around(pin):
+            for name in _SCALE_PINS:
+                value = finite(hal.given.get(f"{component}.{name}", ""))
+                if value:
+                    return Scale(value / unit_mm, f"LinuxCNC: {component}.{name}")
+    for key in _SCALE_KEYS:
+        value = ini.number(f"JOINT_{joint}", key)
+        if value:
+            return Scale(value / unit_mm, f"LinuxCNC: [JOINT_{joint}] {key}")
+    return None
+
+
+def _beside(ini: Ini, hal: Hal, letter: str, joint: int, unit_mm: float) -> Iterator[str]:
+    """Say what LinuxCNC itself corrects, and what that means beside fdhil's offsets."""
+    section = f"JOINT_{joint}"
+    if (ini.number(section, "BACKLASH") or 0.0) > 0 or ini.text(section, "COMP_FILE"):
+        yield (
+            f"axis {letter}: LinuxCNC compensates backlash or the screw ([{section}] BACKLASH, COMP_FILE); leave that "
+            "on: fdhil sees it in the demand, and judges programs by a recorded demand (fdhil record)"
+        )
+    if (ini.number(f"AXIS_{letter}", "OFFSET_AV_RATIO") or 0.0) > 0:
+        yield (
+            f"axis {letter}: external offsets are allowed ([AXIS_{letter}] OFFSET_AV_RATIO); keep them off while a "
+            "correction is armed: the path would not be the one that was checked, and the guard refuses it"
+        )
+    loops = [name for name in hal.around(f"joint.{joint}.motor-pos-cmd") if name.startswith("pid.")]
+    for loop in loops:
+        gains = _gains(hal.given, loop)
+        yield (
+            f"axis {letter}: HAL's {loop} closes the position loop ({gains}); fdhil corrects drives that get position "
+            "set-points (0x607A) as they are: wire joint's motor-pos-cmd to the drive, and switch this loop off"
+        )
+    least = ini.number(section, "MIN_FERROR")
+    if least is not None and 0 < least * unit_mm < 2 * LARGEST_OFFSET_MM:
+        yield (
+            f"axis {letter}: [{section}] MIN_FERROR is {least * unit_mm:g} mm; an offset is a following error "
+            f"to LinuxCNC: keep correction.max_offset_um below a quarter of it, or raise it to "
+            f"{4 * LARGEST_OFFSET_MM:g} mm"
+        )
+
+
+def _gains(settings: Mapping[str, str], loop: str) -> str:
+    found = [(name, settings.get(f"{loop}.{name}")) for name in ("Pgain", "FF1", "FF2")]
+    return ", ".join(f"{name} {value}" for name, value in found if value is not None) or "gains unknown"
+
+
+def _fault(path: Path, where: str, what: str, advice: str) -> ConfigError:
+    return ConfigError(str(path), [ConfigFault(where, what, advice)])

@@ -1,0 +1,141 @@
+"""Makes a machine's configuration file: the order of the questions, the last check, and the text."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from fdhil.commissioning.init.draft import Ask, Draft
+from fdhil.commissioning.init.drives import FoundBus
+from fdhil.commissioning.init.interview import Found, axis_names, settle_axis, settle_machine
+from fdhil.commissioning.init.linuxcnc import Machine
+from fdhil.commissioning.init.told import Told
+from fdhil.config import CanBus, CorrectionLimits, parse, toml_document, unlikely
+from fdhil.config.axis import Axis
+from fdhil.config.offset_bounds import limit_faults
+from fdhil.config.reading import checked
+from fdhil.config.template import filled
+from fdhil.errors import ConfigError
+
+Look = Callable[[str, CanBus], FoundBus]
+"""Find the drives on a bus; ConnectError."""
+
+# from the gentlest on: what an axis of coarse increments, or an odd SYNC period, can keep
+LIMITS: tuple[Mapping[str, float], ...] = (
+    {},
+    {"max_speed_mm_s": 5.0, "max_acceleration_mm_s2": 1000.0},
+    {"max_speed_mm_s": 20.0, "max_acceleration_mm_s2": 2000.0},
+    {"max_offset_um": 100.0, "max_speed_mm_s": 20.0, "max_acceleration_mm_s2": 2000.0},
+    {"max_offset_um": 250.0, "max_speed_mm_s": 20.0, "max_acceleration_mm_s2": 2000.0},
+)
+
+
+def make(
+    file: Path,
+    answers: Mapping[str, Any],
+    nc: Machine | None = None,
+    ask: Ask | None = None,
+    look: Look | None = None,
+    interface: Told | None = None,
+) -> Draft:
+    """Return a draft of the machine's configuration; ``look`` None: no bus is looked at.
+
+    ``interface`` is the CAN interface that this PC has. ConfigError with everything that is not known, where nobody
+    can be asked; ConnectError.
+    """
+    draft = Draft(ask)
+    draft.take(answers)
+    if draft.missing:
+        raise ConfigError(str(file), draft.missing)
+    for path, told in (nc.told if nc else {}).items():
+        draft.tell(path, told)
+    draft.notes += nc.notes if nc else []
+    ways = list(_buses(draft, interface, offline=look is None))
+    buses = [look(name, settings) for name, settings in ways] if look else []
+    settle_machine(draft, buses, file.stem)
+    drives = [drive for bus in buses for drive in bus.drives]
+    complete = bool(buses) and all(bus.master is None for bus in buses)
+    names = axis_names(draft, nc, drives)
+    for place, axis in enumerate(names):
+        settle_axis(draft, axis, names[:place], Found(drives, complete), nc, file.parent)
+    if draft.missing:
+        raise ConfigError(str(file), draft.missing)
+    for axis in names:
+        _fit_limits(draft, axis)
+    return draft
+
+
+def _buses(draft: Draft, interface: Told | None, *, offline: bool) -> Iterator[tuple[str, CanBus]]:
+    """Settle the way onto the bus and yield its settings; several where the answers have several."""
+    if not draft.has_table("bus"):
+        where = "socketcan for an adapter that `ip link` lists; docs/how-to/can-adapter.md has the others"
+        if interface is None and offline:
+            interface = Told("can0", "guessed: no bus was looked at", guessed=True)
+        way = None if interface is None else replace(interface, value="socketcan")
+        draft.settle("bus.can0.interface", where, way)
+        if draft.get("bus.can0.interface") == "socketcand":
+            draft.settle("bus.can0.port", "the hub tells it when it starts; `fdhil sim` does")
+        elif "bus.can0.interface" in draft.values:
+            draft.settle("bus.can0.channel", "the interface's name, as `ip link` lists it", interface)
+    if draft.missing:
+        raise ConfigError("bus", draft.missing)
+    for name, settings in draft.document.get("bus", {}).items():
+        yield name, checked(CanBus, settings, f"bus.{name}")
+
+
+def _fit_limits(draft: Draft, axis: str) -> None:
+    """Where the correction's own limits were left open, take the first that the axis' increments can keep."""
+    path = f"axis.{axis}.correction"
+    if draft.get(path) != {}:
+        return
+    document = draft.document
+    table = {key: value for key, value in document["axis"][axis].items() if key != "correction"}
+    bare = checked(Axis, table, f"axis.{axis}")
+    for limits in LIMITS:
+        tried = bare.model_copy(update={"correction": CorrectionLimits(**limits)})
+        if not limit_faults(tried, float(draft.get("machine.sync_period_s"))):
+            if limits:
+                del draft.values[path]
+            for key, value in limits.items():
+                source = "guessed: the gentlest that these increments can keep"
+                draft.values[f"{path}.{key}"] = Told(value, source, guessed=True)
+            return
+
+
+def conclude(draft: Draft, file: Path) -> str:
+    """Return the file's text. What cannot be of one machine is asked again; ConfigError where nobody can be asked.
+
+    What can be, but hardly is, is noted.
+    """
+    while True:
+        text = text_of(draft, file)
+        try:
+            config = parse(toml_document(text.encode(), str(file)), str(file), file.parent)
+        except ConfigError as error:
+            wrong = [fault for fault in error.faults if fault.path in draft.values]
+            if draft.ask is None or not wrong:
+                raise
+            for fault in wrong:
+                kept = draft.values[fault.path]
+                draft.values[fault.path] = Told(kept.value, "as it was", guessed=True)
+                draft.settle(fault.path, f"it cannot be: {fault.what}")
+        else:
+            draft.notes += unlikely(config)
+            return text
+
+
+def text_of(draft: Draft, file: Path) -> str:
+    """Return the commented file."""
+    guessed = sum(told.guessed for told in draft.values.values())
+    head = (
+        f"{file.name}, made by fdhil init. Behind each value stands who said so; {guessed} are guessed: check these. "
+        "A line that begins with # and no space is a setting at its default; the comment above a line says what it is."
+    )
+    return filled(draft.document, {path: told.source for path, told in draft.values.items()}, head)
+
+
+def guessed(draft: Draft) -> Sequence[str]:
+    """Return the paths of the values that nobody told."""
+    return [path for path, told in draft.values.items() if told.guessed]

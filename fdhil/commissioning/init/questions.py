@@ -1,0 +1,122 @@
+"""What is asked about an axis: in which order, where the answer is found, and what is proposed where it can be guessed.
+
+What a key means is its description in ``fdhil/config``; here stands only where to look. A proposal is calculated from
+what is known by then, in the keys of [axis.X].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+Known = Mapping[str, Any]
+Guess = Callable[[Known], Any]
+"""Propose a value from what is known; KeyError where that is too little."""
+
+FRICTION_SHARE = 0.05
+CURRENT_LOOP_HZ, SPEED_LOOP_HZ, SPEED_CORNER_HZ = 400.0, 40.0, 8.0
+USUAL_KV = 50.0
+_PEAK = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """A key of [axis.X], ``where`` its value is found, a ``guess`` and the words for ``how`` it was made.
+
+    ``follows``: the guess is always possible once the others are known, so that the key itself is never missing.
+    """
+
+    key: str
+    where: str
+    guess: Guess | None = None
+    how: str = ""
+    follows: bool = True
+
+
+def _torque_nm(known: Known) -> float:
+    """A motor's continuous torque, as far as it can be told."""
+    current = known.get("drive.rated_current_a") or known["regulators.current_limit_a"] / _PEAK
+    return float(known["nominal.K"] * current)
+
+
+def _rapid_rad_s(known: Known) -> float:
+    return float(known["rapid_speed_mm_s"] / known["screw_pitch_mm"] * 2 * math.pi)
+
+
+DRIVE_TOOL = "the drive's own tool shows it; where it is unknown take the proposal: fdhil tells later whether it fits"
+SHEET = "the motor's data sheet"
+QUESTIONS = (
+    Question(
+        "screw_pitch_mm",
+        "the screw's label, or its drawing; behind a gear: what the table travels in one turn of the motor",
+    ),
+    Question("drive.increments_per_rev", "the drive's tool: what its position counts in one turn of the motor"),
+    Question("rapid_speed_mm_s", "the NC's parameter for rapids; 1 m/min is 16.67 mm/s"),
+    Question("max_acceleration_mm_s2", "the NC's parameter for the axis; 1 m/s2 is 1000 mm/s2"),
+    Question("drive.rated_current_a", "the drive's tool or object 0x6075; often the motor's continuous current"),
+    Question("drive.rated_torque_nm", "the drive's tool or object 0x6076; often the motor's continuous torque"),
+    Question("drive.dc_link_v", "the drive's display, or a meter at its DC link"),
+    Question("nominal.R", f"{SHEET}, at 20 degC; for three phases that of one phase, half of terminal to terminal"),
+    Question("nominal.L", f"{SHEET}, in henry: 5 mH is 0.005; for three phases that of one phase"),
+    Question("nominal.K", f"{SHEET}: torque per ampere of what the drive calls its current"),
+    Question(
+        "nominal.Jt",
+        f"the rotor's ({SHEET}) plus the screw's plus the table's mass in kg times (pitch in m / 6.283) squared",
+    ),
+    Question(
+        "regulators.current_limit_a",
+        f"the largest current; {DRIVE_TOOL}",
+        lambda known: _PEAK * known["drive.rated_current_a"],
+        "twice the rated current",
+        follows=False,
+    ),
+    Question(
+        "regulators.voltage_limit_v",
+        "the DC link's voltage: the drive's display, or the mains' voltage times 1.41 behind a rectifier",
+        lambda known: known["drive.dc_link_v"],
+        "the DC link's voltage",
+        follows=False,
+    ),
+    Question(
+        "nominal.ft",
+        "take the proposal: the first rapids tell it",
+        lambda known: FRICTION_SHARE * _torque_nm(known) / _rapid_rad_s(known),
+        "5 % of the continuous torque in a rapid; the first rapids tell it",
+    ),
+    Question(
+        "nominal.Cd",
+        "take the proposal: the first rapids tell it",
+        lambda known: FRICTION_SHARE * _torque_nm(known),
+        "5 % of the continuous torque; the first rapids tell it",
+    ),
+    Question("regulators.position_gain_per_s", f"Kv; {DRIVE_TOOL}", lambda _known: USUAL_KV, "a usual value"),
+    Question(
+        "regulators.speed_feedforward", f"1 is all of it; {DRIVE_TOOL}", lambda _known: 1.0, "all of it, as is usual"
+    ),
+    Question(
+        "regulators.speed_kp",
+        DRIVE_TOOL,
+        lambda known: 2 * math.pi * SPEED_LOOP_HZ * known["nominal.Jt"] / known["nominal.K"],
+        f"a speed loop of {SPEED_LOOP_HZ:g} Hz for this inertia",
+    ),
+    Question(
+        "regulators.speed_ki",
+        DRIVE_TOOL,
+        lambda known: 2 * math.pi * SPEED_CORNER_HZ * known["regulators.speed_kp"],
+        f"its integral part from {SPEED_CORNER_HZ:g} Hz down",
+    ),
+    Question(
+        "regulators.current_kp",
+        DRIVE_TOOL,
+        lambda known: 2 * math.pi * CURRENT_LOOP_HZ * known["nominal.L"],
+        f"a current loop of {CURRENT_LOOP_HZ:g} Hz for this winding",
+    ),
+    Question(
+        "regulators.current_ki",
+        DRIVE_TOOL,
+        lambda known: 2 * math.pi * CURRENT_LOOP_HZ * known["nominal.R"],
+        f"a current loop of {CURRENT_LOOP_HZ:g} Hz for this winding",
+    ),
+)

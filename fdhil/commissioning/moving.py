@@ -1,0 +1,105 @@
+"""Moves axes that are held in Operation enabled; whatever ends a motion ends it by a braking ramp."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+from fdhil.cia402 import State
+from fdhil.commissioning.cycle import Cycle
+from fdhil.commissioning.master import Master
+from fdhil.commissioning.set_points import Bounds, SetPoints
+from fdhil.errors import DriveFault
+from fdhil.records import Float
+
+ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+PATIENCE = 20.0  # times as long as the set-points take
+SILENT_CYCLES = 20
+LAG_CYCLES = 300  # an axis may follow so much later than its last set-point
+
+
+def move(
+    masters: Sequence[Master],
+    bounds: Sequence[Bounds],
+    rows: Float,
+    each_turn: Callable[[], None] = lambda: None,
+) -> None:
+    """Play rows of increments (one column per master) to enabled drives of one cycle, and return when they rest there.
+
+    DriveFault where a row would leave its bounds or an axis does not follow: the axes were braked then. Whatever else
+    interrupts it, Ctrl-C too, the axes are braked before it is raised. ``each_turn`` is called while it waits.
+    """
+    loop = masters[0].loop
+    with following(masters, bounds) as path:
+        path.play(rows.tolist())
+        seconds = PATIENCE * (len(rows) + LAG_CYCLES) * loop.period_s + 5.0
+        masters[0].wait(lambda: _settled(masters, path, each_turn), seconds, "the set-points were not sent; check load")
+    if path.stopped is not None:
+        raise DriveFault("the motion", f"was stopped: {path.stopped}; find the cause before anything moves again")
+
+
+def _settled(masters: Sequence[Master], path: SetPoints, each_turn: Callable[[], None]) -> bool:
+    watch_power(masters, path)
+    each_turn()
+    return path.resting
+
+
+def watch_power(masters: Sequence[Master], path: SetPoints) -> None:
+    """Stop all axes when one of them is not in Operation enabled any more, is silent, or another master is heard."""
+    for master in masters:
+        if master.behind > SILENT_CYCLES:
+            path.stop(f"axis {master.axis}: nothing was heard of its drive for {SILENT_CYCLES} SYNC")
+        if master.state() is not State.OPERATION_ENABLED:
+            told = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[-1:]]
+            why = f" (EMCY {told[0]:04X})" if told and told[0] else ""
+            path.stop(f"axis {master.axis}: its drive fell from Operation enabled to {master.state().value}{why}")
+        if master.heard.master is not None:
+            path.stop(f"another master sends {master.heard.master} on the bus of axis {master.axis}")
+
+
+@contextlib.contextmanager
+def following(masters: Sequence[Master], bounds: Sequence[Bounds]) -> Iterator[SetPoints]:
+    """Have the masters' set-points come from a path that begins where they are held; at the end it is braked to rest.
+
+    The masters are all the members of their cycle; they hold what was sent last afterwards.
+    """
+    loop = masters[0].loop
+    path = SetPoints(bounds, [_held(master) for master in masters])
+    loop.path = path
+    try:
+        yield path
+    finally:
+        if not path.resting:
+            path.stop("it was interrupted")
+        with undisturbed():
+            brake(loop, path)
+        loop.path = None
+
+
+@contextlib.contextmanager
+def undisturbed() -> Iterator[None]:
+    """Take no notice of a second Ctrl-C while the axes are braked."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in ENDING_SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _held(master: Master) -> int:
+    if master.target is None:
+        raise DriveFault(master.device, "nothing is held, so that nothing can be moved; enable it first")
+    return master.target
+
+
+def brake(loop: Cycle, path: SetPoints) -> None:
+    """Wait until the path rests; a cycle that does not turn sends nothing, and the drives' own watchdogs act."""
+    while not path.resting and loop.turning:
+        time.sleep(loop.period_s)

@@ -1,0 +1,94 @@
+"""Hears one axis as the daemon would, while the commissioning moves it: the records of its drive and its sensors."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable
+from typing import Self
+
+from fdhil.config import MachineConfig
+from fdhil.drivers import open_machine
+from fdhil.errors import DeviceError
+from fdhil.pipeline import Record
+from fdhil.pipeline.recent_samples import RecentSamples
+from fdhil.records import AxisSamples, NcState, Notice, Recording, TableSamples, TickTimes, VoltageSamples
+
+LONGEST_S = 600.0
+
+
+class Overhearing:
+    """The records of one axis, gathered in a thread of its own until it is closed; a context manager.
+
+    It listens by a connection of its own: what is judged is what went over the bus. ``records`` grow while it is open.
+    """
+
+    def __init__(self, config: MachineConfig, axis: str, rapid_mm_s: float | None = None) -> None:
+        """``rapid_mm_s`` is the speed of the rapids that will be seen; left out: the axis' own."""
+        self._config, self.axis = alone(config, axis, rapid_mm_s), axis
+        self.records: list[Record] = []
+        self._opened = threading.Event()
+        self._stop: Callable[[], object] = lambda: None
+        self._failure: DeviceError | None = None
+        self._thread = threading.Thread(target=self._run, name="fdhil-overhearing", daemon=True)
+
+    def _run(self) -> None:
+        try:
+            asyncio.run(self._gather())
+        except DeviceError as error:
+            self._failure = error
+        finally:
+            self._opened.set()
+
+    async def _gather(self) -> None:
+        async with open_machine(self._config) as source:
+            running = asyncio.create_task(source.run(self._take))
+            loop = asyncio.get_running_loop()
+            self._stop = lambda: loop.call_soon_threadsafe(running.cancel)
+            self._opened.set()
+            await asyncio.wait([running])
+
+    def _take(self, record: Record | NcState | Notice) -> None:
+        if not isinstance(record, NcState | Notice):
+            self.records.append(record)
+
+    @property
+    def newest_tick(self) -> int:
+        """The newest tick of the axis that was heard, -1 before the first."""
+        blocks = (r for r in reversed(list(self.records)) if isinstance(r, AxisSamples) and r.tick.size)
+        return next((int(block.tick[-1]) for block in blocks), -1)
+
+    def check(self) -> None:
+        """Raise what ended the listening: a ConnectError of the bus or a sensor."""
+        if self._failure is not None:
+            raise self._failure
+
+    def recording(self) -> Recording:
+        """Return all rows that were heard."""
+        period_s = self._config.machine.sync_period_s
+        recent = RecentSamples(self.axis, self._config.axis[self.axis], round(LONGEST_S / period_s), period_s)
+        for record in self.records:
+            if isinstance(record, AxisSamples | VoltageSamples | TableSamples | TickTimes):
+                recent.add(record)
+        return recent.cut(0, self.newest_tick + 1)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        self._opened.wait()
+        self.check()
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        if self._thread.is_alive():
+            self._stop()
+        self._thread.join()
+
+
+def alone(config: MachineConfig, axis: str, rapid_mm_s: float | None = None) -> MachineConfig:
+    """Return the configuration of one axis alone, whose rapids are told by its demand: no NC is there to tell them."""
+    settings = config.axis[axis]
+    drive = settings.drive.model_copy(update={"node_id": config.node_id(axis)})
+    rapid = rapid_mm_s or settings.rapid_speed_mm_s
+    settings = settings.model_copy(update={"drive": drive, "rapid_speed_mm_s": rapid})
+    g0 = config.g0.model_copy(update={"source": "inferred"})
+    return config.model_copy(update={"axis": {axis: settings}, "g0": g0})

@@ -1,0 +1,120 @@
+"""Tells by a move to and fro whether speed, current and voltage have their unit and their sign. Pure.
+
+What is spent on a way that ends where it began is friction and heat alone, whatever weight or spring pulls at the
+axis: the integrals of i w, u i and u w over it are positive, and each needs two signs to be right (FAULTS B10).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from fdhil.commissioning.finding import Finding
+from fdhil.records import Float, Recording
+
+SPEED_TOLERANCE = 0.05
+TRAVEL_TOLERANCE = 0.02
+TABLE_TOLERANCE = 0.05  # backlash on a jog of 5 mm is less
+LEAST_CORRELATION = 0.05  # of two signals, by which the sign of their product is told
+RESTING = 0.2  # of the top speed: slower rows tell of offsets and rounding
+CODE = "SignOrScale"
+
+
+def judge_jog(jog: Recording, distance_mm: float) -> Iterator[Finding]:
+    """Compare what was heard of a jog over ``distance_mm`` and back with what an axis with right units shows."""
+    asked = abs(distance_mm)
+    way = float(np.nanmax(np.abs(jog.position_mm - jog.position_mm[np.isfinite(jog.position_mm)][0])))
+    cause = f"{CODE}: it was to go {asked:g} mm and its position (0x6064) went {way:.3f}"
+    same = abs(way - asked) <= TRAVEL_TOLERANCE * asked
+    advice = "its set-point and its position count differently; correct its factors (0x6091, 0x6092)"
+    yield Finding("travel", f"{asked:g} mm", f"{way:.3f} mm", same, cause, advice)
+    yield _speed(jog)
+    yield from _table(jog)
+    power = signed_power(jog)
+    yield _sign("current", "current times speed", power["current x speed"], "drive.sign or the current's sign")
+    voltage = [power[name] for name in ("voltage x current", "voltage x speed") if name in power]
+    if voltage:
+        yield _sign("voltage", "voltage times current, and times speed", min(voltage), VOLTAGE_ADVICE)
+    else:
+        cause = "no voltage was heard"
+        yield Finding("voltage sign", "positive", "not told", None, cause, "R and L stay the data sheet's")
+
+
+VOLTAGE_ADVICE = "the sensor's leads, its word order and [axis.*.voltage] scale"
+
+
+def signed_power(rows: Recording) -> dict[str, float]:
+    """Return the correlation of each two of current, speed and voltage over the rows that move: 1 to -1."""
+    speed, current, voltage = rows.speed_rad_s, rows.current_a, voltage_of(rows)
+    signals = {"current x speed": (current, speed)}
+    if voltage is not None:
+        signals |= {"voltage x current": (voltage, current), "voltage x speed": (voltage, speed)}
+    moving = np.abs(np.nan_to_num(speed)) > RESTING * np.nanmax(np.abs(speed))
+    return {name: _correlation(a[moving], b[moving]) for name, (a, b) in signals.items()}
+
+
+def voltage_of(rows: Recording) -> Float | None:
+    """Return the voltage at each row (n,), that of a slower sensor by lines between its samples; None without one."""
+    slow = rows.slow_voltage
+    if slow is None:
+        return rows.voltage_v
+    middle = slow.begin_s + slow.period_s * (np.arange(slow.voltage_v.size) + 0.5)
+    known = np.isfinite(slow.voltage_v)
+    at = np.arange(rows.speed_rad_s.size) * rows.dt_s
+    return np.interp(at, middle[known], slow.voltage_v[known]) if known.any() else None
+
+
+def _correlation(a: Float, b: Float) -> float:
+    known = np.isfinite(a) & np.isfinite(b)
+    size = math.sqrt(float(np.square(a[known]).sum()) * float(np.square(b[known]).sum()))
+    return float(a[known] @ b[known]) / size if size > 0.0 else 0.0
+
+
+def _sign(what: str, product: str, correlation: float, where: str) -> Finding:
+    shown = f"{correlation:+.2f}"
+    if abs(correlation) < LEAST_CORRELATION:
+        cause = f"{CODE}: {product} come to nothing over a way to and fro ({shown}): its {what} tells nothing"
+        return Finding(f"{what} sign", "positive", shown, False, cause, f"check {where}")
+    cause = f"{CODE}: {product} is negative over a way to and fro ({shown}): its {what} has the wrong sign"
+    return Finding(f"{what} sign", "positive", shown, correlation > 0.0, cause, f"check {where}")
+
+
+def _speed(jog: Recording) -> Finding:
+    """Compare the speed (0x606C) with how the position changes."""
+    rate = np.gradient(jog.position_mm, jog.dt_s) * 2 * math.pi / jog.pitch_mm
+    known = np.isfinite(rate) & np.isfinite(jog.speed_rad_s)
+    power = float(np.square(rate[known]).sum())
+    ratio = float(rate[known] @ jog.speed_rad_s[known]) / power if power > 0.0 else 0.0
+    cause = f"{CODE}: its speed (0x606C) is {ratio:.3g} times what its position shows"
+    same = abs(ratio - 1.0) <= SPEED_TOLERANCE
+    return Finding("speed unit", "1", f"{ratio:.3f}", same, cause, "set drive.speed_unit, or its speed's unit (0x60A9)")
+
+
+def _table(jog: Recording) -> Iterator[Finding]:
+    """Compare the way of the table with the motor's, where an encoder of its own tells it."""
+    if jog.table_mm is None:
+        return
+    known = np.isfinite(jog.table_mm) & np.isfinite(jog.position_mm)
+    if not known.any():
+        return
+    place, table = (values[known] - values[known][0] for values in (jog.position_mm, jog.table_mm))
+    ratio = float(place @ table) / float(place @ place)
+    cause = f"{CODE}: its table goes {ratio:.3g} times the way of its motor"
+    advice = "check drive.sign, screw_pitch_mm and increments_per_rev, then sign and scale of the table's encoder"
+    yield Finding("table", "1", f"{ratio:.3f}", abs(ratio - 1.0) <= TABLE_TOLERANCE, cause, advice)
+
+
+def judge_acceleration(rows: Recording) -> Finding:
+    """While a rapid speeds up the winding takes power: the integral of u i is positive, and so is R."""
+    voltage = voltage_of(rows)
+    expected = "power in while accelerating"
+    if voltage is None:
+        return Finding("power balance", expected, "no voltage", None, "no voltage was heard", "nothing")
+    speed = np.abs(np.nan_to_num(rows.speed_rad_s))
+    rising = np.gradient(speed, rows.dt_s) > 0.2 * float(np.max(np.gradient(speed, rows.dt_s)))
+    known = rising & np.isfinite(voltage) & np.isfinite(rows.current_a)
+    joule = float(voltage[known] @ rows.current_a[known]) * rows.dt_s
+    cause = f"{CODE}: it gave {-joule:.1f} J while it accelerated, which no motor does"
+    return Finding("power balance", expected, f"{joule:+.1f} J", joule > 0.0, cause, f"check {VOLTAGE_ADVICE}")

@@ -1,0 +1,182 @@
+"""Tries a commissioned axis by moving it inside the room that the operator gave: a jog, and rapids.
+
+The jog proves units and signs, the rapids identify the drive, and the last two of them must be as predicted. Set-points
+leave by ``set_points`` alone; whatever happens, also Ctrl-C, the axis is braked and the drive is switched off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+
+from fdhil.commissioning.compare import compare_record
+from fdhil.commissioning.identified import accept, identify, judge, voltage_late
+from fdhil.commissioning.master import Master
+from fdhil.commissioning.overhearing import Overhearing
+from fdhil.commissioning.polarity import judge_acceleration, judge_jog
+from fdhil.commissioning.progress import Found, Progress
+from fdhil.commissioning.record import CommissioningRecord
+from fdhil.commissioning.steps import enable, holds_for, prepare, rolled_back
+from fdhil.commissioning.strokes import Room, Stroke, plan_jog, plan_rapid
+from fdhil.commissioning.stroking import Travel, stroke, travel_of
+from fdhil.commissioning.survey import listen, require, require_alone, survey
+from fdhil.commissioning.timing import judge_answers, judge_sync, measure
+from fdhil.commissioning.watchdog import watched
+from fdhil.config import MachineConfig
+from fdhil.drivers.can.bus import CanBus
+from fdhil.errors import DeviceError, DriveFault
+from fdhil.pipeline import Known
+from fdhil.records import Outcome
+
+RAPIDS = 6
+TIMING_CYCLES = 1000
+REST_S = 0.8  # between two strokes: a window wants a quarter second before it, and a third after
+JOG_REST_S = 0.2
+LAST_REST_S = 1.8  # a separate sensor may deliver a second later
+HEARD_TIMEOUT_S = 10.0
+STEPS = ("timing", "jog", "test rapids", "identification", "acceptance")
+FROM_RAPIDS = STEPS[2:]
+
+
+@dataclass(frozen=True, slots=True)
+class Operator:
+    """Who is told and asked: ``report`` gets the name of each step before it is done, and what it raises ends all.
+
+    ``saw`` gets a question and tells what the operator saw, None where nobody was asked.
+    """
+
+    report: Callable[[str], None] = lambda _step: None
+    saw: Callable[[str], bool | None] = lambda _question: None
+
+
+@dataclass(slots=True)
+class Trial:
+    """What the trial of an axis found, step by step, and the outcomes of its rapids for the history."""
+
+    found: dict[str, Found] = field(default_factory=dict)
+    outcomes: tuple[Outcome, ...] = ()
+
+
+def try_axis(
+    config: MachineConfig,
+    record: CommissioningRecord,
+    room: Room,
+    operator: Operator,
+    progress: Progress,
+    known: Known | None = None,
+) -> Trial:
+    """Do all steps that are not kept and return what they found; nothing moves before ``report`` returns from ``jog``.
+
+    DriveFault when something differs or is not believed, and as commissioning does, after everything was rolled back.
+    """
+    axis, trial = record.axis, Trial()
+    jog, rapid = plan_jog(axis, config.axis[axis], room), plan_rapid(axis, config.axis[axis], room)
+    with Master(config, axis) as master:
+        listen(master)
+        found = survey(master)
+        require(master, [compare_record(record, found)])
+        now = f"{holds_for(config, axis, found)} {config.digest}"
+        trial.found = {step: kept for step in STEPS[1:] if (kept := progress.kept(step, now)) is not None}
+        if len(trial.found) == len(STEPS) - 1:
+            return trial
+        require_alone(master)
+        with rolled_back(master):
+            operator.report("timing")
+            prepare(master)
+            trial.found["timing"] = time_bus(master)
+            travel_mm = travel_of(master, record, room)
+            with guarded(master):
+                if "jog" not in trial.found:
+                    operator.report("jog")
+                    enable(master)
+                    trial.found["jog"] = jog_to_and_fro(master, travel_mm, jog, operator)
+                    progress.keep("jog", now, trial.found["jog"])
+                operator.report("test rapids")
+                enable(master)
+                heard = rapids_to_and_fro(master, travel_mm, rapid)
+                operator.report("restore")
+    balance = judge_acceleration(heard.recording())
+    require(master, [balance])
+    trial.found["test rapids"] = {"rapid": str(rapid), "moves": RAPIDS, balance.point: balance.found}
+    operator.report("identification")
+    trial.outcomes = tuple(identify(config, axis, heard.records, known))
+    rapids = judge(axis, trial.outcomes)
+    trial.found["identification"] = rapids.parameters
+    trial.found["test rapids"] = {**trial.found["test rapids"], **voltage_late(config, rapids)}
+    operator.report("acceptance")
+    trial.found["acceptance"] = accept(config, rapids)
+    for step in FROM_RAPIDS:
+        progress.keep(step, now, trial.found[step])
+    return trial
+
+
+@contextmanager
+def guarded(master: Master) -> Iterator[None]:
+    """Have the drive watch our heartbeat, so that it stops by itself when this process or the bus is gone."""
+    play, loop = master.config.play, master.loop
+    with ExitStack() as undo:
+        undo.callback(setattr, loop, "heartbeat", None)
+        undo.enter_context(watched(master, play.node_id, play.heartbeat_s))
+        loop.heartbeat, loop.heartbeat_s = play.node_id, play.heartbeat_s
+        try:
+            yield
+        except BaseException:
+            with suppress(DeviceError):  # of a bus that is gone: why it ended is told already
+                undo.close()
+            raise
+
+
+def time_bus(master: Master) -> Found:
+    """Listen beside our own SYNC: it must come evenly, and the drive must answer in time; DriveFault."""
+    name, counted = master.bus.name, master.config.guard.clock == "sync"
+    with CanBus(name, master.config.bus[name]) as bus:
+        master.wait_cycles(TIMING_CYCLES)
+        timing = measure(bus.drain(), [spec.cob_base + master.node_id for spec in master.profile.tpdos])
+    findings = [
+        judge_sync(timing.interval_s, master.period_s, counted),
+        *judge_answers(timing, master.period_s, counted),
+    ]
+    require(master, findings)
+    return {finding.point: finding.found for finding in findings}
+
+
+def jog_to_and_fro(master: Master, travel_mm: Travel, jog: Stroke, operator: Operator) -> Found:
+    """Jog an enabled axis and back: units and signs must be right, also in the eyes of the operator; DriveFault."""
+    with Overhearing(master.config, master.axis) as heard:
+        for moved in (jog, jog.back()):
+            stroke(master, travel_mm, moved, JOG_REST_S)
+        wait_heard(master, heard)
+    findings = list(judge_jog(heard.recording(), jog.distance_mm))
+    require(master, findings)
+    saw = operator.saw(f"The drive went {jog}, and back. Is that what you saw the table do?")
+    if saw is False:
+        text = "the table did not move as the drive says"
+        advice = (
+            "another direction: drive.sign; another distance: screw_pitch_mm or increments_per_rev; else a coupling"
+        )
+        raise DriveFault(master.device, f"{text}; {advice}")
+    return {"jog": str(jog), "seen": "not asked" if saw is None else "yes"} | {f.point: f.found for f in findings}
+
+
+def wait_heard(master: Master, heard: Overhearing) -> None:
+    """Wait until all that was moved so far has been heard, that of a separate sensor too."""
+    goal = heard.newest_tick + round(LAST_REST_S / master.period_s)
+    patience_s = HEARD_TIMEOUT_S + LAST_REST_S
+
+    def reached() -> bool:
+        heard.check()
+        return heard.newest_tick >= goal
+
+    master.wait(reached, patience_s, "its TPDOs are not heard any more; check the bus")
+
+
+def rapids_to_and_fro(master: Master, travel_mm: Travel, rapid: Stroke) -> Overhearing:
+    """Move an enabled axis as fast as G0, to and fro, and return what was heard of it."""
+    with Overhearing(master.config, master.axis, rapid.speed_mm_s) as heard:
+        master.wait_cycles(round(REST_S / master.period_s))
+        for _ in range(RAPIDS // 2):
+            for moved in (rapid, rapid.back()):
+                stroke(master, travel_mm, moved, REST_S)
+        wait_heard(master, heard)
+    return heard

@@ -1,0 +1,267 @@
+"""A recording as every file format carries it: headers (texts by key) and columns of numbers by name.
+
+A step of time off by more than 1 % is a gap. A recording may have no voltage: then it may tell the motor's torque
+constant.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdhil.csv_text import MAX_ROWS, shown
+from fdhil.errors import RecordingError
+from fdhil.records import Float, Recording, SlowVoltage, VoltageSampling, frozen
+
+FORMAT = "fdhil-recording-1"
+COLUMNS = ("time_s", "current_A", "speed_rad_per_s", "position_m", "demand_m")
+VOLTAGE = "voltage_V"
+TABLE = ("table_mm", "table_m_s2")  # sensors at the table, which may have lost rows
+REQUIRED = ("format", "sample_rate_hz", "axis", "pitch_m_per_rev")
+SAMPLING = "voltage_sampling"  # required where there is a voltage
+SOURCES: Mapping[str, tuple[str, ...]] = {
+    "speed_source": ("sensor", "difference", "filtered"),
+    "voltage_source": ("terminals", "command"),
+}
+UNITS: Mapping[str, str] = {
+    "time_s": "s",
+    "voltage_V": "V",
+    "current_A": "A",
+    "speed_rad_per_s": "rad/s",
+    "position_m": "m",
+    "demand_m": "m",
+    "table_mm": "mm",
+    "table_m_s2": "m/s2",
+}
+STEP_TOLERANCE = 0.01
+# what readers of damaged files raise
+UNREADABLE = (
+    ArithmeticError, AssertionError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError,
+    TypeError, ValueError, struct.error, zlib.error,
+)  # fmt: skip
+MIN_ROWS = 16
+MAX_VALUES = 64_000_000  # half a gigabyte
+MAX_SAMPLES_CHARS = 16 * 1024 * 1024
+PITCH_M = (1e-5, 0.8)
+RATE_HZ = (1.0, 1e6)
+RAPID_M_S = (1e-4, 20.0)
+CONSTANT_NM_A = (1e-3, 100.0)
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingTable:
+    """``headers`` and ``columns`` (n,) of a recording; a lost sample is a missing row."""
+
+    headers: Mapping[str, str]
+    columns: Mapping[str, Float]
+
+
+def recording_of(table: RecordingTable, source: str = "recording") -> Recording:
+    """Return what a table says; RecordingError names what is wrong with it, and what to do about it."""
+    headers = check_headers(table.headers, table.columns, source)
+    names = [name for name in (*COLUMNS, VOLTAGE, *TABLE) if name in table.columns]
+    values = _rows(table, names, source)
+    dt = 1.0 / _within(headers, "sample_rate_hz", RATE_HZ, source)
+    rows, gaps = _place(values[:, 0], dt, source)
+    columns = _spread(values, rows)
+    sampling = _sampling(headers, source) if SAMPLING in headers else "interval_mean"
+    _check_sources(headers, source)
+    pitch_m = _within(headers, "pitch_m_per_rev", PITCH_M, source)
+    rapid_m_s = _within(headers, "rapid_speed_m_per_s", RAPID_M_S, source) if "rapid_speed_m_per_s" in headers else None
+    return Recording(
+        axis=headers["axis"],
+        dt_s=dt,
+        time_s=frozen(values[0, 0] + dt * np.arange(columns.shape[0])),
+        voltage_v=_told(VOLTAGE, names, columns),
+        current_a=frozen(columns[:, 1]),
+        speed_rad_s=frozen(columns[:, 2]),
+        position_mm=frozen(columns[:, 3] * 1e3),
+        demand_mm=frozen(columns[:, 4] * 1e3),
+        voltage_sampling=sampling,
+        pitch_mm=pitch_m * 1e3,
+        rapid_speed_rad_s=None if rapid_m_s is None else rapid_m_s / pitch_m * 2 * math.pi,
+        temperature_c=_optional(headers, "temperature_C", source),
+        gaps=gaps,
+        headers=headers,
+        slow_voltage=_slow_voltage(headers, float(values[0, 0]), dt, source),
+        torque_constant_nm_per_a=_torque_constant(headers, source),
+        table_mm=_told("table_mm", names, columns),
+        table_m_s2=_told("table_m_s2", names, columns),
+    )
+
+
+def check_size(rows: int, columns: int, source: str) -> None:
+    """Refuse, before any of it is read, a file that declares more than a recording has."""
+    if rows > MAX_ROWS or rows * columns > MAX_VALUES:
+        raise RecordingError(f"{source} declares {columns} columns of {rows} rows, more than a recording has: cut it")
+
+
+def unreadable(source: str, kind: str, error: BaseException) -> RecordingError:
+    """Return the error that tells why a file is none of its kind."""
+    first = (str(error).splitlines() or [type(error).__name__])[0][:200]
+    return RecordingError(f"{source} is no {kind} that can be read: {first}; export it again")
+
+
+def check_headers(headers: Mapping[str, str], columns: Mapping[str, object], source: str) -> dict[str, str]:
+    """Return the headers of a recording that has these columns; RecordingError names what is missing."""
+    required = (*REQUIRED, SAMPLING) if VOLTAGE in columns else REQUIRED
+    missing = [key for key in required if not headers.get(key)]
+    if missing:
+        raise RecordingError(f"{source} has no header {', '.join(missing)}: add a line such as '# {missing[0]}: ...'")
+    if headers["format"] != FORMAT:
+        raise RecordingError(
+            f"{source} has format {shown(headers['format'])}, which is not {FORMAT!r}: convert it first"
+        )
+    absent = [name for name in COLUMNS if name not in columns]
+    if absent:
+        raise RecordingError(f"{source} has no column {', '.join(absent)}: it needs {','.join(COLUMNS)}")
+    return dict(headers)
+
+
+def _rows(table: RecordingTable, names: list[str], source: str) -> Float:
+    """Return the columns side by side (n, k): all finite but what the table tells."""
+    sizes = {name: table.columns[name].size for name in names}
+    if len(set(sizes.values())) > 1:
+        raise RecordingError(f"{source} has columns of unlike lengths, {sizes}: export them with one time step")
+    if sizes["time_s"] < MIN_ROWS:
+        raise RecordingError(f"{source} is truncated: {sizes['time_s']} rows are no recording; record it again")
+    for name in names:
+        values = table.columns[name]
+        wrong = np.isinf(values) if name in TABLE else ~np.isfinite(values)
+        if wrong.any():
+            what = f"{source} has a non-finite {name} in row {int(np.argmax(wrong)) + 1}"
+            raise RecordingError(f"{what}: leave a lost sample's row out")
+    return np.column_stack([table.columns[name] for name in names])
+
+
+def _told(name: str, names: list[str], columns: Float) -> Float | None:
+    return frozen(columns[:, names.index(name)]) if name in names else None
+
+
+def _slow_voltage(headers: dict[str, str], start_s: float, dt_s: float, source: str) -> SlowVoltage | None:
+    """Return the samples of a voltage sensor that is slower than the rows, where the headers hold them.
+
+    Sample j begins ``voltage_begin_s`` + j ``voltage_period_s`` on the time axis of the rows, whose first is at
+    ``start_s`` and which are ``dt_s`` apart; a lost one is ``nan`` among ``voltage_samples_V``.
+    """
+    if "voltage_samples_V" not in headers:
+        return None
+    period, begin = _positive(headers, "voltage_period_s", source), _optional(headers, "voltage_begin_s", source)
+    if period < dt_s / 2:  # the place of finer samples among the rows would be sought for hours
+        raise RecordingError(
+            f"{source} has voltage samples {period:g} s apart, closer than its rows: give voltage_period_s in seconds"
+        )
+    if len(headers["voltage_samples_V"]) > MAX_SAMPLES_CHARS:
+        raise RecordingError(f"{source} has more voltage samples than a recording has: cut it into parts")
+    try:
+        told = np.array(headers["voltage_samples_V"].split(), dtype=np.float64)
+    except ValueError:
+        raise RecordingError(f"{source} has a voltage sample that is no number: copy or export it again") from None
+    if begin is None or not told.size or np.isinf(told).any() or np.isnan(told).all():
+        raise RecordingError(
+            f"{source} has voltage samples of a slower sensor without voltage_begin_s or without a finite value: "
+            "export it again"
+        )
+    error = _optional(headers, "voltage_error_s", source) or 0.0
+    return SlowVoltage(begin - start_s, period, abs(error), frozen(told), _late(headers, told.size, period, source))
+
+
+def _late(headers: dict[str, str], samples: int, period: float, source: str) -> Float | None:
+    """Return by how much later than its place each sample of a slow sensor was true, where the headers hold it."""
+    if "voltage_late_s" not in headers:
+        return None
+    try:
+        late = np.array(headers["voltage_late_s"][:MAX_SAMPLES_CHARS].split(), dtype=np.float64)
+    except ValueError:
+        late = np.zeros(0)
+    if late.size != samples or not (np.abs(late) < period / 2).all():
+        raise RecordingError(f"{source} has voltage_late_s that do not fit its voltage samples: export it again")
+    return frozen(late)
+
+
+def _place(
+    time_s: Float, dt: float, source: str
+) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], tuple[tuple[int, int], ...]]:
+    """Return the grid row (n,) of each sample and the half-open gaps between them."""
+    steps = np.diff(time_s)
+    if (steps <= 0).any():
+        k = int(np.argmax(steps <= 0))
+        raise RecordingError(
+            f"{source}: time stands still or runs back at {time_s[k + 1]:g} s: sort or record it again"
+        )
+    if time_s[-1] - time_s[0] > MAX_ROWS * dt:
+        raise RecordingError(f"{source}: a gap of {steps.max():g} s is no recording of one run: cut the file there")
+    off = np.abs(steps - dt) > STEP_TOLERANCE * dt
+    if off.mean() > 0.5:
+        raise RecordingError(
+            f"{source}: rows are {np.median(steps):g} s apart, but sample_rate_hz says {dt:g} s: correct the header"
+        )
+    # a step that is off is a gap even where it rounds to one sample: at least one row is then missing or misplaced
+    counts = np.where(off, np.maximum(np.rint(steps / dt), 2), 1).astype(np.int64)
+    rows = np.concatenate([[0], np.cumsum(counts)])
+    gaps = tuple((int(rows[k]) + 1, int(rows[k + 1])) for k in np.flatnonzero(off))
+    return rows, gaps
+
+
+def _spread(table: Float, rows: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Float:
+    columns = np.full((int(rows[-1]) + 1, table.shape[1]), np.nan)
+    columns[rows] = table
+    return columns
+
+
+def _sampling(headers: dict[str, str], source: str) -> VoltageSampling:
+    value = headers["voltage_sampling"]
+    if value == "interval_mean":
+        return "interval_mean"
+    if value == "instant":
+        return "instant"
+    raise RecordingError(f"{source} has voltage_sampling {shown(value)}: it must be interval_mean or instant")
+
+
+def _check_sources(headers: dict[str, str], source: str) -> None:
+    """Refuse a word for where speed or voltage come from that is none."""
+    for key, words in SOURCES.items():
+        if key in headers and headers[key] not in words:
+            raise RecordingError(f"{source} has {key} {shown(headers[key])}: it must be {' or '.join(words)}")
+
+
+def _torque_constant(headers: dict[str, str], source: str) -> float | None:
+    key = "torque_constant_nm_per_a"
+    return _within(headers, key, CONSTANT_NM_A, source) if key in headers else None
+
+
+def _positive(headers: dict[str, str], key: str, source: str) -> float:
+    value = _optional(headers, key, source)
+    if value is None or not value > 0:
+        raise RecordingError(f"{source} has header {key} = {shown(str(headers.get(key)))}: it must be a number above 0")
+    return value
+
+
+def _within(headers: dict[str, str], key: str, bounds: tuple[float, float], source: str) -> float:
+    """Return a header's number; RecordingError beyond what machines have, with the unit that was likely meant."""
+    value, (low, high) = _positive(headers, key, source), bounds
+    if low <= value <= high:
+        return value
+    length = key in ("pitch_m_per_rev", "rapid_speed_m_per_s")
+    guess = f" (is {value:g} in mm? then write {value / 1e3:g})" if length and value > high else ""
+    text = f"{source} has header {key} = {value:g}, machines have {low:g} to {high:g}: correct it{guess}"
+    raise RecordingError(text)
+
+
+def _optional(headers: dict[str, str], key: str, source: str) -> float | None:
+    if key not in headers:
+        return None
+    try:
+        value = float(headers[key])
+    except ValueError:
+        raise RecordingError(
+            f"{source} has header {key} = {shown(headers[key])} where a number belongs: correct it"
+        ) from None
+    if not math.isfinite(value):
+        raise RecordingError(f"{source} has the non-finite header {key} = {shown(headers[key])}: correct it")
+    return value

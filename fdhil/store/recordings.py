@@ -1,0 +1,40 @@
+"""Reads a recording from any file: one of the recording formats, or another program's file with a column map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fdhil import tables
+from fdhil.csv_text import read_content
+from fdhil.errors import RecordingError
+from fdhil.records import Recording
+from fdhil.store import suffixes
+from fdhil.store.column_map import mapped, read_column_map
+from fdhil.store.recording_table import RecordingTable, recording_of
+from fdhil.store.trace_text import parse_trace
+
+
+def read_recording(path: Path, columns: Path | None = None) -> Recording:
+    """Read a recording; RecordingError names what is wrong with the file and what to do about it.
+
+    With ``columns``, a column map, the file may be of another program; ConfigError when the map is wrong.
+    """
+    return recording_of(read_table(path, columns), str(path))
+
+
+def read_table(path: Path, columns: Path | None = None) -> RecordingTable:
+    """Read headers and columns of a recording without looking at what they mean. Errors as :func:`read_recording`."""
+    told = None if columns is None else read_column_map(columns)
+    content = read_content(path)
+    name = suffixes.RECORDINGS.get(path.suffix.lower(), "csv")
+    if told is None:
+        return _decoded(name, content, str(path))
+    raw = parse_trace(content, told.text, str(path)) if name == "csv" else _decoded(name, content, str(path))
+    return mapped(raw, told, str(path))
+
+
+def _decoded(name: str, content: bytes, source: str) -> RecordingTable:
+    if not content:
+        raise RecordingError(f"{source} is empty: record it again")
+    table: RecordingTable = tables.load(tables.RECORDING_FORMATS, name).decode(content, source)
+    return table

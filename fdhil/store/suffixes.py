@@ -1,0 +1,16 @@
+"""Which file format a name's suffix means."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+RECORDINGS: Mapping[str, str] = {
+    ".csv": "csv", ".parquet": "parquet", ".mat": "mat", ".mf4": "mdf4", ".h5": "hdf5", ".hdf5": "hdf5",
+}  # fmt: skip
+# logs of all frames of a bus, as python-can reads and writes them
+BUS_LOGS: Mapping[str, str] = {".log": "candump", ".blf": "blf", ".asc": "asc", ".trc": "trc"}
+
+
+def suffix_of(table: Mapping[str, str], name: str) -> str:
+    """Return the first suffix that means the format ``name``."""
+    return next(suffix for suffix, meant in table.items() if meant == name)

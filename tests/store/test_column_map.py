@@ -1,0 +1,142 @@
+"""Files of oscilloscopes and drives, as their makers write them, become recordings by a column map."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdhil.errors import ConfigError, RecordingError
+from fdhil.store.column_map import read_column_map
+from fdhil.store.recordings import read_recording
+
+N, PITCH_M = 400, 0.01
+TIME = np.arange(N) * 1e-3
+SPEED = 100.0 * np.sin(np.pi * TIME / TIME[-1]) ** 2
+POSITION = np.cumsum(SPEED) * 1e-3 * PITCH_M / (2 * math.pi)
+CURRENT = 0.1 * SPEED + 1.25
+HEADERS = '[headers]\naxis = "X"\npitch_m_per_rev = 0.01\nrapid_speed_m_per_s = 0.15\ntorque_constant_nm_per_a = 0.3\n'
+
+
+def _comma(value: float) -> str:
+    return f"{value:.9g}".replace(".", ",")
+
+
+def _twincat(columns: dict[str, np.ndarray]) -> bytes:
+    """Blocks of channel heads side by side, each channel with times of its own, decimal commas, tabs, EOF."""
+    lines = ["Name\tScope Project", "File\tC:\\scope.csv", "Starttime of export\t128783093223690000", ""]
+    lines.append("\t".join(f"Name\t{name}" for name in columns))
+    lines.append("\t".join("SampleTime[ms]\t1" for _ in columns))
+    lines.append("\t".join(f"SymbolName\tMAIN.{name}" for name in columns))
+    lines.append("")
+    for k in range(N):
+        lines.append("\t".join(f"{k}\t{_comma(v[k])}" for v in columns.values()))
+    return "\r\n".join([*lines, "EOF", ""]).encode()
+
+
+def _semicolon(columns: dict[str, np.ndarray]) -> bytes:
+    """Names, then units, then rows with semicolons and decimal points, in UTF-16."""
+    lines = [";".join(["Time", *columns]), ";".join(["ms", *("[]" for _ in columns)])]
+    lines += [";".join([f"{k}", *(f"{v[k]:.9g}" for v in columns.values())]) for k in range(N)]
+    return "\r\n".join([*lines, ""]).encode("utf-16")
+
+
+def _quoted(columns: dict[str, np.ndarray]) -> bytes:
+    """A head of free text with umlauts in cp1252, quoted names, commas."""
+    lines = ["Oszilloskop, Kanäle Achse X", ",".join(['"Zeit"', *(f'"{name}"' for name in columns)])]
+    lines += [",".join([f"{k * 1e-3:.6f}", *(f"{v[k]:.9g}" for v in columns.values())]) for k in range(N)]
+    return ("\n".join(lines) + "\n").encode("cp1252")
+
+
+CASES: dict[str, tuple[Callable[[dict[str, np.ndarray]], bytes], str]] = {
+    "twincat": (_twincat, 'time_s = { name = "#1", unit = "ms" }'),
+    "semicolon": (_semicolon, 'time_s = { name = "Time", unit = "ms" }'),
+    "quoted": (_quoted, 'time_s = { name = "Zeit", unit = "s" }'),
+}
+MAP = """
+[columns]
+%s
+current_A = { name = "Strom", unit = "mA" }
+speed_rad_per_s = { name = "Drehzahl", unit = "rpm" }
+position_m = { name = "Ist", unit = "mm" }
+demand_m = [{ name = "Ist", unit = "mm" }, { name = "Schlepp", unit = "um" }]
+"""
+
+
+def _columns() -> dict[str, np.ndarray]:
+    return {
+        "Strom": CURRENT * 1e3,
+        "Drehzahl": SPEED * 60 / (2 * math.pi),
+        "Ist": POSITION * 1e3,
+        "Schlepp": SPEED * 2.0,
+    }
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_makers_text_file_becomes_a_recording(case: str, tmp_path: Path) -> None:
+    write, time = CASES[case]
+    trace, told = tmp_path / "trace.csv", tmp_path / "map.toml"
+    trace.write_bytes(write(_columns()))
+    told.write_text(HEADERS + MAP % time)
+    read = read_recording(trace, told)
+    assert (read.axis, read.dt_s, read.voltage_v, read.torque_constant_nm_per_a) == ("X", 0.001, None, 0.3)
+    np.testing.assert_allclose(read.current_a, CURRENT, rtol=1e-7)
+    np.testing.assert_allclose(read.speed_rad_s, SPEED, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(read.demand_mm - read.position_mm, SPEED * 2e-3, atol=1e-6)
+
+
+def test_without_a_speed_it_is_the_difference_of_positions(tmp_path: Path) -> None:
+    trace, told = tmp_path / "trace.csv", tmp_path / "map.toml"
+    trace.write_bytes(_semicolon(_columns()))
+    told.write_text(
+        HEADERS + MAP.replace('speed_rad_per_s = { name = "Drehzahl", unit = "rpm" }\n', "") % CASES["semicolon"][1]
+    )
+    read = read_recording(trace, told)
+    assert read.headers["speed_source"] == "difference"
+    np.testing.assert_allclose(read.speed_rad_s[1:], SPEED[1:], rtol=1e-5, atol=1e-4)
+
+
+def test_a_speed_of_the_table_needs_the_pitch_alone(tmp_path: Path) -> None:
+    trace, told = tmp_path / "trace.csv", tmp_path / "map.toml"
+    trace.write_bytes(_semicolon(_columns() | {"Drehzahl": SPEED * PITCH_M / (2 * math.pi) * 60e3}))
+    told.write_text(HEADERS + MAP.replace('"rpm"', '"mm/min"') % CASES["semicolon"][1])
+    np.testing.assert_allclose(read_recording(trace, told).speed_rad_s, SPEED, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('unit = "mA"', 'unit = "furlong"', "columns.current_A.unit"),
+        ('axis = "X"\n', "", "headers.axis"),
+        ("position_m = ", "position_mm = ", "position_mm"),
+        ("[columns]", "[columns", "no TOML"),
+        ('current_A = { name = "Strom", unit = "mA" }\n', "", "columns.current_A"),
+    ],
+)
+def test_a_wrong_map_is_told_by_its_key(old: str, new: str, words: str, tmp_path: Path) -> None:
+    told = tmp_path / "map.toml"
+    told.write_text((HEADERS + MAP % CASES["twincat"][1]).replace(old, new))
+    with pytest.raises(ConfigError, match=words):
+        read_column_map(told)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"no numbers\nat all\n", "no rows of numbers"),
+        (b"Zeit,Strom\n0,1\n1,2\n2,3\n3,4\n", "has no column 'Drehzahl'"),
+        (
+            b"Zeit,Strom,Drehzahl,Ist,Schlepp\n0,1,2,3,4\n1,1,2,3,4\n2,1,2,3,4\nend,of,it,,\n3,1,2,3,4\n",
+            "no row of numbers",
+        ),
+    ],
+)
+def test_a_trace_that_is_not_what_the_map_says_is_one_sentence(content: bytes, words: str, tmp_path: Path) -> None:
+    trace, told = tmp_path / "trace.csv", tmp_path / "map.toml"
+    trace.write_bytes(content)
+    told.write_text(HEADERS + MAP % CASES["quoted"][1])
+    with pytest.raises(RecordingError, match=words):
+        read_recording(trace, told)

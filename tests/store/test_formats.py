@@ -1,0 +1,144 @@
+"""Every recording format gives back what was written, to other programs too; a damaged file is one error."""
+
+from __future__ import annotations
+
+import json
+import random
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil import tables
+from fdhil.errors import RecordingError
+from fdhil.records import Float, frozen
+from fdhil.store import suffixes
+from fdhil.store.export import export_table, table_of
+from fdhil.store.recording_table import UNITS, RecordingTable, recording_of
+from fdhil.store.recordings import read_recording, read_table
+from tests.store.made import window
+
+SUFFIX = {name: suffixes.suffix_of(suffixes.RECORDINGS, name) for name in tables.RECORDING_FORMATS}
+
+
+def _table() -> RecordingTable:
+    made = window()
+    lacking = np.where(np.arange(made.n) % 7 == 0, np.nan, made.position_mm)
+    return table_of(window(table_mm=frozen(lacking)))
+
+
+@pytest.mark.parametrize("name", tables.RECORDING_FORMATS)
+def test_what_goes_in_comes_out_to_the_last_bit(name: str, tmp_path: Path) -> None:
+    table, path = _table(), tmp_path / f"r{SUFFIX[name]}"
+    export_table(table, path, name)
+    back = read_table(path)
+    assert dict(back.headers) == dict(table.headers)
+    for column, values in table.columns.items():
+        assert np.array_equal(back.columns[column], values, equal_nan=True), column
+    read = read_recording(path)
+    assert (read.axis, read.dt_s, read.gaps) == ("X", 0.001, recording_of(table).gaps)
+    assert read.gaps
+
+
+def _pyarrow(path: Path) -> tuple[Float, str]:
+    import pyarrow.parquet as pq
+
+    read = pq.read_table(path)
+    return read.column("current_A").to_numpy(), read.schema.field("current_A").metadata[b"unit"].decode()
+
+
+def _scipy(path: Path) -> tuple[Float, str]:
+    from scipy import io
+
+    read: Any = getattr(io, "loadmat")(path, simplify_cells=True)  # noqa: B009 - its stubs know no such option
+    return read["current_A"], read["units"]["current_A"]
+
+
+def _asammdf(path: Path) -> tuple[Float, str]:
+    import asammdf
+
+    with asammdf.MDF(path) as file:
+        read = file.get("current_A")
+        return read.samples, read.unit
+
+
+def _h5py(path: Path) -> tuple[Float, str]:
+    import h5py
+
+    with h5py.File(path) as file:
+        return file["current_A"][()], file["current_A"].attrs["unit"]
+
+
+@pytest.mark.parametrize(
+    ("name", "reader"), [("parquet", _pyarrow), ("mat", _scipy), ("mdf4", _asammdf), ("hdf5", _h5py)]
+)
+def test_another_programs_library_reads_values_and_units(name: str, reader: Any, tmp_path: Path) -> None:
+    table, path = _table(), tmp_path / f"r{SUFFIX[name]}"
+    export_table(table, path, name)
+    values, unit = reader(path)
+    assert np.array_equal(values, table.columns["current_A"])
+    assert unit == UNITS["current_A"] == "A"
+
+
+def _refused(path: Path) -> bool:
+    try:
+        read_recording(path)
+    except RecordingError as error:
+        return "\n" not in str(error)
+    return False
+
+
+@pytest.mark.parametrize("name", tables.RECORDING_FORMATS)
+def test_a_damaged_file_is_refused_in_one_sentence_or_read_as_numbers(name: str, tmp_path: Path) -> None:
+    path = tmp_path / f"r{SUFFIX[name]}"
+    export_table(_table(), path, name)
+    whole, dice = path.read_bytes(), random.Random(7)
+    refused = 0
+    for k in range(24):
+        damaged = bytearray(whole[: dice.randrange(len(whole))] if k % 2 else whole)
+        for _ in range(0 if k % 2 else 8):
+            damaged[dice.randrange(len(damaged))] ^= 1 << dice.randrange(8)
+        path.write_bytes(damaged)
+        refused += _refused(path)
+    assert refused > 8  # every cut one, but for a format whose end tells nothing
+    path.write_bytes(b"")
+    with pytest.raises(RecordingError, match="is empty"):
+        read_recording(path)
+
+
+def test_a_file_that_declares_more_than_a_recording_has_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    import h5py
+
+    path = tmp_path / "vast.h5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("current_A", shape=(1 << 40,), dtype="f8", chunks=(1 << 16,))
+    assert path.stat().st_size < 1 << 20
+    with pytest.raises(RecordingError, match="more than a recording has"):
+        read_recording(path)
+
+
+def test_matlab_7_3_is_read_as_the_hdf5_that_it_is(tmp_path: Path) -> None:
+    import h5py
+
+    path, table = tmp_path / "new.mat", _table()
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in table.columns.items():
+            file.create_dataset(name, data=values.reshape(1, -1))
+    with path.open("r+b") as raw:
+        raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(116) + b"\0" * 8 + b"\0\2IM")
+    back = read_table(path)
+    assert np.array_equal(back.columns["current_A"], table.columns["current_A"])
+
+
+def test_a_stored_window_is_a_recording_and_an_exported_one_is_no_stored_window(tmp_path: Path) -> None:
+    from fdhil.store.recording_parquet import is_recording
+    from fdhil.store.windows import encode_window
+
+    stored, out = tmp_path / "w00000001-X.parquet", tmp_path / "out.parquet"
+    stored.write_bytes(encode_window(window(), "c0ffee"))
+    assert not is_recording(stored)
+    export_table(read_table(stored), out, "parquet")
+    assert is_recording(out)
+    assert read_recording(out).gaps == read_recording(stored).gaps == ((100, 103),)
+    assert json.dumps(dict(read_table(stored).headers)) == json.dumps(dict(table_of(window()).headers))
