@@ -18,7 +18,7 @@ from typing import Any
 
 import linuxcnc  # type: ignore[import-not-found]  # the package's own module, for the system's Python alone
 
-JOINTS = 3
+JOINTS = int(os.environ["JOINTS"])
 PATIENCE_S = 300.0
 
 
