@@ -15,6 +15,7 @@ import pwd
 import socket
 import stat
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO
 
@@ -36,6 +37,10 @@ def lock_bus(bus: CanBus, transmit: socket.socket | None = None, run_directory: 
         places.append(f"interface {bus.channel} of {_here()}")
     if run_directory is not None:
         places.append(f"directory {run_directory.resolve()}")
+    return _locked(places)
+
+
+def _locked(places: Sequence[str]) -> IO[bytes]:
     try:
         file = os.fdopen(_open(_directory()), "rb")
     except (OSError, KeyError) as error:
@@ -48,6 +53,11 @@ def lock_bus(bus: CanBus, transmit: socket.socket | None = None, run_directory: 
         file.close()
         raise
     return file
+
+
+def lock_place(bus: CanBus, what: str) -> IO[bytes]:
+    """Own a part of a bus beside the guard that owns its offsets; DeviceError (``BusLocked``), ConnectError."""
+    return _locked([f"{what} of {endpoint(bus)}"])
 
 
 def endpoint(bus: CanBus, transmit: socket.socket | None = None) -> str:
@@ -132,5 +142,5 @@ def _lock(file: IO[bytes], place: str) -> None:
     try:
         fcntl.fcntl(file, fcntl.F_OFD_SETLK, struct.pack("hhqqi", fcntl.F_WRLCK, os.SEEK_SET, byte, 1, 0))
     except OSError:
-        text = "BusLocked: another guard, or a commissioning, owns it, and nothing was sent; stop that one first"
+        text = "BusLocked: another guard, commissioning or play owns it, and nothing was sent; stop that one first"
         raise DeviceError(place, text) from None

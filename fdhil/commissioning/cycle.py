@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from typing import Protocol, Self
 
 from fdhil import cia402
+from fdhil.commissioning.realtime import prioritise
 from fdhil.commissioning.set_points import SetPoints
 from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import MachineConfig
@@ -72,18 +73,22 @@ class Cycle:
     """The thread that runs some buses; a context manager. Nothing is sent before ``produce_sync`` or by the members.
 
     ``path`` gives the members' set-points while it is there, in their order; ``failure`` is what ended the thread.
+    ``realtime``: it asks for a real-time priority; ``scheduling`` says what it was given.
     """
 
-    def __init__(self, config: MachineConfig, buses: Iterable[str]) -> None:
+    def __init__(self, config: MachineConfig, buses: Iterable[str], *, realtime: bool = False) -> None:
         self.config = config
         self.period_s = config.machine.sync_period_s
         self.buses = {name: TransmitBus(name, config.bus[name]) for name in buses}
         self.members: list[Member] = []
         self.path: SetPoints | None = None
         self.heartbeat: int | None = None
+        self.heartbeat_s = config.guard.heartbeat_s
         self.count = 0
         self.lateness = Lateness()
         self.failure: DeviceError | None = None
+        self.scheduling = ""
+        self._realtime = realtime
         self.lockstep = config.guard.clock == "sync"
         self._sync_counter = 0
         self._sync_overflow: int | None = None
@@ -97,6 +102,8 @@ class Cycle:
         self._thread.start()
 
     def _run(self) -> None:
+        if self._realtime:
+            self.scheduling = prioritise()
         due = time.monotonic()
         try:
             while not self._stopping.is_set():
@@ -137,7 +144,7 @@ class Cycle:
     def _send_heartbeat(self) -> None:
         now = time.monotonic()
         if self.heartbeat is not None and now >= self._heartbeat_due:
-            self._heartbeat_due = now + self.config.guard.heartbeat_s
+            self._heartbeat_due = now + self.heartbeat_s
             for bus in self.buses.values():
                 bus.send(cia402.COB_HEARTBEAT + self.heartbeat, bytes([cia402.Nmt.OPERATIONAL]))
 
@@ -187,11 +194,16 @@ class Cycle:
     @property
     def turning(self) -> bool:
         """Whether set-points leave."""
-        return self.producing and self.failure is None and self._thread.is_alive()
+        return self.producing and not self.lost and self._thread.is_alive()
 
     def stop_sync(self) -> None:
         """Send SYNC and set-points no more."""
         self._sync_overflow = None
+
+    @property
+    def lost(self) -> bool:
+        """Whether a bus has ended, or takes nothing more."""
+        return self.failure is not None or any(bus.ended is not None for bus in self.buses.values())
 
     def check(self) -> None:
         """Raise what ended the thread or a bus."""

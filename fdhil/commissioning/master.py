@@ -103,8 +103,8 @@ class Master:
 
     @property
     def position(self) -> int | None:
-        """The drive's newest position, None before the first."""
-        return self.heard.objects.get(self.profile.position)
+        """The drive's newest position; None before the first, and when the last SYNC but one brought none."""
+        return self.heard.objects.get(self.profile.position) if self.behind <= 2 else None
 
     def send_set_points(self) -> None:
         """Send the set-points that the next SYNC latches."""

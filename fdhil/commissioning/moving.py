@@ -17,6 +17,7 @@ from fdhil.records import Float
 
 ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 PATIENCE = 20.0  # times as long as the set-points take
+SILENT_CYCLES = 20
 LAG_CYCLES = 300  # an axis may follow so much later than its last set-point
 
 
@@ -47,10 +48,14 @@ def _settled(masters: Sequence[Master], path: SetPoints, each_turn: Callable[[],
 
 
 def watch_power(masters: Sequence[Master], path: SetPoints) -> None:
-    """Stop all axes when one of them is not in Operation enabled any more, or another master is heard."""
+    """Stop all axes when one of them is not in Operation enabled any more, is silent, or another master is heard."""
     for master in masters:
+        if master.behind > SILENT_CYCLES:
+            path.stop(f"axis {master.axis}: nothing was heard of its drive for {SILENT_CYCLES} SYNC")
         if master.state() is not State.OPERATION_ENABLED:
-            path.stop(f"axis {master.axis}: its drive fell from Operation enabled to {master.state().value}")
+            told = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[-1:]]
+            why = f" (EMCY {told[0]:04X})" if told and told[0] else ""
+            path.stop(f"axis {master.axis}: its drive fell from Operation enabled to {master.state().value}{why}")
         if master.heard.master is not None:
             path.stop(f"another master sends {master.heard.master} on the bus of axis {master.axis}")
 

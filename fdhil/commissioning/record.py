@@ -97,9 +97,10 @@ def holds(record: CommissioningRecord | None, config: MachineConfig, axis: str) 
 def axis_digest(config: MachineConfig, axis: str) -> str:
     """SHA-256, 16 hexadecimal digits, of all in the configuration that a commissioning depends on.
 
-    Where sensors are reached and what the motor's data sheet says may change without commissioning again.
+    Where sensors are reached, what the motor's data sheet says and what room there is may change without commissioning
+    again.
     """
-    settings = config.axis[axis].model_dump(mode="json", exclude={"voltage", "nominal", "regulators"})
+    settings = config.axis[axis].model_dump(mode="json", exclude={"voltage", "nominal", "regulators", "setpoints"})
     if settings["feedforward"] is None:
         del settings["feedforward"]
     settings["drive"] = _described(config.axis[axis].drive)

@@ -48,10 +48,11 @@ class Bounds:
         acceleration_mm_s2: float | None = None,
     ) -> Bounds:
         """Return the bounds of an axis: the configuration's, or lower ones; half its following-error window."""
-        scaling = axis.scaling
+        scaling, own = axis.scaling, axis.setpoints
         low, high = sorted(scaling.sign * mm * scaling.increments_per_mm for mm in travel_mm)
+        most = own.max_acceleration_mm_s2 if own is not None else None
         speed = min(speed_mm_s or math.inf, axis.top_speed_mm_s)
-        acceleration = min(acceleration_mm_s2 or math.inf, axis.max_acceleration_mm_s2)
+        acceleration = min(acceleration_mm_s2 or math.inf, most or axis.max_acceleration_mm_s2)
         return cls(
             name,
             low,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from fdhil.cia402 import NmtCommand, Object, State
 from fdhil.commissioning.master import Master
@@ -25,9 +25,9 @@ def watchdog_test(master: Master, enable: Callable[[Master], None]) -> str:
     ``enable`` brings the drive back to Operation enabled.
     """
     node_id, period_s = master.config.guard.node_id, master.config.guard.heartbeat_s
-    entry = node_id << 16 | round(HEARTBEATS_MISSED * period_s * 1e3)
+    entry = _entry(node_id, period_s)
     with contextlib.ExitStack() as undo:
-        sub, before = _consumer_slot(master, node_id)
+        sub, before = consumer_slot(master, node_id)
         master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, 0, 4)
         undo.callback(master.sdo.write_int, Object.CONSUMER_HEARTBEAT, sub, before, 4)
         undo.callback(setattr, master, "heartbeat", False)
@@ -49,6 +49,29 @@ def watchdog_test(master: Master, enable: Callable[[Master], None]) -> str:
             text = f"it stopped with the EMCY {shown} instead of 8130; find out what else stops it"
             raise DriveFault(master.device, text)
     return "proven"
+
+
+@contextlib.contextmanager
+def watched(master: Master, node_id: int, period_s: float) -> Iterator[None]:
+    """Have the drive watch the heartbeat of ``node_id`` from its first one on, until the end.
+
+    DriveFault where it cannot, or does not keep what is written.
+    """
+    sub, before = consumer_slot(master, node_id)
+    entry = _entry(node_id, period_s)
+    master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, 0, 4)
+    try:
+        master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, entry, 4)
+        if master.sdo.read_int(Object.CONSUMER_HEARTBEAT, sub) != entry:
+            raise DriveFault(master.device, "it does not keep 0x1016, so it would not notice when fdhil dies")
+        yield
+    finally:
+        master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, 0, 4)
+        master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, before, 4)
+
+
+def _entry(node_id: int, period_s: float) -> int:
+    return node_id << 16 | round(HEARTBEATS_MISSED * period_s * 1e3)
 
 
 def _reacted(master: Master, told: int) -> bool:
@@ -79,7 +102,7 @@ def _feed(master: Master, sub: int, entry: int, enable: Callable[[Master], None]
     raise DriveFault(master.device, text)
 
 
-def _consumer_slot(master: Master, node_id: int) -> tuple[int, int]:
+def consumer_slot(master: Master, node_id: int) -> tuple[int, int]:
     """Return a sub-index of 0x1016 that is free or ours, and its value."""
     try:
         count = master.sdo.read_int(Object.CONSUMER_HEARTBEAT, 0)

@@ -7,12 +7,12 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, PrivateAttr
+from pydantic import Field, PrivateAttr, field_validator
 
 from fdhil import tables
 from fdhil.cia402 import Scaling
 from fdhil.config.regulators import Regulators
-from fdhil.config.section import NotNegative, Positive, Section, one_of
+from fdhil.config.section import Finite, NotNegative, Positive, Section, one_of
 from fdhil.config.sensors import Thermometer, Voltage
 from fdhil.config.table import Accelerometer, TableEncoder
 
@@ -45,6 +45,23 @@ class CorrectionLimits(Section):
     max_acceleration_mm_s2: Positive = Field(
         250.0, le=CEILING_ACCELERATION_MM_S2, description="largest acceleration of the offset"
     )
+
+
+class SetPointLimits(Section):
+    """[axis.X.setpoints]: the set-points that fdhil may send in the place of an NC. Without this section: none."""
+
+    travel_mm: tuple[Finite, Finite] = Field(description="lowest and highest position, braking included")
+    max_speed_mm_s: Positive | None = Field(None, description="largest speed; left out: the axis maximum")
+    max_acceleration_mm_s2: Positive | None = Field(
+        None, ge=1e-2, le=1e6, description="largest acceleration, that of a stop too; left out: that of G0"
+    )
+
+    @field_validator("travel_mm")
+    @classmethod
+    def _has_room(cls, travel_mm: tuple[float, float]) -> tuple[float, float]:
+        if not travel_mm[0] < travel_mm[1]:
+            raise ValueError("the lowest position must come first")
+        return travel_mm
 
 
 class FeedforwardLimits(Section):
@@ -136,6 +153,7 @@ class Axis(Section):
     regulators: Regulators
     correction: CorrectionLimits | None = None
     feedforward: FeedforwardLimits | None = None
+    setpoints: SetPointLimits | None = None
     drive: Drive = Drive()
     voltage: Voltage = Voltage()
     temperature: Thermometer | None = None

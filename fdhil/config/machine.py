@@ -17,7 +17,7 @@ from fdhil.config.plausible import doubts
 from fdhil.config.regulators import period_faults
 from fdhil.config.section import AxisName, Positive, Section
 from fdhil.config.sensors import WORDS, LineUser, line_faults, line_user
-from fdhil.config.service import Guard, Maintenance, Store
+from fdhil.config.service import Guard, Maintenance, Play, Store
 from fdhil.config.simulation import Sim
 
 
@@ -41,6 +41,7 @@ class MachineConfig(Section):
     bus: Mapping[str, CanBus] = Field(default_factory=lambda: {"can0": CanBus()})
     store: Store = Store()
     guard: Guard = Guard()
+    play: Play = Play()
     maintenance: Maintenance = Maintenance()
     sim: Sim = Sim()
 
@@ -60,6 +61,8 @@ class MachineConfig(Section):
             faults += [f"axis.{name}.{doubt.key}: {doubt.text}" for doubt in found if limits or not doubt.possible]
             faults += limits
         faults += line_faults(self._line_users())
+        if self.play.node_id == self.guard.node_id:
+            faults.append("play.node_id: it is the guard's node_id; both send a heartbeat")
         # the PDOs of a device's second axis are those of the next node-ID
         ids = {(axis.drive.bus, self.node_id(name) + axis.drive.logical_axis) for name, axis in self.axis.items()}
         if len(ids) < len(self.axis):

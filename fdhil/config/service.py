@@ -1,4 +1,4 @@
-"""[bus.NAME], [store], [guard], [maintenance]: what the daemon and the guard run on."""
+"""[store], [guard], [play], [maintenance]: what the daemon, the guard and fdhil play run on."""
 
 from __future__ import annotations
 
@@ -34,6 +34,15 @@ class Guard(Section):
     run_directory: Path | None = Field(None, description="the guard's socket and settings; left out: that of [store]")
     daemon_user: str | None = Field(
         None, description="the daemon's user, where the guard runs under one of its own; left out: the same user"
+    )
+
+
+class Play(Section):
+    """[play]: fdhil in the place of an NC on a test bench (fdhil play)."""
+
+    node_id: int = Field(101, ge=1, le=127, description="the node-ID of its heartbeat, which the drives watch")
+    heartbeat_s: Positive = Field(
+        0.020, ge=0.001, le=1.0, description="period of that heartbeat; a drive that misses three of them stops"
     )
 
 

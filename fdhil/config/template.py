@@ -33,6 +33,8 @@ EXAMPLES: Mapping[str, Any] = {  # of keys without a default: the bench machine
     "node_id": 1, "speed_limit_mm_s": 500.0, "method": "maximum_likelihood", "tolerance_um": 2.0,
     "speed_feedforward": 0.98, "setpoint_filter_s": 0.002, "speed_filter_s": 0.0005, "current_delay_cycles": 2,
     "eds": "drive.eds", "dc_link_v": 300.0, "speed_unit": "millirpm",
+    "travel_mm": [0.0, 400.0], "axis.X.setpoints.max_speed_mm_s": 100.0,
+    "axis.X.setpoints.max_acceleration_mm_s2": 2000.0,
     "limit_switches_mm": [-10.0, 410.0], "home_switch_mm": 50.0,
     "run_directory": "/run/fdhil",
     "guard.run_directory": "/run/fdhil-guard", "daemon_user": "fdhil",

@@ -1,0 +1,213 @@
+"""``fdhil play``: a program or a demand streamed to the drives of a test bench that has no NC."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fdhil import config as machine_config
+from fdhil.errors import DeviceError, DriveFault
+from fdhil.guard.protocol import SOCKET_NAME
+
+if TYPE_CHECKING:
+    from fdhil.commissioning.play import Bench, Plan, Played
+    from fdhil.commissioning.record import CommissioningRecord
+    from fdhil.commissioning.set_points import SetPoints
+    from fdhil.config import MachineConfig
+
+_FILE = click.Path(path_type=Path)
+SWITCH_INTERVAL_S = 0.0002  # the cycle must not wait 5 ms for the thread that only looks on
+MARKED_S = 1.0  # a daemon beside the guard marks a record that late
+SIGNALS: Mapping[int, str] = {
+    signal.SIGINT: "stopped by Ctrl-C",
+    signal.SIGTERM: "stopped by SIGTERM",
+    signal.SIGHUP: "the terminal is gone",
+}
+
+
+@click.command()
+@click.argument("program", type=_FILE)
+@click.option("--config", "config_path", required=True, type=_FILE, help="The machine (TOML).")
+@click.option("--go-to-start", is_flag=True, help="Go to the first set-point slowly, where the axes are not there.")
+@click.option("--dry-run", is_flag=True, help="Check the program and say what would move; opens no bus.")
+@click.option("--yes", is_flag=True, help="Do not ask before the axes move.")
+@click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
+def play(program: Path, config_path: Path, go_to_start: bool, dry_run: bool, yes: bool, as_json: bool) -> int:
+    """Stream PROGRAM (an NC program, or a demand CSV) to the drives of a test bench that has no NC.
+
+    The axes move: fdhil produces SYNC, switches the drives on and sends their set-points, so nothing else may run the
+    bus. Asked for are a commissioning of every axis, [axis.X.setpoints] with its travel, and your yes. What would leave
+    its limits is refused before anything is sent; Ctrl-C and SIGTERM brake the axes and switch the drives off; should
+    fdhil die, the drives miss its heartbeat and stop by themselves. A correction may be armed while it plays.
+    Exit codes: 0 played to its end, 1 refused, or stopped on its way, 2 wrong option or configuration, 3 a drive or
+    bus cannot be reached, or failed on the way.
+    """
+    machine = machine_config.load(config_path)
+    from fdhil.commissioning.play import plan_play
+    from fdhil.program import load_trajectory
+
+    try:
+        plan = plan_play(machine, load_trajectory(program, machine), str(config_path))
+        if not as_json or dry_run:
+            click.echo(_told(plan, program), err=as_json)
+        if dry_run:
+            _document(as_json, {"would_play": True, "rows": int(plan.trajectory.time_s.size)})
+            return 0
+        played = _play(machine, plan, program, go_to_start, yes)
+    except DriveFault as fault:
+        click.echo(f"refused: {fault}", err=True)
+        _document(as_json, {"refused": str(fault)})
+        return 1
+    _tell(played, plan, as_json)
+    return int(played.stopped is not None)
+
+
+def _play(machine: MachineConfig, plan: Plan, program: Path, go_to_start: bool, yes: bool) -> Played:
+    """Ask, lead the drives and play; DriveFault when it is refused."""
+    from fdhil.cli.bus_lock import lock_place
+    from fdhil.commissioning.play import on_bench, valid_records
+
+    records = valid_records(machine)
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    with ExitStack() as held, _raised():
+        for name in dict.fromkeys(axis.drive.bus for axis in machine.axis.values()):
+            held.enter_context(lock_place(machine.bus[name], "set-points"))
+        bench = held.enter_context(on_bench(plan, _say))
+        bench.compare(records)
+        here = bench.here()
+        bench.require_start(here, go_to_start)
+        if not yes:
+            _ask(bench, program, here)
+        _quiet()
+        with bench.led(lambda: _tell_guard(machine, records)):
+            stopped = bench.go_to_start(_stopping)
+            if stopped is not None:
+                raise DriveFault("the way to the start", f"{stopped}; nothing was played")
+            return bench.play(_stopping)
+
+
+def _tell_guard(machine: MachineConfig, records: Mapping[str, CommissioningRecord]) -> None:
+    """Tell a running guard that the drives are those of their records: they were compared, and 0x1016 was ours."""
+    from fdhil.arming.guard_client import GuardClient
+    from fdhil.arming.token import operator_token
+    from fdhil.commissioning.void import confirm_record
+
+    directory = machine.guard_directory
+    if (directory / SOCKET_NAME).exists():
+        try:
+            with GuardClient(directory) as guard:
+                seen = {axis: record.fingerprint for axis, record in records.items()}
+                guard.compared(operator_token(machine.run_directory), seen)
+        except DeviceError as error:
+            click.echo(f"the guard was not told that the drives were compared: {error}", err=True)
+            return
+        time.sleep(MARKED_S)
+    for axis in records:
+        confirm_record(machine.store.directory, axis)
+
+
+def _say(text: str) -> None:
+    if sys.stderr.isatty():
+        click.echo(text, err=True)
+
+
+def _quiet() -> None:
+    """What is there now stays: no collector looks at it between two SYNCs."""
+    import gc
+
+    from fdhil.commissioning.realtime import lock_memory
+
+    gc.collect()
+    gc.freeze()
+    lock_memory()
+
+
+@contextmanager
+def _raised() -> Iterator[None]:
+    """SIGTERM and a terminal that closes are raised like Ctrl-C while the axes stand."""
+    with _handled(lambda number, _frame: signal.default_int_handler(number, _frame)):
+        yield
+
+
+@contextmanager
+def _stopping(path: SetPoints) -> Iterator[None]:
+    """While the axes move they are braked instead, whatever is pressed how often."""
+    with _handled(lambda number, _frame: path.stop(SIGNALS[number])):
+        yield
+
+
+@contextmanager
+def _handled(handler: Callable[[int, Any], None]) -> Iterator[None]:
+    before = {number: signal.signal(number, handler) for number in SIGNALS}
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
+
+
+def _told(plan: Plan, program: Path) -> str:
+    """What would move: from where to where, how fast, how long."""
+    trajectory = plan.trajectory
+    lines = [f"{program.name}: {trajectory.time_s.size} set-points, {trajectory.time_s[-1]:.3f} s"]
+    for axis, path in trajectory.position_mm.items():
+        speed = abs(path[1:] - path[:-1]).max(initial=0.0) / trajectory.dt_s
+        lines.append(
+            f"  {axis} from {path[0]:.3f} to {path[-1]:.3f} mm, between {path.min():.3f} and {path.max():.3f} mm, "
+            f"at up to {speed:.1f} mm/s"
+        )
+    return "\n".join(lines)
+
+
+def _ask(bench: Bench, program: Path, here: list[int]) -> None:
+    """Ask before anything moves; DriveFault when the answer is no, or nobody is there to give one."""
+    ways = zip(bench.plan.axes, bench.away_mm(here), strict=True)
+    start = ", ".join(f"{axis} {way:+.3f} mm" for axis, way in ways if way)
+    first = f"First the axes go slowly to the start ({start}). " if start else ""
+    question = (
+        f"The drives are as they were commissioned. {first}Then {program.name} is played. "
+        "Is everybody out of reach, is the emergency stop within it, and may the axes move?"
+    )
+    try:
+        agreed = click.confirm(question, err=True)
+    except click.Abort:
+        if sys.stdin.isatty():
+            raise  # Ctrl-C
+        agreed = False
+    if not agreed:
+        raise DriveFault("the bench", "nobody said yes, and nothing moved; start again, with --yes where nobody is")
+
+
+def _document(as_json: bool, more: Mapping[str, Any]) -> None:
+    if as_json:
+        click.echo(json.dumps({"schema": "fdhil-play-1", **more}))
+
+
+def _tell(played: Played, plan: Plan, as_json: bool) -> None:
+    late = played.lateness
+    sync = {
+        "period_s": plan.trajectory.dt_s,
+        "cycles": late.cycles,
+        "late_p50_us": late.quantile_us(0.5),
+        "late_p99_us": late.quantile_us(0.99),
+        "late_max_us": round(late.most_us, 1),
+        "skipped": late.skipped,
+        "scheduling": played.scheduling,
+    }
+    _document(as_json, {"rows": played.of, "played": played.rows, "stopped": played.stopped, "sync": sync})
+    if as_json:
+        return
+    how = "played to its end" if played.stopped is None else f"{played.stopped}: braked, the drives are off"
+    click.echo(f"{played.rows} of {played.of} set-points, {how}")
+    click.echo(
+        f"SYNC left late by {sync['late_p50_us']:.0f} us (half of them), {sync['late_p99_us']:.0f} us (99 %), "
+        f"{sync['late_max_us']:.0f} us (worst of {late.cycles}); {late.skipped} periods missed; {played.scheduling}"
+    )
