@@ -103,7 +103,7 @@ class MtConnect:
         ]
         if lacking:
             text = f"tells no {', no '.join(lacking)}; compare the profile with its /current"
-            raise ProtocolError(self.name, f"{text}, and see docs/how-to/g0-from-the-nc.md")
+            raise ProtocolError(self.name, f"{text}, and see docs/how-to/g0-over-the-network.md")
         self._signals = {item: name for name, item in found.items() if item is not None}
         self._instance = streams.instance
         for each in (each for component in components for each in component.observed):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ssl
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -109,14 +110,21 @@ async def certificates(folder: Path, name: str, uri: str) -> tuple[Path, Path]:
     return certificate, key
 
 
+def as_pem(certificate: Path) -> Path:
+    """Write a certificate as text, under a name that does not tell so."""
+    text = certificate.with_suffix(".crt")
+    text.write_text(ssl.DER_cert_to_PEM_cert(certificate.read_bytes()))
+    return text
+
+
 async def test_a_user_a_certificate_and_encryption(tmp_path: Path) -> None:
     ours = await certificates(tmp_path, "fdhil", OWN_URI)
     theirs = await certificates(tmp_path, "nc", "urn:nc")
     password = tmp_path / "password"
     async with OpcUaPeer(secure=theirs, users=_Users()) as peer:
         keys = {**peer.settings, "timeout_s": 2.0, "user": "fdhil", "password_file": str(password)}
-        keys |= {"certificate": str(ours[0]), "private_key": str(ours[1])}
-        with pytest.raises(ConfigError, match=r"password_file.*cannot be read"):
+        keys |= {"certificate": str(as_pem(ours[0])), "private_key": str(ours[1])}
+        with pytest.raises(ConnectError, match=r"password_file.*cannot be read"):
             await once(config_of(**keys))
         password.write_text("wrong\n")
         with pytest.raises(ConnectError, match="cannot be entered"):
@@ -125,7 +133,7 @@ async def test_a_user_a_certificate_and_encryption(tmp_path: Path) -> None:
         await peer.say(MoveKind.ARC)
         assert (await once(config_of(**keys, server_certificate=str(theirs[0])))).motion is MoveKind.ARC
         (tmp_path / "fdhil.pem").write_text("no key")
-        with pytest.raises(ConfigError, match="cannot be used with its key"):
+        with pytest.raises(ConnectError, match="cannot be used with its key"):
             await once(config_of(**keys))
 
 
