@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ssl
+import struct
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -14,6 +15,8 @@ import pytest
 from asyncua import ua
 from asyncua.crypto import cert_gen
 from asyncua.crypto.permission_rules import User, UserRole
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from fdhil import tables
 from fdhil.config import MachineConfig
@@ -173,6 +176,22 @@ async def test_what_is_no_server_is_told_in_one_sentence(answer: bytes | None) -
             await once(config_of(url=url, timeout_s=0.1))
     assert "compare url" in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+ACKNOWLEDGE = b"ACKF\x1c\x00\x00\x00" + struct.pack("<5I", 0, 65536, 65536, 0, 0)
+
+
+@settings(max_examples=25)
+@given(st.binary(max_size=60), st.sampled_from([b"", b"OPNF", b"MSGF", b"ERRF", b"CLOF"]), st.booleans())
+def test_whatever_a_server_answers_is_a_device_error(body: bytes, kind: bytes, sized: bool) -> None:
+    head = kind + struct.pack("<I", len(body) + 8) if sized else kind
+
+    async def ask() -> None:
+        async with server_of(ACKNOWLEDGE + head + body) as url:
+            with pytest.raises(DeviceError):
+                await once(config_of(url=url, timeout_s=0.05))
+
+    asyncio.run(ask())
 
 
 @pytest.mark.parametrize(
