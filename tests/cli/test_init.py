@@ -70,7 +70,7 @@ def written(folder: Path, **tables: Any) -> Path:
 
 
 def test_linuxcncs_files_and_few_answers_make_a_machine(fdhil: Said, tmp_path: Path) -> None:
-    (tmp_path / "mill.ini").write_text(INI.replace("X Y Z", "X Y"))
+    (tmp_path / "mill.ini").write_text(INI.replace("X Y Z", "X Y").replace("No 3", "No 3 \x07"))
     (tmp_path / "drives.hal").write_text(HAL_TEXT)
     sheet = SHEET | {"screw_pitch_mm": 10.0}
     answers = written(tmp_path, axis={"X": sheet | {"correction": {"max_offset_um": 40.0}}, "Y": sheet})
@@ -81,13 +81,13 @@ def test_linuxcncs_files_and_few_answers_make_a_machine(fdhil: Said, tmp_path: P
     assert "next: fdhil doctor" in out
     made = machine_config.load(file)
     x, y = made.axis["X"], made.axis["Y"]
-    assert (made.machine.name, made.machine.sync_period_s, made.nc.profile) == ("Mill No 3", 0.002, "linuxcnc")
+    assert (made.machine.name.strip(), made.machine.sync_period_s, made.nc.profile) == ("Mill No 3", 0.002, "linuxcnc")
     assert (x.rapid_speed_mm_s, x.drive.increments_per_rev, x.drive.sign) == (400.0, 10000, 1)
     assert (y.drive.increments_per_rev, y.drive.sign) == (8192, -1)
     assert (x.correction is not None, y.correction is not None) == (True, False)
     text = file.read_text()
     assert "rapid_speed_mm_s = 400.0  # LinuxCNC: [TRAJ] MAX_LINEAR_VELOCITY" in text
-    assert "# travel per motor revolution" in text or "# table travel per motor revolution" in text
+    assert "# table travel per motor revolution" in text
     assert "R = 0.5  # from the answers" in text
     assert "Cd = 2.0  # guessed: 5 % of the continuous torque; the first rapids tell it" in text
     assert "/work" not in text
@@ -189,6 +189,17 @@ def test_who_goes_away_leaves_nothing(fdhil: Said, tmp_path: Path) -> None:
     assert code == 130
     assert "stopped by the operator" in err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_file_says_cannot_break_the_comments(fdhil: Said, tmp_path: Path) -> None:
+    (tmp_path / "mill.ini").write_text(INI.replace("X Y Z", "X").replace("[JOINT_0]", "[JOINT_0]\nN=\x07\x7f\u2028"))
+    (tmp_path / "drives.hal").write_text(HAL_TEXT.replace("cia402.0", "cia402.[JOINT_0]N"))
+    axis = SHEET | {"screw_pitch_mm": 10.0}
+    answers = written(tmp_path, axis={"X": axis})
+    arguments = ("--from-linuxcnc", tmp_path / "mill.ini", "--answers", answers, "--offline")
+    code, _, err = fdhil("init", tmp_path / "m.toml", *arguments)
+    assert code == 0, err
+    assert machine_config.load(tmp_path / "m.toml").axis["X"].drive.increments_per_rev == 10000
 
 
 def test_beside_an_nc_nothing_is_sent(fdhil: Said, peer: DrivePeer, bus: dict[str, Any], tmp_path: Path) -> None:

@@ -35,8 +35,8 @@ class Found:
     complete: bool
 
 
-def settle_machine(draft: Draft, buses: Sequence[FoundBus], name: str) -> None:
-    """Settle [machine]: its name, and the SYNC period that files, answers or the bus tell."""
+def settle_machine(draft: Draft, buses: Sequence[FoundBus], name: str, nc: Machine | None) -> None:
+    """Settle [machine]: its name, and the SYNC period that files, answers or the bus tell; and how G0 is seen."""
     draft.settle("machine.name", "any name", Told(name, "guessed: the file's name", guessed=True))
     for bus in buses:
         if bus.master is not None:
@@ -51,6 +51,10 @@ def settle_machine(draft: Draft, buses: Sequence[FoundBus], name: str) -> None:
     if len(cycles) == 1:
         usual = Told(cycles.pop(), "guessed: the drives' own cycle, 0x60C2; it must be the NC's", guessed=True)
     draft.settle("machine.sync_period_s", "the NC's cycle: how often it sends SYNC", usual)
+    if nc is not None:
+        where = "linuxcnc where its HAL file loads fdhil's bridge: line and override are then known; else inferred"
+        by_motion = "guessed: by the motion; 'linuxcnc' where its HAL file loads fdhil's bridge"
+        draft.settle("g0.source", where, Told("inferred", by_motion, guessed=True))
 
 
 def _cycle(heard_s: float) -> float:

@@ -54,7 +54,7 @@ def make(
     draft.notes += nc.notes if nc else []
     ways = list(_buses(draft, interface, offline=look is None))
     buses = [look(name, settings) for name, settings in ways] if look else []
-    settle_machine(draft, buses, file.stem)
+    settle_machine(draft, buses, file.stem, nc)
     drives = [drive for bus in buses for drive in bus.drives]
     complete = bool(buses) and all(bus.master is None for bus in buses)
     names = axis_names(draft, nc, drives)
