@@ -21,6 +21,7 @@ from fdhil.config.template import filled
 from tests.commissioning.test_linuxcnc_files import HAL_TEXT, INI
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
+from tests.eds import write_eds
 
 Said = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).parents[2]
@@ -79,6 +80,7 @@ def test_linuxcncs_files_and_few_answers_make_a_machine(fdhil: Said, tmp_path: P
     code, out, err = fdhil(*arguments)
     assert code == 0, err
     assert "next: fdhil doctor" in out
+    assert "  check nominal.Cd of axis.X, axis.Y = 2.0: guessed: 5 % of the continuous torque" in out
     made = machine_config.load(file)
     x, y = made.axis["X"], made.axis["Y"]
     assert (made.machine.name.strip(), made.machine.sync_period_s, made.nc.profile) == ("Mill No 3", 0.002, "linuxcnc")
@@ -165,7 +167,7 @@ def test_the_drive_tells_its_scales_and_the_operator_the_rest(
     made = machine_config.load(file).axis["X"]
     assert (made.drive.profile, made.drive.increments_per_rev, made.nominal.K) == ("fdhil_twin", 65536, 0.8)
     assert (made.nominal.Jt, made.correction is not None) == (0.075, True)
-    assert "check axis.X.nominal.K = 0.8: guessed: the drive's rated torque" in out
+    assert "check nominal.K of axis.X = 0.8: guessed: the drive's rated torque" in out
     assert set(peer.heard) == {*range(0x601, 0x680)}, "only SDO requests, to every node-ID once"
 
 
@@ -182,6 +184,20 @@ def test_numbers_that_cannot_be_of_one_machine_are_asked_again(
     assert code == 0, (err, out)
     assert "it cannot be" in err
     assert machine_config.load(file).axis["X"].nominal.L == 0.005
+
+
+def test_an_eds_that_cannot_be_read_is_asked_again(fdhil: Said, tmp_path: Path) -> None:
+    write_eds("elmo", tmp_path)
+    lines = [
+        "virtual", "one", "", "", "X", "", "cia402", "lost.eds", "cia402", "elmo.eds", "20", "65536", "500", "4000",
+        "50", "0.5", "0.005", "0.8", "0.075", "", "300", *[""] * 8, "yes",
+    ]  # fmt: skip
+    file = tmp_path / "m.toml"
+    code, out, err = fdhil("init", file, "--offline", said="\n".join(lines) + "\n")
+    assert code == 0, (err, out)
+    assert "lost.eds" in err
+    made = machine_config.load(file).axis["X"]
+    assert (made.drive.profile, made.drive.eds) == ("cia402", tmp_path / "elmo.eds")
 
 
 def test_who_goes_away_leaves_nothing(fdhil: Said, tmp_path: Path) -> None:
