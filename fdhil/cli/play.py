@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -13,15 +14,18 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import config as machine_config
-from fdhil.errors import DriveFault
+from fdhil.errors import DeviceError, DriveFault
+from fdhil.guard.protocol import SOCKET_NAME
 
 if TYPE_CHECKING:
     from fdhil.commissioning.play import Bench, Plan, Played
+    from fdhil.commissioning.record import CommissioningRecord
     from fdhil.commissioning.set_points import SetPoints
     from fdhil.config import MachineConfig
 
 _FILE = click.Path(path_type=Path)
 SWITCH_INTERVAL_S = 0.0002  # the cycle must not wait 5 ms for the thread that only looks on
+MARKED_S = 1.0  # a daemon beside the guard marks a record that late
 SIGNALS: Mapping[int, str] = {
     signal.SIGINT: "stopped by Ctrl-C",
     signal.SIGTERM: "stopped by SIGTERM",
@@ -83,11 +87,31 @@ def _play(machine: MachineConfig, plan: Plan, program: Path, go_to_start: bool, 
         if not yes:
             _ask(bench, program, here)
         _quiet()
-        with bench.led():
+        with bench.led(lambda: _tell_guard(machine, records)):
             stopped = bench.go_to_start(_stopping)
             if stopped is not None:
                 raise DriveFault("the way to the start", f"{stopped}; nothing was played")
             return bench.play(_stopping)
+
+
+def _tell_guard(machine: MachineConfig, records: Mapping[str, CommissioningRecord]) -> None:
+    """Tell a running guard that the drives are those of their records: they were compared, and 0x1016 was ours."""
+    from fdhil.arming.guard_client import GuardClient
+    from fdhil.arming.token import operator_token
+    from fdhil.commissioning.void import confirm_record
+
+    directory = machine.guard_directory
+    if (directory / SOCKET_NAME).exists():
+        try:
+            with GuardClient(directory) as guard:
+                seen = {axis: record.fingerprint for axis, record in records.items()}
+                guard.compared(operator_token(machine.run_directory), seen)
+        except DeviceError as error:
+            click.echo(f"the guard was not told that the drives were compared: {error}", err=True)
+            return
+        time.sleep(MARKED_S)
+    for axis in records:
+        confirm_record(machine.store.directory, axis)
 
 
 def _say(text: str) -> None:

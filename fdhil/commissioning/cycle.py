@@ -194,11 +194,16 @@ class Cycle:
     @property
     def turning(self) -> bool:
         """Whether set-points leave."""
-        return self.producing and self.failure is None and self._thread.is_alive()
+        return self.producing and not self.lost and self._thread.is_alive()
 
     def stop_sync(self) -> None:
         """Send SYNC and set-points no more."""
         self._sync_overflow = None
+
+    @property
+    def lost(self) -> bool:
+        """Whether a bus has ended, or takes nothing more."""
+        return self.failure is not None or any(bus.ended is not None for bus in self.buses.values())
 
     def check(self) -> None:
         """Raise what ended the thread or a bus."""

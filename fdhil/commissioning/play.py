@@ -179,11 +179,15 @@ class Bench:
     # the drives are led
 
     @contextlib.contextmanager
-    def led(self) -> Iterator[None]:
-        """Take the bus over and hold every drive in Operation enabled; at the end they are off and as they were."""
+    def led(self, written: Callable[[], None]) -> Iterator[None]:
+        """Take the bus over and hold every drive in Operation enabled; at the end they are off and as they were.
+
+        ``written`` is called while SYNC goes on when 0x1016 was written and when it was given back: a guard that heard
+        it takes the drives for set up anew.
+        """
         node_id, beat_s = self._config.play.node_id, self._config.play.heartbeat_s
-        with contextlib.ExitStack() as undo:
-            undo.callback(setattr, self.loop, "heartbeat", None)
+        with self._bus_loss_told(), contextlib.ExitStack() as undo:
+            undo.callback(self._leave_bus, written)
             for master in self.masters:
                 undo.enter_context(self._given_back(watched(master, node_id, beat_s)))
             for master in self.masters:
@@ -195,7 +199,25 @@ class Bench:
             self.loop.heartbeat, self.loop.heartbeat_s = node_id, beat_s
             for master in self.masters:
                 enable(master)
+            written()
             yield
+
+    @contextlib.contextmanager
+    def _bus_loss_told(self) -> Iterator[None]:
+        try:
+            yield
+        except DeviceError as error:
+            if not self.loop.lost:
+                raise
+            what = "nothing more can be sent: a drive that is on stops by itself when it misses our heartbeat (0x1016)"
+            raise DeviceError(error.device, f"{str(error).removeprefix(f'{error.device}: ')}; {what}") from None
+
+    def _leave_bus(self, written: Callable[[], None]) -> None:
+        with undisturbed():
+            self.loop.heartbeat = None
+            if self.loop.turning and all(master.heard.master is None for master in self.masters):
+                written()
+            self.loop.stop_sync()
 
     @contextlib.contextmanager
     def _given_back(self, watching: contextlib.AbstractContextManager[None]) -> Iterator[None]:
@@ -212,7 +234,7 @@ class Bench:
                         self._say(f"0x1016 could not be given back ({error}); power the drive off and on again")
 
     def _switch_off(self) -> None:
-        """Wait until a guard has taken its offsets away, then take the power off, step by step, and SYNC."""
+        """Wait until a guard has taken its offsets away, then take the power off, step by step."""
         with undisturbed(), contextlib.suppress(DeviceError):  # of a bus that is gone: what went wrong is told already
             if not self.loop.turning:
                 return
@@ -224,7 +246,6 @@ class Bench:
             for master in self.masters:
                 master.target = None
                 master.nmt(NmtCommand.ENTER_PRE_OPERATIONAL)
-            self.loop.stop_sync()
 
     def _await_landing(self) -> None:
         end = time.monotonic() + LANDING_S

@@ -33,11 +33,18 @@ EXAMPLES: Mapping[str, Any] = {  # of keys without a default: the bench machine
     "node_id": 1, "speed_limit_mm_s": 500.0, "method": "maximum_likelihood", "tolerance_um": 2.0,
     "speed_feedforward": 0.98, "setpoint_filter_s": 0.002, "speed_filter_s": 0.0005, "current_delay_cycles": 2,
     "eds": "drive.eds", "dc_link_v": 300.0, "speed_unit": "millirpm",
+    "travel_mm": [0.0, 400.0], "axis.X.setpoints.max_speed_mm_s": 100.0,
+    "axis.X.setpoints.max_acceleration_mm_s2": 2000.0,
     "limit_switches_mm": [-10.0, 410.0], "home_switch_mm": 50.0,
     "run_directory": "/run/fdhil",
     "guard.run_directory": "/run/fdhil-guard", "daemon_user": "fdhil",
     "commissioning_key": "/etc/fdhil/commissioning.key",
     "cob_id": 0x2A0, "axis.X.accelerometer.device": "/dev/ttyACM0",
+    "nc_source.modbus_coil.hold": "1", "nc_source.modbus_coil.feed": "2", "nc_source.modbus_coil.arc": "3",
+    "nc_source.modbus_coil.line": 100, "nc_source.modbus_coil.tool": 103,
+    "feed_override": 101, "rapid_override": 102,
+    "nc_source.opcua.user": "fdhil", "password_file": "nc-password",
+    "certificate": "fdhil.der", "private_key": "fdhil.pem", "server_certificate": "nc.der",
     "axis.X.voltage.type": "float32", "count_address": 42, "trigger_address": 43,
 }  # fmt: skip
 NAMES = {"axis": "X", "bus": "can0"}  # the user's own names in the template

@@ -1,0 +1,176 @@
+"""fdhil play as a process beside the simulated machine: when it or its bus dies, the drives stop by themselves."""
+
+from __future__ import annotations
+
+import select
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import can
+import pytest
+
+from fdhil import config as machine_config
+from tests.integration.conftest import sign_off
+from tests.sim.twin_process import TwinProcess, write_config
+
+PER_MM = 65536 / 20
+HEARTBEAT_LOST = 0x8130
+STROKE = "G21 G90 G94\nG1 X300 F9000\nM2\n"
+SETPOINTS = "[axis.X.setpoints]\ntravel_mm = [-10.0, 400.0]\n[axis.Y.setpoints]\ntravel_mm = [-10.0, 10.0]\n"
+# fdhil as a process of its own that waits a shorter time than on a real machine
+QUICK = """
+from fdhil.commissioning import steps, survey
+from fdhil.drivers.can import sdo
+survey.LISTEN_S, steps.SETTLE_CYCLES, sdo.RESPONSE_TIMEOUT_S, sdo.DEADLINE_S = 0.3, 50, 1.0, 20.0
+from fdhil.cli.main import main
+main()
+"""
+
+
+class Relay:
+    """A cable between fdhil and the hub that can be cut."""
+
+    def __init__(self, port: int) -> None:
+        self._hub = port
+        self._listening = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listening.getsockname()[1]
+        self._ends: list[socket.socket] = []
+        self._thread = threading.Thread(target=self._carry, daemon=True)
+        self._thread.start()
+
+    def _carry(self) -> None:
+        near, _ = self._listening.accept()
+        far = socket.create_connection(("127.0.0.1", self._hub))
+        self._ends = [near, far]
+        other = {near: far, far: near}
+        try:
+            while True:
+                for end in select.select(self._ends, (), ())[0]:
+                    data = end.recv(65536)
+                    if not data:
+                        return
+                    other[end].sendall(data)
+        except OSError:
+            return
+
+    def cut(self) -> None:
+        """Both ends lose the connection at once."""
+        for end in self._ends:
+            end.shutdown(socket.SHUT_RDWR)
+        self._thread.join()
+        for end in (*self._ends, self._listening):
+            end.close()
+
+
+@dataclass
+class Shop:
+    """The simulated machine as a process, what is heard on its bus, and its commissioned config."""
+
+    twin: TwinProcess
+    folder: Path
+    bus: can.BusABC
+
+    def config(self, port: int) -> Path:
+        path = write_config(self.folder, bus=f'interface = "socketcand"\nport = {port}')
+        path.write_text(path.read_text() + SETPOINTS + '[guard]\nclock = "sync"\n[play]\nheartbeat_s = 0.1\n')
+        return path
+
+    def playing(self, port: int) -> subprocess.Popen[str]:
+        """Start to play, and return as soon as X is in motion."""
+        program = self.folder / "part.ngc"
+        program.write_text(STROKE)
+        arguments = ["play", program, "--config", self.config(port), "--yes", "--go-to-start"]
+        process = subprocess.Popen(
+            [sys.executable, "-c", QUICK, *map(str, arguments)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        targets: list[float] = []
+
+        def moves() -> bool:
+            while (frame := self.bus.recv(0)) is not None:
+                if frame.arbitration_id == 0x201:
+                    targets.append(struct.unpack("<Hi", frame.data)[1] / PER_MM)
+            return process.poll() is not None or (bool(targets) and max(targets) - min(targets) > 5.0)
+
+        self.wait(moves)
+        return process
+
+    def wait(self, condition: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + 300
+        while not condition():
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+
+    def stopped_by_themselves(self) -> bool:
+        """Both drives report that our heartbeat is lost, fall into fault, and stand."""
+        lost: set[int] = set()
+
+        def told() -> bool:
+            while (frame := self.bus.recv(0)) is not None:
+                if frame.arbitration_id in (0x081, 0x082) and frame.data[:2] == HEARTBEAT_LOST.to_bytes(2, "little"):
+                    lost.add(frame.arbitration_id)
+            return len(lost) == 2
+
+        self.wait(told)
+        places = [self.read(0x6064)]
+
+        def stands() -> bool:
+            time.sleep(0.2)
+            places.append(self.read(0x6064))
+            return self.read(0x6041) & 0x4F == 0x08 and places[-1] == places[-2]
+
+        self.wait(stands)
+        return places[-1] < 300 * PER_MM
+
+    def read(self, index: int) -> int:
+        """Read an object of drive X by SDO."""
+        request = bytes([0x40]) + struct.pack("<HB", index, 0) + bytes(4)
+        self.bus.send(can.Message(arbitration_id=0x601, data=request, is_extended_id=False))
+        answers: list[bytes] = []
+
+        def answered() -> bool:
+            while (frame := self.bus.recv(0)) is not None:
+                if frame.arbitration_id == 0x581 and frame.data[1:3] == request[1:3]:
+                    answers.append(bytes(frame.data))
+            return bool(answers)
+
+        self.wait(answered)
+        return int.from_bytes(answers[-1][4:], "little", signed=True)
+
+
+@pytest.fixture(scope="module")
+def shop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shop]:
+    folder = tmp_path_factory.mktemp("play")
+    with TwinProcess(write_config(folder)) as twin, twin.join() as bus:
+        made = Shop(twin, folder, bus)
+        sign_off(machine_config.load(made.config(twin.bus_settings["port"])))
+        yield made
+
+
+def test_a_killed_process_leaves_drives_that_stop(shop: Shop) -> None:
+    process = shop.playing(shop.twin.bus_settings["port"])
+    process.send_signal(signal.SIGKILL)
+    said = process.communicate()
+    assert process.returncode == -signal.SIGKILL, said
+    assert shop.stopped_by_themselves()
+
+
+def test_a_lost_bus_leaves_drives_that_stop_and_is_told(shop: Shop) -> None:
+    cable = Relay(shop.twin.bus_settings["port"])
+    process = shop.playing(cable.port)
+    cable.cut()
+    _, err = process.communicate()
+    assert process.returncode == 3
+    assert "a drive that is on stops by itself" in err
+    assert "Traceback" not in err
+    assert shop.stopped_by_themselves()
