@@ -1,4 +1,4 @@
-"""The literal registries: name -> "module:factory" (a drive profile: "package:file"). Being listed is being tested.
+"""The literal registries: name -> "module:factory" (a profile: "package:file"). Being listed is being tested.
 
 Nothing registers itself. Config checks names against these tables without importing the rooms behind them.
 """
@@ -34,6 +34,16 @@ VOLTAGE_SOURCES: Mapping[str, str] = {
 }
 NC_SOURCES: Mapping[str, str] = {
     "linuxcnc": "fdhil.drivers.nc.linuxcnc:LinuxCnc",
+    "modbus_coil": "fdhil.drivers.nc.modbus_coil:ModbusCoil",
+    "mtconnect": "fdhil.drivers.nc.mtconnect:MtConnect",
+    "opcua": "fdhil.drivers.nc.opcua:OpcUa",
+}
+NC_PROFILES: Mapping[str, str] = {
+    "mtconnect": "fdhil.drivers.nc.profiles:mtconnect.toml",
+    "opc40502": "fdhil.drivers.nc.profiles:opc40502.toml",
+    "siemens": "fdhil.drivers.nc.profiles:siemens.toml",
+    "heidenhain": "fdhil.drivers.nc.profiles:heidenhain.toml",
+    "beckhoff": "fdhil.drivers.nc.profiles:beckhoff.toml",
 }
 EVENT_SOURCES: Mapping[str, str] = {
     "inferred": "fdhil.drivers.moves.inferred:InferredG0",

@@ -11,7 +11,7 @@ from fdhil import tables
 TABLES: dict[str, Mapping[str, str]] = {
     name: table
     for name, table in vars(tables).items()
-    if name.isupper() and isinstance(table, Mapping) and name != "DRIVE_PROFILES"  # files of data, with a loader
+    if name.isupper() and isinstance(table, Mapping) and not name.endswith("_PROFILES")  # files of data, with a loader
 }
 
 

@@ -35,7 +35,7 @@ from fdhil.arming.whole_plan import plan_whole
 from fdhil.config import MachineConfig
 from fdhil.errors import DeviceError
 from fdhil.guard.protocol import LANDING
-from fdhil.records import AxisSamples, Notice, Skill
+from fdhil.records import AxisSamples, NcState, Notice, Skill
 from fdhil.store.rows import Revision
 
 STREAM_S = 0.05
@@ -82,6 +82,10 @@ class ArmingDesk:
         """Take samples: those of a pass of the armed program are compared with what was predicted."""
         self._passes.take(samples)
         self._standstill.take(samples)
+
+    def hear_nc(self, state: NcState) -> None:
+        """Take what the NC says: a pass that it held, or ran at another speed, is not as planned."""
+        self._passes.hear_nc(state)
 
     @property
     def passes(self) -> list[Mapping[str, Any]]:

@@ -24,7 +24,7 @@ from fdhil.errors import StoreError
 from fdhil.prediction import contour_error_um
 from fdhil.prediction.contour import WINDOW_S
 from fdhil.prediction.gain import plus_minus
-from fdhil.records import AxisSamples, Float, Int, Notice, Parameters, Reason
+from fdhil.records import AxisSamples, Float, Int, MoveKind, NcState, Notice, Parameters, Reason
 
 Rows = tuple[Int, Float, Float]
 """Tick, demand and position (n,) of an axis."""
@@ -36,6 +36,7 @@ MOST_LEAD_S = 10.0
 TOLERANCE_INCREMENTS = 2.5
 WORSE = 1.05  # times the error predicted without a correction
 SHOWN_CURVE = 8  # passes
+FULL_OVERRIDE = 0.005  # by which one of 100 % may be off
 FINISHED = "Finished"  # the guard's word for a program that ran to its end
 
 
@@ -91,6 +92,11 @@ class Passes:
         if self._running is not None or self._ended:
             self._taken.append(samples)
 
+    def hear_nc(self, state: NcState) -> None:
+        """Take what the NC says while a pass may run."""
+        if self._running is not None:
+            self._running.hear_nc(state)
+
     def end(self, cause: str, summary: Mapping[str, Any]) -> None:
         """The guard has ended the correction."""
         if self._running is not None:
@@ -117,7 +123,7 @@ class Passes:
         summary = ended.summary
         digest = str(summary["program_digest"])
         self._count[digest] += 1
-        told = {
+        told: dict[str, Any] = {
             "program": summary["program"],
             "program_digest": digest,
             "pass": self._count[digest],
@@ -128,6 +134,9 @@ class Passes:
         }
         lesson, notices = _learned(ended)
         text = _text(told) + ("" if lesson is None else _lesson_text(lesson))
+        if ended.running.disturbed is not None:
+            told["disturbed"] = ended.running.disturbed
+            text += f"; {ended.running.disturbed}: nothing is learned from this pass"
         learned = {} if lesson is None else {"learned": {"passes": len(lesson.curve_um), "curve_um": lesson.curve_um}}
         self.told.append({**told, "text": text, **learned})
         self._keep_or_break(ended, told, text)
@@ -139,6 +148,7 @@ class Passes:
         self._broken.pop(digest, None)
         if (
             ended.cause == FINISHED
+            and ended.running.disturbed is None
             and told["measured"]["rms_um"] * gate.LEAST_GAIN > told["predicted_without"]["rms_um"]
         ):
             advice = "let the machine make a few rapids, which identify it again, then arm"
@@ -176,9 +186,15 @@ class Pass:
         self._begun = self._at_start = False
         self._rows, self._squares, self._max_um = 0, 0.0, 0.0
         self._following = np.zeros(len(self._axes))
+        self.disturbed: str | None = None
 
     def _away(self, rows_mm: Float) -> Any:
         return np.any(np.abs(rows_mm - self._start_mm) > self._tolerance_mm, axis=1)
+
+    def hear_nc(self, state: NcState) -> None:
+        """Note what the NC did to the pass: the first that made it another than was planned."""
+        if self.disturbed is None:
+            self.disturbed = disturbance(state)
 
     def take(self, samples: AxisSamples) -> None:
         """Take a block of one axis; the rows that all axes have by then go on."""
@@ -259,9 +275,21 @@ class Pass:
         return self._pupil.learn(demand, position)
 
 
+def disturbance(state: NcState) -> str | None:
+    """Return what an NC says that makes a running program another than was planned; None while nothing does."""
+    where = "" if state.line is None else f" in line {state.line}"
+    if state.held:
+        return f"the NC held its feed{where}"
+    override = state.rapid_override if state.motion is MoveKind.RAPID else state.feed_override
+    moving = state.motion in (MoveKind.RAPID, MoveKind.FEED, MoveKind.ARC)
+    if moving and override is not None and abs(override - 1.0) > FULL_OVERRIDE:
+        return f"the NC's override was {100 * override:.0f} %{where}"
+    return None
+
+
 def _learned(ended: _Ended) -> tuple[Lesson | None, list[Notice]]:
     """Let a program learn from its pass; return what it knows then, and a notice where that could not be kept."""
-    if ended.cause != FINISHED:
+    if ended.cause != FINISHED or ended.running.disturbed is not None:
         return None, []
     try:
         return ended.running.learn(), []

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import config as machine_config
-from fdhil.cli.commission_guide import Asked, Guide, confirm, room_of
-from fdhil.cli.commission_steps import FEEDFORWARD, STEPS, planned, trial_moves
+from fdhil.cli.commission_guide import Asked, Guide, confirm, room_of, told
+from fdhil.cli.commission_steps import FEEDFORWARD, STEPS, moves_of, planned, trial_moves
 from fdhil.cli.commission_trial import try_commissioned
 from fdhil.errors import ConfigError, ConfigFault, DriveFault
 
@@ -129,7 +129,7 @@ def _tell_plan(machine: MachineConfig, axes: list[str], asked: Asked) -> int:
         asked.say(f"axis {axis}, nothing is sent now:")
         for number, step in enumerate(steps, 1):
             done = f" Done {step['done_utc']}, kept if the drive is the same." if step["done_utc"] else ""
-            asked.say(f"  {number} {step['step']}: {step['does']} Moves {step['moves']}.{done}")
+            asked.say(f"  {number} {step['step']}: {told(step['does'], step['moves'])}{done}")
     if refused is not None:
         click.echo(f"refused: {refused}", err=True)
     return int(refused is not None)
@@ -161,7 +161,7 @@ def _commission_axis(machine: MachineConfig, axis: str, asked: Asked) -> dict[st
 
 def _commissioning_guide(machine: MachineConfig, axis: str, asked: Asked, progress: Progress) -> Callable[[str], None]:
     """Return the function that tells of each step, and asks before the drive is switched on."""
-    guide = Guide(axis, asked, STEPS, progress)
+    guide = Guide(axis, asked, STEPS, moves_of(machine, axis), progress)
 
     def report(step: str) -> None:
         if step == "enable" and not asked.yes:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from fdhil.cli.commission_steps import NOTHING
 from fdhil.errors import DriveFault
 
 if TYPE_CHECKING:
@@ -34,26 +35,33 @@ class Asked:
 
 
 class Guide:
-    """Tells of each step before it is done, or that it is kept."""
+    """Tells of each step before it is done, with what it moves, or that it is kept."""
 
-    def __init__(self, axis: str, asked: Asked, steps: Mapping[str, str], progress: Progress) -> None:
-        self._axis, self._asked, self._steps = axis, asked, steps
+    def __init__(
+        self, axis: str, asked: Asked, steps: Mapping[str, str], moves: Mapping[str, str], progress: Progress
+    ) -> None:
+        self._axis, self._asked, self._steps, self._moves = axis, asked, steps, moves
         progress.on_kept = self.kept
 
     def __call__(self, step: str) -> None:
         """Tell what is done next."""
-        self._asked.say(f"{self._head(step)}: {self._steps[step]}")
+        self._asked.say(f"{self._head(step)}: {told(self._steps[step], self._moves[step])}")
 
     def kept(self, name: str, step: Step) -> None:
         """Tell that a step need not be done."""
-        found = ", ".join(f"{key} {value}" for key, value in step.found.items() if not isinstance(value, Mapping))
-        self._asked.say(f"{self._head(name)}: kept, it was done {step.done_utc} ({found}).")
+        self._asked.say(f"{self._head(name)}: kept, it was done {step.done_utc}.")
 
     def _head(self, step: str) -> str:
         return f"axis {self._axis}, step {list(self._steps).index(step) + 1} of {len(self._steps)}, {step}"
 
 
+def told(does: str, moves: str) -> str:
+    """Return what a step does, and what it moves where it moves something."""
+    return does if moves == NOTHING else f"{does} Moves {moves}."
+
+
 def room_of(given: tuple[float, float] | None) -> Room | None:
+    """Return the room that was given, mm back and forward; click.BadParameter where it is none."""
     from fdhil.commissioning.strokes import Room
 
     if given is None:
@@ -66,6 +74,7 @@ def room_of(given: tuple[float, float] | None) -> Room | None:
 
 
 def confirm(axis: str, question: str, advice: str) -> None:
+    """DriveFault unless the operator says yes; ``advice`` says how things stand then, and what to do."""
     if not agreed(question):
         raise DriveFault(f"drive {axis}", f"nobody said yes; {advice}")
 

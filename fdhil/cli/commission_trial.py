@@ -34,7 +34,7 @@ def try_commissioned(
         asked.say(f"axis {axis} is not tried by moving it: no --room was given, so units, signs and model are unproven")
         return None
     moves = trial_moves(machine, axis, room)
-    guide = Guide(axis, asked, TRIAL, progress)
+    guide = Guide(axis, asked, TRIAL, moves, progress)
 
     def report(step: str) -> None:
         if moves[step] != NOTHING and not asked.yes:

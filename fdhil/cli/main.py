@@ -21,6 +21,10 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
         "fdhil.cli.init:init",
         "Make a machine's configuration from nothing: the NC's files, the drives, questions.",
     ),
+<<<<<<< HEAD
+    "paper": ("fdhil.cli.paper:paper", "Reproduce the paper that fdhil goes back to, claim by claim."),
+=======
+>>>>>>> 221a5e6a005198518506e567578cf56589057a1b
     "scan": ("fdhil.cli.commissioning:scan", "List what is on the bus: nodes, identity, state, heartbeat."),
     "check": ("fdhil.cli.commissioning:check", "Check that the machine on the bus is the one in the config."),
     "commission": ("fdhil.cli.commission:commission", "Commission the drives, step by step."),
@@ -42,7 +46,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "replay": ("fdhil.cli.records:replay", "Analyse a recorded window again, bit by bit as the daemon did."),
     "history": ("fdhil.cli.records:history", "Show how the parameters moved."),
     "report": ("fdhil.cli.records:report", "Write an HTML report of the stored history."),
-    "export": ("fdhil.cli.records:export", "Write a recording as CSV."),
+    "export": ("fdhil.cli.records:export", "Write a recording, or a log of the bus, in another file format."),
 }
 
 # the matrices of a window are small: threads of the numeric libraries only spin, and this PC has an NC beside it

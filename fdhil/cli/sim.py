@@ -45,8 +45,8 @@ def sim(
       {"command": "temperature", "celsius": 22}  {"command": "fault", "axis": "X", "fault": "reboot"}
       {"command": "trace", "file": "trace.csv"}  {"command": "stop"}  {"command": "quit"}
 
-    With --demand - the same lines may stand among the rows; the NC holds still while no row comes, and SYNC goes on.
-    It ends on quit, Ctrl-C or SIGTERM; the end of standard input does not end it.
+    With --demand - the same lines may stand among the rows; the NC takes the bus with the first of them, and holds
+    still while none comes. It ends on quit, Ctrl-C or SIGTERM; the end of standard input does not end it.
     """
     if demand is not None and program is not None:
         raise click.UsageError("give --demand or --program, not both")

@@ -48,6 +48,8 @@ def show(status: Mapping[str, Any], console: Console | None = None) -> None:
     guard = status.get("guard") or {}
     out.print(f"[bold]{escape(status['machine'])}[/bold]: {_heard(status)}, up {_ago(status['uptime_s'])}")
     out.print(counted(status.get("counters", {})))
+    if nc := status.get("nc"):
+        out.print(escape(nc_line(nc)))
     loads = "".join(f", {bus} loaded {load:.0f} %" for bus, load in status["bus_load_percent"].items())
     out.print(escape(f"correction: {status['state']}, guard {_guard(guard)}{loads}"))
     stands = status.get("may_stand", {"nothing": True})
@@ -110,6 +112,22 @@ def _guard(guard: Mapping[str, Any]) -> str:
     if state == "lost":
         return f"lost, heard {_ago(heard_s)} ago in state {guard.get('last_state')}"
     return state if heard_s <= GUARD_LIVE_S else f"{state} when it answered last, {_ago(heard_s)} ago"
+
+
+def nc_line(nc: Mapping[str, Any]) -> str:
+    """Say what the NC says of itself."""
+    if nc["motion"] == "unknown":
+        return f"NC: not heard for {_ago(nc['heard_s_ago'])}, its moves are unknown"
+    program = (nc["program"] or "").rpartition("/")[2]
+    line = "" if nc["line"] is None else f" line {nc['line']}" + (f" of {program}" if program else "")
+    parts = [f"{nc['motion']}{line}"]
+    parts += [
+        f"{what.replace('_', ' ')} {100 * nc[what]:.0f} %"
+        for what in ("feed_override", "rapid_override")
+        if nc[what] is not None
+    ]
+    parts += ["feed held"] if nc["feed_hold"] else []
+    return "NC: " + ", ".join(parts)
 
 
 def _ago(seconds: float) -> str:

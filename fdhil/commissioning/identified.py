@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from fdhil.config import MachineConfig
+from fdhil.config import Identification, MachineConfig
 from fdhil.errors import DriveFault
+from fdhil.identification.estimators.maximum_likelihood import delay_score, fit_windows
 from fdhil.pipeline import AxisPipeline, Known, Record
 from fdhil.records import PARAMETERS, Outcome, ParameterSet, Skill, WindowOutcome, unit_of
 
@@ -34,7 +35,7 @@ class Rapids:
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Value, standard deviation and unit of each parameter, and the delay of the voltage, ms."""
+        """Value, standard deviation and unit of each parameter."""
         values, deviations = self.published.parameters.as_dict(), self.published.covariance.diagonal()
         return {
             name: {"value": values[name], "std": math.sqrt(variance), "unit": unit_of(name)}
@@ -55,6 +56,28 @@ def judge(axis: str, outcomes: Sequence[Outcome]) -> Rapids:
         told = f" ({reasons[0]}); {reasons[0].advice}" if reasons else "; look at its windows with fdhil history"
         raise DriveFault(device, f"the test rapids are not believed{told}")
     return Rapids(axis, windows, published[-1], tuple(o for o in outcomes if isinstance(o, Skill))[-ACCEPTANCE_MOVES:])
+
+
+def voltage_late(config: MachineConfig, rapids: Rapids) -> dict[str, Any]:
+    """Return by how much the voltage is late against the current (early: negative), ms, and the standard deviation.
+
+    One of more than a sample has refused the windows already (SampleTiming); {} without a voltage.
+    """
+    told = [found for window in rapids.windows if (found := _late_s(window, config.identification)) is not None]
+    if not told:
+        return {}
+    late_s, std_s = (sum(column) / len(told) for column in zip(*told, strict=True))
+    return {"voltage_late_ms": round(late_s * 1e3, 4), "std_ms": round(std_s * 1e3 / math.sqrt(len(told)), 4)}
+
+
+def _late_s(outcome: WindowOutcome, settings: Identification) -> tuple[float, float] | None:
+    estimate = outcome.estimate
+    if estimate is not None and estimate.delay_s is not None and estimate.delay_std_s is not None:
+        return estimate.delay_s, estimate.delay_std_s
+    if not outcome.verdict.accepted or outcome.window.voltage_v is None:
+        return None
+    fit = fit_windows([outcome.window], settings)
+    return None if fit is None else delay_score(fit)
 
 
 def accept(config: MachineConfig, rapids: Rapids) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from fdhil.drivers import open_machine
 from fdhil.errors import DeviceError
 from fdhil.pipeline import Record
 from fdhil.pipeline.recent_samples import RecentSamples
-from fdhil.records import AxisSamples, Notice, Recording, TableSamples, TickTimes, VoltageSamples
+from fdhil.records import AxisSamples, NcState, Notice, Recording, TableSamples, TickTimes, VoltageSamples
 
 LONGEST_S = 600.0
 
@@ -48,8 +48,8 @@ class Overhearing:
             self._opened.set()
             await asyncio.wait([running])
 
-    def _take(self, record: Record | Notice) -> None:
-        if not isinstance(record, Notice):
+    def _take(self, record: Record | NcState | Notice) -> None:
+        if not isinstance(record, NcState | Notice):
             self.records.append(record)
 
     @property

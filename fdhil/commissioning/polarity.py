@@ -16,6 +16,7 @@ from fdhil.records import Float, Recording
 
 SPEED_TOLERANCE = 0.05
 TRAVEL_TOLERANCE = 0.02
+TABLE_TOLERANCE = 0.05  # backlash on a jog of 5 mm is less
 LEAST_CORRELATION = 0.05  # of two signals, by which the sign of their product is told
 RESTING = 0.2  # of the top speed: slower rows tell of offsets and rounding
 CODE = "SignOrScale"
@@ -30,6 +31,7 @@ def judge_jog(jog: Recording, distance_mm: float) -> Iterator[Finding]:
     advice = "its set-point and its position count differently; correct its factors (0x6091, 0x6092)"
     yield Finding("travel", f"{asked:g} mm", f"{way:.3f} mm", same, cause, advice)
     yield _speed(jog)
+    yield from _table(jog)
     power = signed_power(jog)
     yield _sign("current", "current times speed", power["current x speed"], "drive.sign or the current's sign")
     voltage = [power[name] for name in ("voltage x current", "voltage x speed") if name in power]
@@ -88,6 +90,20 @@ def _speed(jog: Recording) -> Finding:
     cause = f"{CODE}: its speed (0x606C) is {ratio:.3g} times what its position shows"
     same = abs(ratio - 1.0) <= SPEED_TOLERANCE
     return Finding("speed unit", "1", f"{ratio:.3f}", same, cause, "set drive.speed_unit, or its speed's unit (0x60A9)")
+
+
+def _table(jog: Recording) -> Iterator[Finding]:
+    """Compare the way of the table with the motor's, where an encoder of its own tells it."""
+    if jog.table_mm is None:
+        return
+    known = np.isfinite(jog.table_mm) & np.isfinite(jog.position_mm)
+    if not known.any():
+        return
+    place, table = (values[known] - values[known][0] for values in (jog.position_mm, jog.table_mm))
+    ratio = float(place @ table) / float(place @ place)
+    cause = f"{CODE}: its table goes {ratio:.3g} times the way of its motor"
+    advice = "check drive.sign, screw_pitch_mm and increments_per_rev, then sign and scale of the table's encoder"
+    yield Finding("table", "1", f"{ratio:.3f}", abs(ratio - 1.0) <= TABLE_TOLERANCE, cause, advice)
 
 
 def judge_acceleration(rows: Recording) -> Finding:

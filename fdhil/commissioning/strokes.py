@@ -73,14 +73,20 @@ def plan_rapid(axis: str, settings: Axis, room: Room) -> Stroke:
     As fast as G0, or as the room allows; DriveFault where that would be no rapid any more.
     """
     side, top = USED * room.farthest_mm, settings.rapid_speed_mm_s
-    acceleration, jerk = settings.max_acceleration_mm_s2, settings.jerk_mm_s3
+    limits = settings.setpoints
+    fastest = (limits.max_speed_mm_s if limits else None) or top
+    steepest = (limits.max_acceleration_mm_s2 if limits else None) or settings.max_acceleration_mm_s2
+    acceleration, jerk = min(steepest, settings.max_acceleration_mm_s2), settings.jerk_mm_s3
     # v^2 / a + v (a / j + cruise) is the way of a rapid of speed v
     spent_s = acceleration / jerk + CRUISE_S
     fits = acceleration / 2 * (math.sqrt(spent_s**2 + 4 * abs(side) / acceleration) - spent_s)
+    if fastest < SLOWEST * top:
+        text = f"[axis.{axis}.setpoints] allows {fastest:g} mm/s where G0 is {top:g}, so that no rapid can be tried"
+        raise DriveFault(f"drive {axis}", f"{text}; raise its max_speed_mm_s, or leave --room out")
     if fits < SLOWEST * top:
         least = SLOWEST * top * (SLOWEST * top / acceleration + spent_s)
         text = f"there is room from {room} for test rapids, which need {math.ceil(least / USED)} mm to one side"
         raise DriveFault(f"drive {axis}", f"{text}; move the axis away from its end, and give it more with --room")
-    speed = min(top, fits)
+    speed = min(top, fits, fastest)
     way = min(abs(side), speed * (speed / acceleration + spent_s))
     return Stroke(math.copysign(way, side), speed, acceleration, jerk)

@@ -6,11 +6,12 @@ leave by ``set_points`` alone; whatever happens, also Ctrl-C, the axis is braked
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 
 from fdhil.commissioning.compare import compare_record
-from fdhil.commissioning.identified import accept, identify, judge
+from fdhil.commissioning.identified import accept, identify, judge, voltage_late
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.overhearing import Overhearing
 from fdhil.commissioning.polarity import judge_acceleration, judge_jog
@@ -18,18 +19,20 @@ from fdhil.commissioning.progress import Found, Progress
 from fdhil.commissioning.record import CommissioningRecord
 from fdhil.commissioning.steps import enable, holds_for, prepare, rolled_back
 from fdhil.commissioning.strokes import Room, Stroke, plan_jog, plan_rapid
-from fdhil.commissioning.stroking import check_room, stroking
+from fdhil.commissioning.stroking import Travel, stroke, travel_of
 from fdhil.commissioning.survey import listen, require, require_alone, survey
 from fdhil.commissioning.timing import judge_answers, judge_sync, measure
+from fdhil.commissioning.watchdog import watched
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.bus import CanBus
-from fdhil.errors import DriveFault
+from fdhil.errors import DeviceError, DriveFault
 from fdhil.pipeline import Known
 from fdhil.records import Outcome
 
 RAPIDS = 6
 TIMING_CYCLES = 1000
 REST_S = 0.8  # between two strokes: a window wants a quarter second before it, and a third after
+JOG_REST_S = 0.2
 LAST_REST_S = 1.8  # a separate sensor may deliver a second later
 HEARD_TIMEOUT_S = 10.0
 STEPS = ("timing", "jog", "test rapids", "identification", "acceptance")
@@ -82,16 +85,17 @@ def try_axis(
             operator.report("timing")
             prepare(master)
             trial.found["timing"] = time_bus(master)
-            travel_mm = check_room(master, record, room)
-            if "jog" not in trial.found:
-                operator.report("jog")
+            travel_mm = travel_of(master, record, room)
+            with guarded(master):
+                if "jog" not in trial.found:
+                    operator.report("jog")
+                    enable(master)
+                    trial.found["jog"] = jog_to_and_fro(master, travel_mm, jog, operator)
+                    progress.keep("jog", now, trial.found["jog"])
+                operator.report("test rapids")
                 enable(master)
-                trial.found["jog"] = jog_to_and_fro(master, travel_mm, jog, operator)
-                progress.keep("jog", now, trial.found["jog"])
-            operator.report("test rapids")
-            enable(master)
-            heard = rapids_to_and_fro(master, travel_mm, rapid)
-            operator.report("restore")
+                heard = rapids_to_and_fro(master, travel_mm, rapid)
+                operator.report("restore")
     balance = judge_acceleration(heard.recording())
     require(master, [balance])
     trial.found["test rapids"] = {"rapid": str(rapid), "moves": RAPIDS, balance.point: balance.found}
@@ -99,11 +103,28 @@ def try_axis(
     trial.outcomes = tuple(identify(config, axis, heard.records, known))
     rapids = judge(axis, trial.outcomes)
     trial.found["identification"] = rapids.parameters
+    trial.found["test rapids"] = {**trial.found["test rapids"], **voltage_late(config, rapids)}
     operator.report("acceptance")
     trial.found["acceptance"] = accept(config, rapids)
     for step in FROM_RAPIDS:
         progress.keep(step, now, trial.found[step])
     return trial
+
+
+@contextmanager
+def guarded(master: Master) -> Iterator[None]:
+    """Have the drive watch our heartbeat, so that it stops by itself when this process or the bus is gone."""
+    play, loop = master.config.play, master.loop
+    with ExitStack() as undo:
+        undo.callback(setattr, loop, "heartbeat", None)
+        undo.enter_context(watched(master, play.node_id, play.heartbeat_s))
+        loop.heartbeat, loop.heartbeat_s = play.node_id, play.heartbeat_s
+        try:
+            yield
+        except BaseException:
+            with suppress(DeviceError):  # of a bus that is gone: why it ended is told already
+                undo.close()
+            raise
 
 
 def time_bus(master: Master) -> Found:
@@ -120,12 +141,11 @@ def time_bus(master: Master) -> Found:
     return {finding.point: finding.found for finding in findings}
 
 
-def jog_to_and_fro(master: Master, travel_mm: tuple[float, float], jog: Stroke, operator: Operator) -> Found:
+def jog_to_and_fro(master: Master, travel_mm: Travel, jog: Stroke, operator: Operator) -> Found:
     """Jog an enabled axis and back: units and signs must be right, also in the eyes of the operator; DriveFault."""
     with Overhearing(master.config, master.axis) as heard:
-        with stroking(master, travel_mm, jog) as axis:
-            for stroke in (jog, jog.back()):
-                axis.move(stroke, REST_S)
+        for moved in (jog, jog.back()):
+            stroke(master, travel_mm, moved, JOG_REST_S)
         wait_heard(master, heard)
     findings = list(judge_jog(heard.recording(), jog.distance_mm))
     require(master, findings)
@@ -151,13 +171,12 @@ def wait_heard(master: Master, heard: Overhearing) -> None:
     master.wait(reached, patience_s, "its TPDOs are not heard any more; check the bus")
 
 
-def rapids_to_and_fro(master: Master, travel_mm: tuple[float, float], rapid: Stroke) -> Overhearing:
+def rapids_to_and_fro(master: Master, travel_mm: Travel, rapid: Stroke) -> Overhearing:
     """Move an enabled axis as fast as G0, to and fro, and return what was heard of it."""
     with Overhearing(master.config, master.axis, rapid.speed_mm_s) as heard:
         master.wait_cycles(round(REST_S / master.period_s))
-        with stroking(master, travel_mm, rapid) as axis:
-            for _ in range(RAPIDS // 2):
-                for stroke in (rapid, rapid.back()):
-                    axis.move(stroke, REST_S)
+        for _ in range(RAPIDS // 2):
+            for moved in (rapid, rapid.back()):
+                stroke(master, travel_mm, moved, REST_S)
         wait_heard(master, heard)
     return heard

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+from pathlib import Path
+from typing import Self
 
+from pydantic import Field, model_validator
+
+from fdhil.config.nc_clients import Asked, ModbusNc, MtConnectNc, OpcUaNc
 from fdhil.config.section import Positive, Section
 
 
@@ -21,3 +25,19 @@ class NcSource(Section):
         2.0, ge=0.05, le=60, description="an NC that says nothing for so long is not heard: its moves are unknown"
     )
     linuxcnc: LinuxCncBridge = LinuxCncBridge()
+    modbus_coil: ModbusNc = ModbusNc()
+    mtconnect: MtConnectNc = MtConnectNc()
+    opcua: OpcUaNc = OpcUaNc()
+
+    @model_validator(mode="after")
+    def _heard_in_time(self) -> Self:
+        asked: tuple[ModbusNc | Asked, ...] = (self.modbus_coil, self.mtconnect, self.opcua)
+        names = ("modbus_coil", "mtconnect", "opcua")
+        slow = [name for name, source in zip(names, asked, strict=True) if source.period_s > self.silence_s / 2]
+        if slow:
+            raise ValueError("\n".join(f"{name}.period_s: is more than half of silence_s" for name in slow))
+        return self
+
+    def placed(self, folder: Path) -> Self:
+        """Return it with the paths of its files taken from ``folder``."""
+        return self.model_copy(update={"mtconnect": self.mtconnect.placed(folder), "opcua": self.opcua.placed(folder)})

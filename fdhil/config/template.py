@@ -40,6 +40,11 @@ EXAMPLES: Mapping[str, Any] = {  # of keys without a default: the bench machine
     "guard.run_directory": "/run/fdhil-guard", "daemon_user": "fdhil",
     "commissioning_key": "/etc/fdhil/commissioning.key",
     "cob_id": 0x2A0, "axis.X.accelerometer.device": "/dev/ttyACM0",
+    "nc_source.modbus_coil.hold": "1", "nc_source.modbus_coil.feed": "2", "nc_source.modbus_coil.arc": "3",
+    "nc_source.modbus_coil.line": 100, "nc_source.modbus_coil.tool": 103,
+    "feed_override": 101, "rapid_override": 102,
+    "nc_source.opcua.user": "fdhil", "password_file": "nc-password",
+    "certificate": "fdhil.der", "private_key": "fdhil.pem", "server_certificate": "nc.der",
     "axis.X.voltage.type": "float32", "count_address": 42, "trigger_address": 43,
 }  # fmt: skip
 NAMES = {"axis": "X", "bus": "can0"}  # the user's own names in the template

@@ -79,6 +79,8 @@ def line_of(outcome: Outcome) -> tuple[str, Severity]:
 def _window_line(outcome: WindowOutcome) -> str:
     window, verdict = outcome.window, outcome.verdict
     head = f"{window.axis}: G0 {'+' if window.direction > 0 else '-'} at {window.start_s:.2f} s ({window.n} samples)"
+    if window.nc is not None and window.nc.line is not None:
+        head += f", line {window.nc.line}"
     fit = "" if verdict.fit_percent is None else f", fit {verdict.fit_percent:.2f} %"
     if verdict.accepted:
         warned = "; ".join(str(warning) for warning in verdict.warnings)

@@ -121,6 +121,7 @@ def _window(outcome: WindowOutcome) -> dict[str, Any]:
         "friction_at_rapid": friction_of(outcome),
         "delay_s": _delay(outcome),
         "at_table": None if outcome.at_table is None else asdict(outcome.at_table),
+        "nc": None if window.nc is None else asdict(window.nc),
     }
 
 

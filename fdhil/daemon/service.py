@@ -31,7 +31,7 @@ from fdhil.daemon.record_queue import RecordQueue
 from fdhil.daemon.status import Watch
 from fdhil.errors import DeviceError, FdhilError, StoreError
 from fdhil.pipeline import AxisPipeline, Record
-from fdhil.records import AxisSamples, Notice, Outcome, Temperature, TickTimes
+from fdhil.records import AxisSamples, NcState, Notice, Outcome, Temperature, TickTimes
 
 NOTICE_QUEUE = 200
 FIRST_RETRY_S = 0.1
@@ -44,7 +44,7 @@ STUCK_S = 60.0  # a batch that is digested for so long hangs
 class Source(Protocol):
     """A machine as the daemon needs it: its records in blocks, and counts of what was received and lost."""
 
-    async def run(self, take: Callable[[Record | Notice], None]) -> None:
+    async def run(self, take: Callable[[Record | NcState | Notice], None]) -> None:
         """Hand records over as they come, until the source ends; DeviceError when a device fails for good."""
 
     def counters(self) -> Mapping[str, Any]:
@@ -178,8 +178,12 @@ class Service:
             await asyncio.sleep(self._delay_s)
             self._delay_s = min(LAST_RETRY_S, 2 * self._delay_s)
 
-    def _take(self, record: Record | Notice) -> None:
+    def _take(self, record: Record | NcState | Notice) -> None:
         self._delay_s = FIRST_RETRY_S
+        if isinstance(record, NcState):
+            self._desk.hear_nc(record)
+            self._tell(self._watch.nc.note(record, time.monotonic()))
+            return
         self._watch.hearing.record_came(record, time.monotonic())
         if isinstance(record, Notice):
             self._tell([record])
@@ -213,7 +217,8 @@ class Service:
 
     def _tell(self, notices: Sequence[Notice]) -> None:
         """Show notices and have them stored; what a flood held back is not stored either."""
-        for notice in self._say(notices):
+        now_s = time.monotonic()
+        for notice in self._say([self._watch.nc.placed(notice, now_s) for notice in notices]):
             if isinstance(notice, Notice) and not self._notices.full():
                 self._notices.put_nowait(notice)
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from fdhil.config import MachineConfig
 from fdhil.daemon.hearing import Hearing, Trouble
+from fdhil.daemon.nc_watch import NcWatch
 from fdhil.daemon.outcome_json import loops_document, parameters_status, terms_status
 from fdhil.records import LoopEstimate, Notice, Outcome, ParameterSet, Skill, WindowOutcome
 
@@ -38,6 +39,7 @@ class Watch:
         self._notices: deque[tuple[float, Notice]] = deque(maxlen=NOTICES)
         self._troubles: dict[Trouble, str] = {}
         self.hearing = Hearing(config, now_s)
+        self.nc = NcWatch()
 
     def begin(
         self, axis: str, published: ParameterSet | None, counts: tuple[int, int], loops: LoopEstimate | None = None
@@ -87,6 +89,7 @@ class Watch:
             "config_digest": self._config.digest,
             "uptime_s": round(now_s - self._started_s, 3),
             **self.hearing.status(now_s),
+            "nc": self.nc.status(now_s),
             "troubles": [{"code": code, "axis": axis, "text": text} for (code, axis), text in self._troubles.items()],
             "axes": {axis: self._axis_status(axis, now_s) for axis in self._axes},
             "notices": [{"age_s": round(now_s - at_s, 3), **asdict(notice)} for at_s, notice in self._notices],
@@ -125,4 +128,5 @@ def _window_status(outcome: WindowOutcome) -> dict[str, Any]:
         "unexplained_um": outcome.verdict.unexplained_um,
         "warnings": [str(warning) for warning in outcome.verdict.warnings],
         "at_table": None if outcome.at_table is None else asdict(outcome.at_table),
+        "nc": None if outcome.window.nc is None else asdict(outcome.window.nc),
     }

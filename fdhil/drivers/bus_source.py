@@ -17,7 +17,7 @@ from fdhil.drivers.cia402.drive import InputSamples
 from fdhil.drivers.moves import load_event_source
 from fdhil.drivers.sensor_source import BACK_OFF_S, Record, Take
 from fdhil.errors import ConnectError
-from fdhil.records import AxisSamples, Notice, TickTimes
+from fdhil.records import AxisSamples, MoveEvent, NcState, Notice, TickTimes
 
 DRAIN_S = 0.05
 SILENCE_S = 2.0
@@ -61,12 +61,16 @@ class BusSource:
         for record in self.decoder.feed(frames, now_ns):
             if isinstance(record, TickTimes):
                 self.ticks.add(record)
-            if isinstance(record, AxisSamples | InputSamples):
+            if isinstance(record, AxisSamples | InputSamples | TickTimes):
                 for source in self._events:
                     out += source.feed(record)
             if not isinstance(record, InputSamples):
                 out.append(record)
         return [*out, *self._stamping(bus), *self._overflow(bus), *self._silence(bus, now_ns)]
+
+    def hear_nc(self, state: NcState) -> list[MoveEvent]:
+        """Take what the NC says; return the moves that are known by now."""
+        return [event for source in self._events for event in source.feed(state)]
 
     def _stamping(self, bus: CanBus) -> list[Notice]:
         """Say once what the time stamps of this way onto the bus are worth, where that is less than the kernel's."""

@@ -1,7 +1,8 @@
 """Opens the whole machine as one source of records: buses, sensors and event sources of a configuration.
 
 At the start every bus and sensor must be there, else one ConnectError names all that are not. A bus on which nothing
-is heard is told, and listened to all the same: with the NC off, drives that send no heartbeat are silent. Later nothing
+is heard is told, and listened to all the same: with the NC off, drives that send no heartbeat are silent, and so is an
+interface of the NC's own. Later nothing
 ends the source: a bus or a sensor that goes away is a notice and a gap, and is tried again with growing pauses. Nothing
 is queued here: what came waits in the bus' ring and in the sensor, both of which count what they had no room for, and a
 fault of a source's own leaves ``run`` as the exception that it is.
@@ -13,11 +14,14 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
+from fdhil import tables
 from fdhil.config import MachineConfig
 from fdhil.drivers.bus_source import BusSource
 from fdhil.drivers.can.frame_history import candump
+from fdhil.drivers.nc.listener import NcListener
 from fdhil.drivers.sensor_source import Record, SensorSource, Take, sensors_of
 from fdhil.errors import ConnectError, DeviceError
+from fdhil.records import NcState, Notice
 
 __all__ = ["MachineSource", "Record", "open_machine"]
 
@@ -33,6 +37,8 @@ class MachineSource:
             for axis, settings in config.axis.items()
             for what, sensor in sensors_of(axis, config).items()
         }
+
+        self._nc = NcListener(config) if config.g0.source in tables.NC_SOURCES else None
 
     async def open(self) -> None:
         """Reach every device; ConnectError with all that cannot be reached."""
@@ -56,8 +62,18 @@ class MachineSource:
                     sources.create_task(bus.run(take))
                 for sensor in self._sensors.values():
                     sources.create_task(sensor.run(take))
+                if self._nc is not None:
+                    sources.create_task(self._nc.run(lambda told: self._hear_nc(told, take)))
         except ExceptionGroup as group:
             raise group.exceptions[0] from group
+
+    def _hear_nc(self, told: NcState | Notice, take: Take) -> None:
+        """Hand over what the NC says, then the moves that are known by it."""
+        take(told)
+        if isinstance(told, NcState):
+            for bus in self._buses.values():
+                for event in bus.hear_nc(told):
+                    take(event)
 
     def counters(self) -> dict[str, int]:
         """Frames received and lost over all, and per bus and sensor with its name in front."""
@@ -67,6 +83,8 @@ class MachineSource:
             flat |= {f"{name}.{key}": value for key, value in counted.items()}
         for name, source in self._sensors.items():
             flat |= {f"{source.sensor.link.wire}.{name}.{key}": value for key, value in source.counters().items()}
+        if self._nc is not None:
+            flat |= {f"nc.{key}": value for key, value in self._nc.counters().items()}
         return flat
 
     def black_box(self) -> dict[str, str]:

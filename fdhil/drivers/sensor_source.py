@@ -16,9 +16,9 @@ from fdhil.drivers.table.accelerometer import StreamedAccelerometer
 from fdhil.drivers.table.modbus_encoder import ModbusEncoder
 from fdhil.drivers.thermometer import SlidewayThermometer
 from fdhil.errors import DeviceError
-from fdhil.records import AxisSamples, MoveEvent, Notice, TableSamples, Temperature, TickTimes, VoltageSamples
+from fdhil.records import AxisSamples, MoveEvent, NcState, Notice, TableSamples, Temperature, TickTimes, VoltageSamples
 
-Record = AxisSamples | VoltageSamples | TableSamples | TickTimes | MoveEvent | Temperature | Notice
+Record = AxisSamples | VoltageSamples | TableSamples | TickTimes | MoveEvent | Temperature | NcState | Notice
 Take = Callable[[Record], None]
 """Takes a source's records; it never waits, for nothing may hold a source up."""
 

@@ -26,6 +26,7 @@ from fdhil.records import (
     LoopEstimate,
     MoveEvent,
     MoveKind,
+    NcMove,
     Notice,
     Outcome,
     Parameters,
@@ -59,6 +60,7 @@ class _Rapid:
     start: int
     end: int | None
     source: str
+    nc: NcMove | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +167,7 @@ class AxisPipeline:
         if self._rapids and self._rapids[-1].end is None:
             self._rapids[-1] = replace(self._rapids[-1], end=event.tick)
         if event.kind is MoveKind.RAPID:
-            self._rapids.append(_Rapid(event.tick, None, event.source))
+            self._rapids.append(_Rapid(event.tick, None, event.source, event.nc))
 
     def _cut_what_is_over(self) -> list[Outcome]:
         outcomes: list[Outcome] = []
@@ -198,7 +200,8 @@ class AxisPipeline:
             source=rapid.source,
         )
         # the neighbours of a rapid may reach into what is cut; they have their own
-        return [w for w in find_windows(recording) if rapid.start <= w.start_tick + w.n // 2 <= end]
+        windows = [w for w in find_windows(recording) if rapid.start <= w.start_tick + w.n // 2 <= end]
+        return [replace(w, nc=rapid.nc) for w in windows]
 
     def _analyse(self, window: Window) -> list[Outcome]:
         outcome, loops = self._loops.analyse(window)

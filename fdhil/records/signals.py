@@ -105,13 +105,30 @@ class MoveKind(Enum):
 
 
 @dataclass(frozen=True, slots=True)
+class NcMove:
+    """What an NC said of itself while an axis moved; None is what it did not tell.
+
+    ``override`` is the least and the greatest that was in force, 1.0 at 100 %; ``held`` whether a feed hold was on.
+    """
+
+    line: int | None = None
+    program: str | None = None
+    override: tuple[float, float] | None = None
+    held: bool | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class MoveEvent:
-    """From ``tick`` on the axis makes a move of this kind, as ``source`` (a G0 event source) says."""
+    """From ``tick`` on the axis makes a move of this kind, as ``source`` (a G0 event source) says.
+
+    ``nc`` is what the NC said of it, None where the source is no NC.
+    """
 
     axis: str
     kind: MoveKind
     tick: int
     source: str
+    nc: NcMove | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,8 +162,8 @@ class Window:
     deviation. ``table_mm`` is the place and ``table_m_s2`` the acceleration that sensors at the table tell, NaN in rows
     that they do not, None without them. ``start_s`` is the time of row 0 in its recording or since the first tick.
     ``offset_mm`` is the position offset in force, None where it was 0 throughout or is not known.
-    ``torque_constant_nm_per_a`` is the K that the recording itself tells. Two windows are equal when they are the same
-    one.
+    ``torque_constant_nm_per_a`` is the K that the recording itself tells. ``nc`` is what the NC said of the move,
+    None where it was not heard. Two windows are equal when they are the same one.
     """
 
     axis: str
@@ -174,6 +191,7 @@ class Window:
     torque_constant_nm_per_a: float | None = None
     table_mm: Float | None = None
     table_m_s2: Float | None = None
+    nc: NcMove | None = None
 
     @property
     def n(self) -> int:

@@ -100,6 +100,7 @@ class SimService:
         self._panel_fd = panel_fd
         self._line = b""
         self._stream: DemandStream | None = None
+        self._streaming = False
         self._ending = False
         self._drive_time_s = 0.0
         self._wall_s = self._told_s = 0.0
@@ -193,12 +194,13 @@ class SimService:
     def run(self, play: Path | None = None, trace: Path | None = None) -> None:
         """Say that it is ready and serve until stopped. ``play`` is played at once, recorded to ``trace``.
 
-        ``-`` is the demand that comes by the panel's descriptor, among the commands, until its end.
+        ``-`` is the demand that comes by the panel's descriptor, among the commands, until its end; the NC takes the bus
+        with its first rows.
         """
         try:
             if play == _STREAM:
                 self._stream = DemandStream(tuple(self.config.axis), self.config.machine.sync_period_s)
-            demand = self._stream if play is None or self._stream is not None else self._load(play, self.config)
+            demand = None if play is None or play == _STREAM else self._load(play, self.config)
             self._send(self.machine.power_on())
             self._emit(self.ready_event())
             self._serve_panel()
@@ -207,7 +209,7 @@ class SimService:
             if demand is not None or self.config.sim.nc:
                 self.machine.nc.switch(True)
             if demand is not None:
-                self.machine.nc.play("standard input" if play == _STREAM else str(play), demand)
+                self.machine.nc.play(str(play), demand)
             while not self._ending:
                 self._turn()
         finally:
@@ -309,8 +311,21 @@ class SimService:
             lines, self._line = [*lines, self._line], b""
         for line in lines:
             self.command(line.decode("utf-8", "replace"))
-        if self._stream is not None and self._panel_fd is None:
-            self._stream.close()
+        if self._stream is not None:
+            self._serve_stream(self._stream)
+
+    def _serve_stream(self, stream: DemandStream) -> None:
+        """Begin with a stream that has rows enough; with standard input it ends."""
+        if self._panel_fd is None:
+            stream.close()
+        if self._streaming:
+            return
+        if stream.start_mm is not None:
+            self._streaming = True
+            self.machine.nc.switch(True)
+            self.machine.nc.play("standard input", stream)
+        elif stream.ended:
+            self._emit({"event": "error", "text": "standard input ended before a row of the demand came"})
 
     def command(self, line: str) -> None:
         """Obey one command of the panel, or take a row of the stream; what is wrong with it becomes an event."""

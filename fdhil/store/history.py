@@ -13,6 +13,7 @@ import sqlite3
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -159,6 +160,7 @@ class History:
             "warnings": _dumped(verdict.warnings),
             "friction": json.dumps(friction_of(outcome)),
             "told": _told(outcome),
+            "nc": None if window.nc is None else json.dumps(asdict(window.nc)),
         }
         return self._insert("windows", row, stamp)
 

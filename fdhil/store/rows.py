@@ -71,7 +71,8 @@ class StoredWindow:
 
     ``friction`` is {"value", "std", "speed_rad_s"}: the friction torque at the rapid speed (N.m), load included.
     ``told`` is what an accepted window tells a pool: "names" and "values" (k,), the covariance (k, k) of its "own"
-    chance, and the doubts (k, q) "shared" by all windows of the drive.
+    chance, and the doubts (k, q) "shared" by all windows of the drive. ``nc`` is what the NC said of the move: "line",
+    "program", "override" (least and greatest) and "held".
     """
 
     number: int
@@ -89,6 +90,7 @@ class StoredWindow:
     warnings: tuple[str, ...] = ()
     friction: dict[str, float] | None = None
     told: dict[str, Any] | None = None
+    nc: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,6 +156,7 @@ def _stored_window(row: Mapping[str, Any]) -> StoredWindow:
         row["fit_percent"], tuple(json.loads(row["reasons"])), parameters, row["temperature_c"], _stamp(row),
         row.get("unexplained_um"), tuple(str(warning) for warning in _warnings(row)),
         json.loads(row.get("friction") or "null"), json.loads(row.get("told") or "null"),
+        json.loads(row.get("nc") or "null"),
     )  # fmt: skip
 
 

@@ -61,9 +61,10 @@ CREATE TABLE loops (id INTEGER PRIMARY KEY AUTOINCREMENT, axis TEXT NOT NULL, st
   accepted INTEGER NOT NULL, gains TEXT NOT NULL, covariance TEXT NOT NULL, unexplained_um REAL, reasons TEXT NOT NULL,
   warnings TEXT NOT NULL, {_STAMP}, digest TEXT NOT NULL DEFAULT '')
 """
+_NC = "ALTER TABLE windows ADD COLUMN nc TEXT"
 TABLES = (*_WITH_DIGESTS, "loops")
 # what leads from each schema to the next, in order: a new one is added at the end, an old one never changes
-_STEPS = (_FIRST, _COMPARISONS, _DIGESTS, _TERMS)
+_STEPS = (_FIRST, _COMPARISONS, _DIGESTS, _TERMS, _NC)
 SCHEMA_VERSION = len(_STEPS)
 WITH_COMPARISONS, WITH_DIGESTS, WITH_TERMS = 2, 3, 4
 # what the check of the structure says of single values; their row's digest tells the same and no more than the row

@@ -22,7 +22,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fdhil.errors import RecordingError, StoreError
-from fdhil.records import Float, SlowVoltage, Stages, Window, read_only
+from fdhil.records import Float, NcMove, SlowVoltage, Stages, Window, read_only
 from fdhil.store.atomic import store_error, sync_folder, write_file
 from fdhil.store.parquet_pages import uncompressed_bytes
 
@@ -131,6 +131,9 @@ def _head(window: Window) -> dict[str, Any]:
     slow = plain.pop("slow_voltage")
     if plain["torque_constant_nm_per_a"] is None:  # as in windows of before there was one: their digest stays
         del plain["torque_constant_nm_per_a"]
+    nc = plain.pop("nc")
+    if nc is not None:
+        plain["nc"] = asdict(nc)
     if slow is not None:
         grid = {"begin_s": slow.begin_s, "period_s": slow.period_s, "error_s": slow.error_s}
         plain["slow_voltage"] = grid | {"samples": slow.voltage_v.size}
@@ -220,6 +223,9 @@ def _window(head: Mapping[str, Any], arrays: Mapping[str, Any]) -> Window:
     plain = {key: value for key, value in head.items() if key in known}
     stages = {key: None if span is None else (int(span[0]), int(span[1])) for key, span in head["stages"].items()}
     plain["stages"] = Stages(**stages)
+    if "nc" in plain:
+        override = plain["nc"]["override"]
+        plain["nc"] = NcMove(**plain["nc"] | {"override": None if override is None else (override[0], override[1])})
     plain["gaps"] = tuple((int(start), int(end)) for start, end in head["gaps"])
     return Window(**plain, **arrays)
 

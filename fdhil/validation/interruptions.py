@@ -2,7 +2,8 @@
 
 Feed override and feed hold change the speed on the way; an abort brakes harder than any planned ramp or leaves the
 demand behind. Position and demand tell, so that no fault of the speed sensor can pass for one. A slower rapid at a
-constant override keeps its three stages and is as good as any; a hold that comes to rest leaves two whole moves.
+constant override keeps its three stages and is as good as any, where no NC says that it was one: what is known to be
+no rapid as planned is refused. A hold that comes to rest leaves two whole moves.
 """
 
 from __future__ import annotations
@@ -13,11 +14,13 @@ import numpy as np
 
 from fdhil.identification.filtering import moving_mean
 from fdhil.identification.windows import bridged, longest
-from fdhil.records import Float, Reason, Window
+from fdhil.records import Float, NcMove, Reason, Window
 from fdhil.validation.evidence import Evidence
 
 CODE = "EpisodeAborted"
 ADVICE = "record a rapid without feed hold, override change or stop"
+NC_ADVICE = "rapids teach at an override of 100 % and without feed hold"
+OVERRIDE = 0.005  # that is still 100 %
 SMOOTHING_S = 0.020
 TOP = 0.95
 OVERSHOOT = 0.85
@@ -35,6 +38,9 @@ LEFT_SHARE = 0.01
 def interruptions(evidence: Evidence) -> Iterator[Reason]:
     """Yield the reason why the window is no whole rapid, with the figure that shows it."""
     window = evidence.window
+    if window.nc is not None and (said := _said(window.nc)) is not None:
+        yield Reason(CODE, said, NC_ADVICE)
+        return
     a, b = (min(row, window.n) for row in evidence.moving)
     speed = _course(window.position_mm, window)
     if speed is None or b - a < 8:
@@ -52,6 +58,18 @@ def interruptions(evidence: Evidence) -> Iterator[Reason]:
     reason = reason or _quick_stop(window, a, b)
     if reason is not None:
         yield Reason(CODE, reason, ADVICE)
+
+
+def _said(nc: NcMove) -> str | None:
+    """Return what the NC itself says was no whole rapid; at another speed than planned its demand is another, too."""
+    where = "" if nc.line is None else f" in line {nc.line}"
+    if nc.held:
+        return f"the NC says that its feed was held{where}"
+    if nc.override is not None and max(abs(1.0 - override) for override in nc.override) > OVERRIDE:
+        least, greatest = nc.override
+        told = f"{100 * least:.0f} %" if greatest - least < OVERRIDE else f"{100 * least:.0f} to {100 * greatest:.0f} %"
+        return f"the NC says that its override was {told}{where}"
+    return None
 
 
 def _plateau(window: Window, moving: Float, speed: Float) -> float:

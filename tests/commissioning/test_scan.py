@@ -149,7 +149,10 @@ def test_a_node_that_lacks_objects_is_listed_all_the_same(peer: tuple[DrivePeer,
 
 def test_nothing_is_asked_once_a_master_is_heard(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
-    with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as nc, BusScanner("can0", settings.bus["can0"]) as bus:
+    with (
+        can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as nc,
+        BusScanner("can0", settings.bus["can0"]) as bus,
+    ):
         nc.send(can.Message(arbitration_id=0x80, is_extended_id=False))
         bus.listen(0.1)
         with pytest.raises(ProtocolError, match=r"an NC came on the bus \(SYNC\)"):

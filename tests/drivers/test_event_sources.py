@@ -12,7 +12,7 @@ from fdhil.drivers.cia402.drive import InputSamples
 from fdhil.drivers.moves import load_event_source
 from fdhil.drivers.moves.digital_input import DigitalInputG0
 from fdhil.drivers.moves.inferred import InferredG0
-from fdhil.records import AxisSamples, Float, MoveEvent, MoveKind, frozen, frozen_ints
+from fdhil.records import AxisSamples, Float, MoveEvent, MoveKind, NcState, TickTimes, frozen, frozen_ints
 from tests.drivers.wire import machine
 
 
@@ -91,10 +91,10 @@ def test_contract(name: str) -> None:
         assert source.feed(record) == []
 
 
-@pytest.mark.parametrize("name", sorted(set(tables.EVENT_SOURCES) - set(tables.NC_SOURCES)))
+@pytest.mark.parametrize("name", tables.EVENT_SOURCES)
 def test_every_listed_source_tells_a_rapid_in_its_own_name(name: str) -> None:
-    """Demand and signal come in blocks, as from a drive: a rapid to and fro, with the bit set meanwhile."""
-    config = machine()
+    """Demand, signal and the NC's words come in blocks: a rapid to and fro, with the bit set and told meanwhile."""
+    config = machine(g0={"source": name})
     source = load_event_source(name)("X", config)
     there = move(400, 500)
     demand = np.concatenate([there, there[-1] - there])
@@ -102,6 +102,10 @@ def test_every_listed_source_tells_a_rapid_in_its_own_name(name: str) -> None:
     events: list[MoveEvent] = []
     for first in range(0, demand.size, 50):
         ticks = np.arange(first, min(first + 50, demand.size))
+        events += source.feed(TickTimes(frozen_ints(ticks), frozen_ints(ticks * 1_000_000)))
+        for tick in ticks[::10].tolist():
+            said = MoveKind.RAPID if high[tick] else MoveKind.REST
+            events += source.feed(NcState(tick * 1_000_000, 5_000_000, said))
         events += source.feed(samples(demand[ticks], first))
         inputs = np.where(high[ticks[::10]], 1 << config.g0.input_bit, 0)
         events += source.feed(InputSamples("X", frozen_ints(ticks[::10]), frozen_ints(inputs)))

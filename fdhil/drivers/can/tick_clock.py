@@ -42,6 +42,10 @@ class TickClock:
         """Whether SYNCs up to host time ``t_ns`` are known."""
         return self._t_ns.size > 0 and int(self._t_ns[-1]) >= t_ns
 
+    def is_past(self, t_ns: int) -> bool:
+        """Whether host time ``t_ns`` is before every SYNC that is still known."""
+        return self.running and t_ns < int(self._t_ns[0])
+
     def bounds(self, from_ns: int, to_ns: int) -> tuple[float, float] | None:
         """Return fractional ticks that surely enclose the span; None when SYNC does not run at that time.
 

@@ -43,7 +43,7 @@ class DamagedAnswer(ProtocolError):
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """``value`` registers to read from ``address`` on (functions 3 and 4), or the value to write there (6)."""
+    """``value`` bits (functions 1, 2) or registers (3, 4) to read from ``address`` on, or the value to write (6)."""
 
     name: str
     unit: int
@@ -54,13 +54,14 @@ class Request:
 
     @property
     def count(self) -> int:
-        """How many registers the answer must have."""
+        """How many bits or registers the answer must have."""
         return 0 if self.function == WRITE_REGISTER else self.value
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The registers of an answer, read by the unit between ``asked_ns`` and ``answered_ns`` (host-monotonic)."""
+    """The registers of an answer, or its bits (0 or 1), read by the unit between ``asked_ns`` and ``answered_ns``
+    (host-monotonic)."""
 
     registers: tuple[int, ...]
     asked_ns: int

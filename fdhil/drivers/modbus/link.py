@@ -49,7 +49,10 @@ class ModbusLink:
         return await self.read(READ_INPUT, address, count)
 
     async def read(self, function: int, address: int, count: int) -> list[int]:
-        """Read ``count`` <= 125 registers with one request: input registers by function 4, holding ones by 3."""
+        """Read ``count`` <= 125 registers with one request: input registers by function 4, holding ones by 3.
+
+        Or ``count`` <= 2000 bits, each 0 or 1: coils by function 1, discrete inputs by 2.
+        """
         return list((await self._ask(function, address, count)).registers)
 
     async def write(self, address: int, value: int) -> None:

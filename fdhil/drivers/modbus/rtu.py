@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import struct
 
-READ_HOLDING, READ_INPUT, WRITE_REGISTER = 3, 4, 6
+READ_COILS, READ_DISCRETE, READ_HOLDING, READ_INPUT, WRITE_REGISTER = 1, 2, 3, 4, 6
 ERROR = 0x80
-_READS = (READ_HOLDING, READ_INPUT)
+BIT_READS = (READ_COILS, READ_DISCRETE)
+_READS = (*BIT_READS, READ_HOLDING, READ_INPUT)
 _ECHO_BYTES, _EXCEPTION_BYTES, _LEAST_BYTES = 8, 5, 5
 
 
@@ -33,9 +34,29 @@ def framed(unit: int, body: bytes) -> bytes:
     return frame + struct.pack("<H", crc16(frame))
 
 
+def data_bytes(function: int, count: int) -> int:
+    """Return how many bytes ``count`` bits or registers take in an answer.
+
+    >>> data_bytes(READ_COILS, 9), data_bytes(READ_INPUT, 9)
+    (2, 18)
+    """
+    return (count + 7) // 8 if function in BIT_READS else 2 * count
+
+
+def numbers_in(data: bytes, function: int, count: int) -> tuple[int, ...]:
+    """Return the bits (0 or 1) or the registers that the data of an answer hold.
+
+    >>> numbers_in(bytes([0b101]), READ_COILS, 3)
+    (1, 0, 1)
+    """
+    if function in BIT_READS:
+        return tuple(data[place // 8] >> place % 8 & 1 for place in range(count))
+    return struct.unpack(f">{count}H", data)
+
+
 def answer_bytes(function: int, count: int) -> int:
-    """Return how long the answer to a request for ``count`` registers, or to a write, must be."""
-    return 5 + 2 * count if function in _READS else _ECHO_BYTES
+    """Return how long the answer to a request for ``count`` bits or registers, or to a write, must be."""
+    return 5 + data_bytes(function, count) if function in _READS else _ECHO_BYTES
 
 
 def find_answer(data: bytes, unit: int, function: int, count: int) -> bytes | None:
@@ -51,7 +72,7 @@ def find_answer(data: bytes, unit: int, function: int, count: int) -> bytes | No
         if refused[1] == function | ERROR and not crc16(refused):
             return refused[1:-2]
         frame = data[at : at + wanted]
-        fits = function not in _READS or frame[2] == 2 * count
+        fits = function not in _READS or frame[2] == data_bytes(function, count)
         if len(frame) == wanted and frame[1] == function and fits and not crc16(frame):
             return frame[1:-2]
     return None
@@ -62,8 +83,9 @@ def fault_in(data: bytes, unit: int, function: int, count: int) -> tuple[str, st
     whole = _whole_frame(data)
     if whole and data[0] != unit:
         return "ModbusUnit", f"unit {data[0]} answers where unit {unit} was asked; check that no two have one number"
-    if whole and data[1] == function and function in _READS and data[2] != 2 * count:
-        return "ModbusShape", f"{data[2] // 2} registers came for {count} asked; check that one client asks at a time"
+    wanted = data_bytes(function, count)
+    if whole and data[1] == function and function in _READS and data[2] != wanted:
+        return "ModbusShape", f"{data[2]} bytes came for {wanted} asked; check that one client asks at a time"
     if len(data) >= answer_bytes(function, count) and data[:2] == bytes([unit, function]):
         return "ModbusCrc", "an answer came damaged; check shield, termination and the baud rate of the line"
     text = f"{len(data)} bytes came that are no answer; check baud rate, parity and that one client asks at a time"

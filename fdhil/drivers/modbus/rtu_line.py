@@ -15,7 +15,7 @@ from weakref import WeakSet
 
 from fdhil.config.sensors import ModbusPlace
 from fdhil.drivers.modbus.line import Answer, DamagedAnswer, ModbusRefused, Request, no_answer
-from fdhil.drivers.modbus.rtu import ERROR, WRITE_REGISTER, answer_bytes, fault_in, find_answer, framed
+from fdhil.drivers.modbus.rtu import ERROR, WRITE_REGISTER, answer_bytes, fault_in, find_answer, framed, numbers_in
 from fdhil.drivers.serial.port import SerialPort
 from fdhil.errors import DeviceTimeout
 
@@ -80,8 +80,7 @@ class RtuLine:
             raise
         if answer[0] == request.function | ERROR:
             raise ModbusRefused(request.name, request.address, answer[1])
-        count = request.count
-        registers = struct.unpack(f">{count}H", answer[2:]) if count else ()
+        registers = numbers_in(answer[2:], request.function, request.count) if request.count else ()
         return Answer(registers, min(asked_ns, answered_ns), answered_ns)
 
     async def _late_answers(self, request: Request) -> None:

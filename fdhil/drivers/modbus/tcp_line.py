@@ -19,7 +19,7 @@ from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.pdu import ModbusPDU
 
 from fdhil.drivers.modbus.line import Answer, DamagedAnswer, ModbusRefused, Request, no_answer
-from fdhil.drivers.modbus.rtu import READ_INPUT, WRITE_REGISTER
+from fdhil.drivers.modbus.rtu import BIT_READS, READ_COILS, READ_DISCRETE, READ_HOLDING, READ_INPUT, WRITE_REGISTER
 from fdhil.errors import ConnectError, DeviceError
 
 CONNECT_S = 2.0  # beyond the time an answer may take
@@ -70,21 +70,28 @@ class TcpLine:
             asked_ns = time.monotonic_ns()
             answer = await self.answered(self._call(request), request)
             answered_ns = time.monotonic_ns()
-        registers = tuple(answer.registers) if request.count else ()
-        if len(registers) != request.count:
-            text = f"{len(registers)} registers came for {request.count} asked; check that one client asks at a time"
+        came = answer.bits if request.function in BIT_READS else answer.registers
+        registers = tuple(map(int, came)) if request.count else ()
+        spare = -request.count % 8 if request.function in BIT_READS else 0  # bits come in whole bytes
+        if len(registers) != request.count + spare:
+            what = "bits" if request.function in BIT_READS else "registers"
+            text = f"{len(registers)} {what} came for {request.count} asked; check that one client asks at a time"
             raise DamagedAnswer(request.name, "ModbusShape", text)
-        return Answer(registers, asked_ns, answered_ns)
+        return Answer(registers[: request.count], asked_ns, answered_ns)
 
-    def _call(self, request: Request) -> Awaitable[ModbusPDU]:
-        if self._client is None:
+    async def _call(self, request: Request) -> ModbusPDU:
+        client = self._client
+        if client is None:
             raise self._gone(request)
         if request.function == WRITE_REGISTER:
-            return self._client.write_register(request.address, request.value, device_id=request.unit)
-        read = self._client.read_input_registers
-        if request.function != READ_INPUT:
-            read = self._client.read_holding_registers
-        return read(request.address, count=request.value, device_id=request.unit)
+            return await client.write_register(request.address, request.value, device_id=request.unit)
+        reads = {
+            READ_COILS: client.read_coils,
+            READ_DISCRETE: client.read_discrete_inputs,
+            READ_HOLDING: client.read_holding_registers,
+            READ_INPUT: client.read_input_registers,
+        }
+        return await reads[request.function](request.address, count=request.value, device_id=request.unit)
 
     async def answered(self, call: Awaitable[ModbusPDU], request: Request) -> ModbusPDU:
         """Wait for the library's answer until the request's deadline."""

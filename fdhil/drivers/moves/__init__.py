@@ -7,7 +7,7 @@ from typing import ClassVar, Protocol
 from fdhil import tables
 from fdhil.config import MachineConfig
 from fdhil.drivers.cia402.drive import InputSamples
-from fdhil.records import AxisSamples, MoveEvent
+from fdhil.records import AxisSamples, MoveEvent, NcState, TickTimes
 
 
 class EventSource(Protocol):
@@ -23,8 +23,8 @@ class EventSource(Protocol):
     def __init__(self, axis: str, config: MachineConfig) -> None:
         pass
 
-    def feed(self, record: AxisSamples | InputSamples) -> list[MoveEvent]:
-        """Take a block; return the moves it shows."""
+    def feed(self, record: AxisSamples | InputSamples | TickTimes | NcState) -> list[MoveEvent]:
+        """Take a block, or what the NC says; return the moves it shows."""
 
 
 def load_event_source(name: str) -> type[EventSource]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from fdhil.config import MachineConfig
 from fdhil.drivers.cia402.drive import InputSamples
-from fdhil.records import AxisSamples, MoveEvent, MoveKind
+from fdhil.records import AxisSamples, MoveEvent, MoveKind, NcState, TickTimes
 
 
 class DigitalInputG0:
@@ -23,7 +23,7 @@ class DigitalInputG0:
         self._high: bool | None = None
         self._last_tick = 0
 
-    def feed(self, record: AxisSamples | InputSamples) -> list[MoveEvent]:
+    def feed(self, record: AxisSamples | InputSamples | TickTimes | NcState) -> list[MoveEvent]:
         """Take a block of inputs; return the edges. The first sample ever only tells where the signal stands."""
         if not isinstance(record, InputSamples) or record.axis != self._axis:
             return []

@@ -9,7 +9,7 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.drivers.cia402.drive import InputSamples
-from fdhil.records import AxisSamples, MoveEvent, MoveKind
+from fdhil.records import AxisSamples, MoveEvent, MoveKind, NcState, TickTimes
 
 REST_SHARE = 0.002
 REST_S = 0.010
@@ -35,7 +35,7 @@ class InferredG0:
         self._kind: MoveKind | None = None
         self._still_since: int | None = None
 
-    def feed(self, record: AxisSamples | InputSamples) -> list[MoveEvent]:
+    def feed(self, record: AxisSamples | InputSamples | TickTimes | NcState) -> list[MoveEvent]:
         """Take a block of samples; return the moves that began, ended or became recognisable."""
         if not isinstance(record, AxisSamples) or record.axis != self._axis or record.tick.size == 0:
             return []

@@ -1,29 +1,178 @@
-"""Tells G0 by what the NC itself says of its moves. Pure."""
+"""Tells G0 by what the NC itself says: the kind of a move comes from the NC, its edges from the demand. Pure.
+
+The demand shows exactly when an axis moves, to and fro; what the NC says is known to the accuracy of its source. So a
+move in one direction is of the kind that the NC says within it, and where it says two the demand's slowest row between
+them parts them. An NC that tells its own set-points is laid on the bus by them, exact to a cycle; any other by the
+clocks. A move in which the NC was not heard is UNKNOWN, and no rapid.
+"""
 
 from __future__ import annotations
 
+import math
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
 from fdhil.config import MachineConfig
+from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.cia402.drive import InputSamples
-from fdhil.records import AxisSamples, MoveEvent, MoveKind, NcState
+from fdhil.drivers.moves.alignment import DemandAlignment
+from fdhil.drivers.moves.stretches import Stretch, Stretches
+from fdhil.records import AxisSamples, MoveEvent, MoveKind, NcMove, NcState, TickTimes
+
+PATIENCE_S = 1.0  # beyond the NC's own silence, until a move of which it said nothing is UNKNOWN
+MOST_STATES = 20_000
+MOVING = (MoveKind.RAPID, MoveKind.FEED, MoveKind.ARC, MoveKind.UNKNOWN)
+NEXT = 1.5  # ticks between two states that are those of neighbouring cycles
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """What the NC said, and the ticks between which that was so."""
+
+    low: float
+    high: float
+    state: NcState
 
 
 class ToldG0:
-    """Says what the NC says, at the newest tick."""
+    """Feeds on samples, arrivals of SYNC and the NC's states, and says RAPID, FEED, ARC, UNKNOWN and REST."""
 
     needs_input = False
     least_share = 0.0
 
     def __init__(self, axis: str, config: MachineConfig) -> None:
-        self._axis = axis
-        self._source = config.g0.source
-        self._tick = 0
-        self._kind = MoveKind.UNKNOWN
+        increment_mm = 1 / config.axis[axis].scaling.increments_per_mm
+        period_s = config.machine.sync_period_s
+        self._axis, self._source = axis, config.g0.source
+        self._patience = round((config.nc_source.silence_s + PATIENCE_S) / period_s)
+        self._clock = TickClock(period_s)
+        self._alignment = DemandAlignment(axis, period_s, increment_mm)
+        self._moving = Stretches(period_s, 2 * increment_mm)
+        self._new: deque[NcState] = deque(maxlen=MOST_STATES)  # whose tick is not yet known
+        self._said: deque[Said] = deque(maxlen=MOST_STATES)
+        self._waiting: deque[Stretch] = deque()
+        self._kind = MoveKind.REST
 
-    def feed(self, record: AxisSamples | InputSamples | NcState) -> list[MoveEvent]:
-        """Take a block of samples, or what the NC says."""
-        if isinstance(record, AxisSamples) and record.axis == self._axis and record.tick.size:
-            self._tick = int(record.tick[-1])
-        if not isinstance(record, NcState) or record.motion is self._kind:
-            return []
-        self._kind = record.motion
-        return [MoveEvent(self._axis, record.motion, self._tick, self._source)]
+    def feed(self, record: AxisSamples | InputSamples | TickTimes | NcState) -> list[MoveEvent]:
+        """Take a block of samples, arrivals of SYNC, or what the NC says; return the moves that are known by now."""
+        if isinstance(record, TickTimes):
+            self._clock.add(record)
+        elif isinstance(record, NcState):
+            self._new.append(record)
+        elif isinstance(record, AxisSamples) and record.axis == self._axis and record.tick.size:
+            return list(self._heard(record))
+        return []
+
+    def _heard(self, samples: AxisSamples) -> Iterator[MoveEvent]:
+        newest = self._moving.newest
+        if newest is not None and samples.tick[0] <= newest:  # the SYNC count began anew
+            self._moving.clear()
+            self._alignment.clear()
+            self._said.clear()
+            self._waiting.clear()
+        self._waiting += self._moving.feed(samples)
+        self._place_new()
+        self._alignment.heard(samples.tick, samples.demand_mm)
+        while self._waiting and self._is_known(self._waiting[0], int(samples.tick[-1])):
+            yield from self._tell(self._waiting.popleft())
+
+    def _place_new(self) -> None:
+        """Place what the NC said by the clocks, once the SYNCs of that time have come."""
+        while self._new:
+            state = self._new[0]
+            begin_ns, end_ns = state.stamp_ns - state.error_ns, state.stamp_ns + state.error_ns
+            bounds = self._clock.bounds(begin_ns, end_ns)
+            if bounds is None and not self._clock.is_past(begin_ns):
+                return
+            self._new.popleft()
+            if bounds is not None:
+                if self._is_new_count(state):
+                    self._said.clear()
+                self._said.append(Said(*bounds, state))
+                self._alignment.told(state, bounds[0])
+
+    def _is_new_count(self, state: NcState) -> bool:
+        """Whether the NC has begun to count anew since it was last heard."""
+        last = self._said[-1].state.nc_tick if self._said else None
+        return last is not None and state.nc_tick is not None and state.nc_tick < last
+
+    def _where(self, said: Said) -> Said | None:
+        """Return what was said at the ticks that its set-points tell, else the clocks; None while they tell none."""
+        if not self._alignment.possible(said.state):
+            return said
+        if self._alignment.offset is None or said.state.nc_tick is None:
+            return None
+        tick = said.state.nc_tick + self._alignment.offset
+        return Said(tick, tick, said.state)
+
+    def _is_known(self, stretch: Stretch, newest: int) -> bool:
+        last = self._where(self._said[-1]) if self._said else None
+        return (last is not None and last.low > stretch.end) or newest - stretch.end > self._patience
+
+    def _tell(self, stretch: Stretch) -> Iterator[MoveEvent]:
+        """Say what kind of move a stretch was."""
+        said = self._about(stretch)
+        pieces = list(self._pieces(stretch, said))
+        for (begin, kind), (end, _) in pairwise([*pieces, (stretch.end, MoveKind.REST)]):
+            told = _move(_of_a_piece(said, begin, end), kind)
+            if kind is not self._kind:
+                yield MoveEvent(self._axis, kind, begin, self._source, told)
+            self._kind = kind
+        if not stretch.goes_on:
+            self._kind = MoveKind.REST
+            yield MoveEvent(self._axis, MoveKind.REST, stretch.end, self._source)
+
+    def _about(self, stretch: Stretch) -> list[Said]:
+        """Return what the NC said in a stretch, and the last before it: that still held; older ones are forgotten."""
+        placed = [found for found in map(self._where, self._said) if found is not None]
+        found = _of_a_piece(placed, stretch.begin, stretch.end)
+        while found and self._said[0].state is not found[0].state:
+            self._said.popleft()
+        return found
+
+    def _pieces(self, stretch: Stretch, said: Sequence[Said]) -> Iterator[tuple[int, MoveKind]]:
+        """Yield from which tick on a stretch is of which kind; at its first tick the axis does not move yet."""
+        within = [each for each in said if each.low > stretch.begin and each.high <= stretch.end]
+        sure = [each for each in within if each.state.motion in MOVING]
+        if not sure:
+            yield stretch.begin, MoveKind.UNKNOWN
+            return
+        yield stretch.begin, sure[0].state.motion
+        for one, other in pairwise(sure):
+            if one.state.motion is other.state.motion:
+                continue
+            if other.high - one.low <= NEXT:
+                yield round(one.low), other.state.motion
+            else:
+                yield self._moving.slowest(math.floor(one.low), math.ceil(other.high)), other.state.motion
+
+
+def _of_a_piece(said: Sequence[Said], begin: int, end: int) -> list[Said]:
+    """Return what was said between two ticks, and the last before them, which still held."""
+    before = [each for each in said if each.high < begin]
+    return [*before[-1:], *(each for each in said if each.high >= begin and each.low <= end)]
+
+
+def _move(said: Sequence[Said], kind: MoveKind) -> NcMove:
+    """Return what was said of a move, all of it together."""
+    states = [each.state for each in said]
+    own = [state for state in states if state.motion is kind]
+    overrides = [override for state in states if (override := _override(state, kind)) is not None]
+    holds = [state.held for state in states if state.feed_hold is not None or state.motion is MoveKind.HOLD]
+    return NcMove(
+        line=next((state.line for state in own if state.line is not None), None),
+        program=next((state.program for state in own if state.program), None),
+        override=(min(overrides), max(overrides)) if overrides else None,
+        held=any(holds) if holds else None,
+    )
+
+
+def _override(state: NcState, kind: MoveKind) -> float | None:
+    """Return the override that acts on a kind of move; no rapid is faster than at 100 %."""
+    if kind is not MoveKind.RAPID:
+        return state.feed_override
+    if state.rapid_override is not None:
+        return state.rapid_override
+    return None if state.feed_override is None else min(1.0, state.feed_override)

@@ -10,6 +10,9 @@ from contextlib import AbstractAsyncContextManager
 from typing import Any, Protocol, Self
 
 from fdhil.records import MoveKind
+from tests.drivers.nc.modbus_peer import ModbusPeer
+from tests.drivers.nc.mtconnect_peer import MtConnectPeer
+from tests.drivers.nc.opcua_peer import OpcUaPeer
 
 
 class Peer(Protocol):
@@ -83,5 +86,10 @@ class BridgePeer:
         self._nonsense = True
 
 
-PEERS: Mapping[str, Callable[[], AbstractAsyncContextManager[Peer] | Any]] = {"linuxcnc": BridgePeer}
+PEERS: Mapping[str, Callable[[], AbstractAsyncContextManager[Peer] | Any]] = {
+    "linuxcnc": BridgePeer,
+    "modbus_coil": ModbusPeer,
+    "mtconnect": MtConnectPeer,
+    "opcua": OpcUaPeer,
+}
 """The peer of each entry of ``tables.NC_SOURCES``."""

@@ -62,7 +62,8 @@ async def test_stamps_rise_and_are_of_this_computers_clock(name: str) -> None:
 async def test_nobody_there_is_a_connect_error_that_names_the_place(name: str) -> None:
     async with PEERS[name]() as peer:
         source = load_nc_source(name)(config_of(name, peer))
-    with pytest.raises(ConnectError, match=str(peer.settings.get("port", ""))):
+    port = peer.settings.get("port") or peer.settings["url"].rpartition(":")[2]
+    with pytest.raises(ConnectError, match=str(port)):
         await source.__aenter__()
 
 

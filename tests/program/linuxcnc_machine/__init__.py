@@ -13,8 +13,8 @@ import numpy as np
 from fdhil.records import Float
 
 HERE = Path(__file__).parent
-_NOBODY = 65534
-_AXIS = """
+NOBODY = 65534
+AXIS = """
 [AXIS_{letter}]
 MAX_VELOCITY = {speed}
 MAX_ACCELERATION = {acceleration}
@@ -32,7 +32,7 @@ MAX_LIMIT = 1000
 FERROR = 10
 MIN_FERROR = 10
 """
-_MACHINE = """
+MACHINE = """
 [EMC]
 VERSION = 1.1
 MACHINE = bench
@@ -86,8 +86,8 @@ def demand(
         command = ["linuxcnc", str(folder / "machine.ini")]
         if os.geteuid() == 0:  # it refuses to run as root
             for path in (folder, *folder.iterdir()):
-                os.chown(path, _NOBODY, _NOBODY)
-            command = ["setpriv", f"--reuid={_NOBODY}", f"--regid={_NOBODY}", "--clear-groups", *command]
+                os.chown(path, NOBODY, NOBODY)
+            command = ["setpriv", f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups", *command]
         environment = os.environ | {
             "HOME": name, "PROGRAM": str(folder / "program.ngc"), "DEMAND": str(folder / "demand.txt"),
             "JOINTS": str(len(axes)), "LIMIT_S": str(limit_s),
@@ -113,9 +113,9 @@ def _write(folder: Path, program: str, speed_mm_s: float, acceleration_mm_s2: fl
     (folder / "nobody_at_the_panel.py").chmod(0o755)
     hal = folder / "machine.hal"
     hal.write_text(hal.read_text().replace("=xyz", f"={axes}").replace("num_joints=3", f"num_joints={len(axes)}"))
-    ini = _MACHINE.format(folder=folder, speed=speed_mm_s, acceleration=acceleration_mm_s2, axes=axes, joints=len(axes))
+    ini = MACHINE.format(folder=folder, speed=speed_mm_s, acceleration=acceleration_mm_s2, axes=axes, joints=len(axes))
     ini += "".join(
-        _AXIS.format(letter=letter, number=number, speed=speed_mm_s, acceleration=acceleration_mm_s2)
+        AXIS.format(letter=letter, number=number, speed=speed_mm_s, acceleration=acceleration_mm_s2)
         for number, letter in enumerate(axes)
     )
     (folder / "machine.ini").write_text(ini)

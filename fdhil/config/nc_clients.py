@@ -1,0 +1,150 @@
+"""[nc_source.modbus_coil], [nc_source.mtconnect], [nc_source.opcua]: where and how an NC is asked what it does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, model_validator
+
+from fdhil import tables
+from fdhil.config.section import NotNegative, Positive, Section, one_of
+from fdhil.config.sensors import MOST_REGISTERS, ModbusPlace
+
+MOST_COILS = 2000  # of one request
+Place = Annotated[str, Field(pattern=r"^\d{1,5}(\.\d{1,2})?$")]
+BITS_ARE = {"coils": 1, "discrete_inputs": 2, "holding_registers": 3, "input_registers": 4}
+NUMBERS_ARE = {"holding_registers": 3, "input_registers": 4}
+
+
+def _bit(description: str) -> Place | None:
+    place: Place | None = Field(None, description=f"{description}; left out: the NC does not tell it")
+    return place
+
+
+def _number(description: str) -> int | None:
+    place: int | None = Field(
+        None, ge=0, le=65535, description=f"register of {description}; left out: the NC does not tell it"
+    )
+    return place
+
+
+class ModbusNc(ModbusPlace):
+    """[nc_source.modbus_coil]: an NC or its PLC that shows what it does in coils or registers."""
+
+    port: int = Field(502, ge=1, le=65535, description="modbus: TCP port")
+    bits: Literal["coils", "discrete_inputs", "holding_registers", "input_registers"] = Field(
+        "coils", description="where the bits below are: coils, discrete_inputs, holding_registers, input_registers"
+    )
+    rapid: Place = Field("0", description="the bit that is set during G0: address from 0, in registers '12.3' is bit 3")
+    hold: Place | None = _bit("the bit of a feed hold")
+    feed: Place | None = _bit("the bit that is set during G1; with it, neither this bit nor another is rest")
+    arc: Place | None = _bit("the bit that is set during G2 and G3")
+    numbers: Literal["holding_registers", "input_registers"] = Field(
+        "holding_registers", description="where the numbers below are, whole and without a sign, one register each"
+    )
+    line: int | None = _number("the program's line")
+    feed_override: int | None = _number("the feed override")
+    rapid_override: int | None = _number("the rapid override")
+    tool: int | None = _number("the tool's number")
+    override_scale: Positive = Field(0.01, ge=1e-6, le=1, description="what 1 of an override means; 0.01 is per cent")
+    period_s: Positive = Field(0.02, ge=1e-3, le=5, description="how often it is asked")
+    renewed_s: NotNegative = Field(0.02, le=5, description="how often the NC renews what it shows: its PLC's cycle")
+
+    def places(self) -> Mapping[str, tuple[int, int, int | None]]:
+        """Return function, address and bit in a register (None for coils and numbers) of what is asked for."""
+        found: dict[str, tuple[int, int, int | None]] = {}
+        for name in ("rapid", "hold", "feed", "arc"):
+            if (place := getattr(self, name)) is not None:
+                address, _, bit = place.partition(".")
+                found[name] = BITS_ARE[self.bits], int(address), int(bit) if bit else None
+        for name in ("line", "feed_override", "rapid_override", "tool"):
+            if (register := getattr(self, name)) is not None:
+                found[name] = NUMBERS_ARE[self.numbers], register, None
+        return found
+
+    def requests(self) -> Mapping[int, tuple[int, int]]:
+        """Return by function the first address that is read and how many, with one request each."""
+        spans: dict[int, list[int]] = {}
+        for function, address, _ in self.places().values():
+            spans.setdefault(function, []).append(address)
+        return {function: (min(each), max(each) - min(each) + 1) for function, each in spans.items()}
+
+    @model_validator(mode="after")
+    def _in_reach(self) -> Self:
+        faults = "\n".join([*self._place_faults(), *self._span_faults()])
+        if faults:
+            raise ValueError(faults)
+        return self
+
+    def _place_faults(self) -> Iterator[str]:
+        in_registers = self.bits in NUMBERS_ARE
+        for name, (function, address, bit) in self.places().items():
+            if address > 65535 or (bit is not None and bit > 15):
+                yield f"{name}: addresses end at 65535, the bits of a register at 15"
+            elif function == BITS_ARE[self.bits] and name in ("rapid", "hold", "feed", "arc"):
+                if in_registers and bit is None:
+                    yield f"{name}: names a register; say which bit of it, as '{address}.0'"
+                elif not in_registers and bit is not None:
+                    yield f"{name}: {self.bits} have no bits; give their address alone, or bits = 'holding_registers'"
+
+    def _span_faults(self) -> Iterator[str]:
+        for function, (first, count) in self.requests().items():
+            most = MOST_COILS if function < min(NUMBERS_ARE.values()) else MOST_REGISTERS
+            if count > most:
+                yield f"addresses {first} to {first + count - 1} are too far apart: one request reads {most}"
+
+
+class Asked(Section):
+    """An NC that is asked over the network, and translated by a profile."""
+
+    period_s: Positive = Field(0.1, ge=5e-3, le=5, description="how often it is asked, or tells what is new")
+    renewed_s: NotNegative = Field(0.1, le=5, description="how often the agent or server renews what it shows")
+    profile: str = Field("", description="how the NC shows what it does")
+
+    def placed(self, folder: Path) -> Self:
+        """Return it with the paths of its files taken from ``folder``."""
+        changes: dict[str, Any] = {key: folder / value for key, value in self if isinstance(value, Path)}
+        own = self.profile not in tables.NC_PROFILES
+        return self.model_copy(update=changes | ({"profile": str(folder / self.profile)} if own else {}))
+
+
+class MtConnectNc(Asked):
+    """[nc_source.mtconnect]: an MTConnect agent beside the NC."""
+
+    url: str = Field("http://127.0.0.1:5000", pattern=r"^http://[^/\s]+(/\S*)?$", description="the agent")
+    device: str = Field("", description="name or uuid of the device; left out: the agent has one alone")
+    path: str = Field("", description="name or componentId of the path; left out: the device has one alone")
+    profile: Annotated[str, one_of(tables.NC_PROFILES, or_suffix=".toml")] = Field(
+        "mtconnect", description="mtconnect, or the path of a TOML file, from this file's folder"
+    )
+
+
+class OpcUaNc(Asked):
+    """[nc_source.opcua]: an OPC UA server in the NC (needs the extra opcua)."""
+
+    url: str = Field("opc.tcp://127.0.0.1:4840", pattern=r"^opc\.tcp://\S+$", description="the server's end point")
+    profile: Annotated[str, one_of(tables.NC_PROFILES, or_suffix=".toml")] = Field(
+        "opc40502",
+        description="how the NC shows what it does: siemens, heidenhain, beckhoff, opc40502 (the CNC companion "
+        "specification), or the path of a TOML file, from this file's folder",
+    )
+    timeout_s: Positive = Field(2.0, ge=0.05, le=60, description="how long an answer may take")
+    user: str | None = Field(None, min_length=1, description="the server's user; left out: anonymous")
+    password_file: Path | None = Field(None, description="file with the user's password, mode 0600")
+    certificate: Path | None = Field(
+        None, description="fdhil's own certificate, to sign and encrypt (Basic256Sha256); left out: neither"
+    )
+    private_key: Path | None = Field(None, description="the key of that certificate, mode 0600")
+    server_certificate: Path | None = Field(None, description="the server's; left out: the one that it shows is taken")
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        if (self.certificate is None) != (self.private_key is None):
+            raise ValueError("certificate: it comes with its private_key, and the key with its certificate")
+        if self.server_certificate is not None and self.certificate is None:
+            raise ValueError("server_certificate: it is of use with a certificate and private_key of our own alone")
+        if (self.user is None) != (self.password_file is None):
+            raise ValueError("user: a user comes with the password_file, and the file with its user")
+        return self

@@ -1,0 +1,85 @@
+"""Remembers what the NC says of itself: for the status, for notices, and for where a notice was. Pure.
+
+Times are given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+from fdhil.records import MoveKind, NcState, Notice
+
+FRESH_S = 1.0
+FULL = 0.005  # by which an override of 100 % may be off
+WORKING = (MoveKind.RAPID, MoveKind.FEED, MoveKind.ARC, MoveKind.HOLD)
+HELD = "a rapid that is held teaches nothing, and a correction waits"
+ADVICE = {
+    "rapid override": "rapids teach nothing until it is 100 %",
+    "feed override": "a program is not corrected at another speed than it was planned for",
+}
+
+
+class NcWatch:
+    """The newest state of the NC, and what is unusual about it."""
+
+    def __init__(self) -> None:
+        self._state: NcState | None = None
+        self._heard_s = 0.0
+        self._unusual: dict[str, str] = {}
+
+    def note(self, state: NcState, now_s: float) -> list[Notice]:
+        """Take a state; return what begins to be unusual, and what no longer is."""
+        self._state, self._heard_s = state, now_s
+        if state.motion is MoveKind.UNKNOWN:
+            return []
+        found = dict(_unusual(state))
+        begun = [_notice(what, "minor", text) for what, text in found.items() if what not in self._unusual]
+        over = [_notice(what, "info", _usual(what)) for what in self._unusual if what not in found]
+        self._unusual = found
+        return begun + over
+
+    def placed(self, notice: Notice, now_s: float) -> Notice:
+        """Return a notice with the line that the NC works at, where it is known and the notice is no mere news."""
+        state = self._state
+        if state is None or notice.severity == "info" or state.line is None or state.motion not in WORKING:
+            return notice
+        if now_s - self._heard_s > FRESH_S:
+            return notice
+        program = "" if state.program is None else f" of {state.program.rpartition('/')[2]}"
+        return replace(notice, text=f"{notice.text} (the NC is at line {state.line}{program})")
+
+    def status(self, now_s: float) -> dict[str, Any] | None:
+        """Return what the NC said last, with its age; None when it never said anything."""
+        state = self._state
+        if state is None:
+            return None
+        return {
+            "motion": state.motion.value,
+            "line": state.line,
+            "program": state.program,
+            "feed_mm_min": state.feed_mm_min,
+            "programmed_feed_mm_min": state.programmed_feed_mm_min,
+            "feed_override": state.feed_override,
+            "rapid_override": state.rapid_override,
+            "feed_hold": state.feed_hold,
+            "tool": state.tool,
+            "heard_s_ago": round(now_s - self._heard_s, 3),
+        }
+
+
+def _unusual(state: NcState) -> Iterator[tuple[str, str]]:
+    if state.held:
+        yield "feed hold", f"the NC's feed is held: {HELD}"
+    for what, override in (("rapid override", state.rapid_override), ("feed override", state.feed_override)):
+        if override is not None and abs(override - 1.0) > FULL:
+            yield what, f"the NC's {what} is {100 * override:.0f} %: {ADVICE[what]}"
+
+
+def _usual(what: str) -> str:
+    return "the NC's feed goes on" if what == "feed hold" else f"the NC's {what} is 100 % again"
+
+
+def _notice(what: str, severity: Any, text: str) -> Notice:
+    return Notice("FeedHold" if what == "feed hold" else "OverrideChanged", severity, text)

@@ -1,0 +1,165 @@
+"""Listens to an NC by its MTConnect agent: what it is now, then every change of it, as a stream over HTTP.
+
+The agent sends what is new every ``period_s``, and an empty document when nothing is: what a document tells is no older
+than the one before it. The agent's own stamps part what one document tells; its clock is not compared with ours.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AsyncExitStack
+from types import TracebackType
+from typing import Self
+from urllib.parse import quote
+
+from fdhil.config import MachineConfig
+from fdhil.drivers.nc.http_stream import Parts, Response, get
+from fdhil.drivers.nc.mtconnect_xml import Observation, Streams, chosen, items_at, read_streams
+from fdhil.drivers.nc.profile import NcProfile, Shown, Translator
+from fdhil.drivers.nc.profile_file import read_nc_profile
+from fdhil.drivers.nc.timing import between
+from fdhil.errors import DeviceTimeout, ProtocolError
+from fdhil.records import NcState
+
+ANSWER_S = 5.0
+MOST_OBSERVATIONS = 10_000  # of one document
+
+
+class MtConnect:
+    """The NC source ``mtconnect``."""
+
+    def __init__(self, config: MachineConfig) -> None:
+        self._settings = config.nc_source.mtconnect
+        self._silence_s = config.nc_source.silence_s
+        self._url = self._settings.url.rstrip("/")
+        self.name = f"MTConnect agent at {self._url.removeprefix('http://')}"
+        self._profile: NcProfile = read_nc_profile(self._settings.profile, "mtconnect")
+        self._translator = Translator(self._profile, self.name)
+        self._open = AsyncExitStack()
+        self._waiting: list[NcState] = []
+        self._signals: dict[str, str] = {}  # by dataItemId
+        self._shown: dict[str, Shown] = {}
+        self._instance = ""
+        self._came_ns = self._way_ns = self._stamp_ns = 0
+
+    async def __aenter__(self) -> Self:
+        self._translator.forget()
+        self._shown, self._waiting = {}, []
+        try:
+            streams, asked_ns, came_ns = await self._current()
+            self._choose(streams)
+            stamp_ns, error_ns = between(asked_ns, came_ns, self._settings.renewed_s)
+            self._waiting.append(self._state(stamp_ns, error_ns))
+            self._came_ns, self._way_ns = came_ns, came_ns - asked_ns
+            self._response = await self._stream(streams)
+            self._parts = Parts(self.name, self._response.headers.get("content-type", ""))
+        except BaseException:
+            await self._open.aclose()
+            raise
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self._open.aclose()
+
+    async def _current(self) -> tuple[Streams, int, int]:
+        """Return what the NC does now, with when it was asked for and had come."""
+        asked_ns = time.monotonic_ns()
+        try:
+            async with asyncio.timeout(ANSWER_S), get(self.name, f"{self._place}/current", ANSWER_S) as response:
+                document = await response.document()
+        except TimeoutError:
+            text = f"does not answer within {ANSWER_S:g} s; is the agent overloaded?"
+            raise DeviceTimeout(self.name, text) from None
+        return read_streams(document, self.name), asked_ns, time.monotonic_ns()
+
+    @property
+    def _place(self) -> str:
+        device = self._settings.device
+        return f"{self._url}/{quote(device, safe='')}" if device else self._url
+
+    async def _stream(self, streams: Streams) -> Response:
+        count = min(MOST_OBSERVATIONS, streams.buffer_size or MOST_OBSERVATIONS)
+        heartbeat_ms = max(1, round(min(2 * self._settings.period_s, self._silence_s / 4) * 1e3))
+        query = f"from={streams.next_sequence}&interval={round(self._settings.period_s * 1e3)}&count={count}"
+        url = f"{self._place}/sample?{query}&heartbeat={heartbeat_ms}"
+        response = await self._open.enter_async_context(get(self.name, url, ANSWER_S))
+        if response.status != 200 or "xml" in response.headers.get("content-type", ""):
+            async with asyncio.timeout(ANSWER_S):
+                read_streams(await response.document(), self.name)  # it says what it refuses
+            raise ProtocolError(self.name, f"refuses a stream (HTTP {response.status}); compare url")
+        return response
+
+    def _choose(self, streams: Streams) -> None:
+        """Find the profile's signals among the data items; ProtocolError with what is not there."""
+        components = chosen(streams.components, self._settings.device, self._settings.path, self.name)
+        found = {name: items_at(components, signal.at) for name, signal in self._profile.signals.items()}
+        lacking = [
+            signal.at for name, signal in self._profile.signals.items() if found[name] is None and not signal.optional
+        ]
+        if lacking:
+            text = f"tells no {', no '.join(lacking)}; compare the profile with its /current"
+            raise ProtocolError(self.name, f"{text}, and see docs/how-to/g0-from-the-nc.md")
+        self._signals = {item: name for name, item in found.items() if item is not None}
+        self._instance = streams.instance
+        for each in (each for component in components for each in component.observed):
+            self._take(each)
+
+    def _take(self, observed: Observation) -> bool:
+        name = self._signals.get(observed.item)
+        if name is not None:
+            self._shown[name] = observed.text
+        return name is not None
+
+    def _state(self, stamp_ns: int, error_ns: int) -> NcState:
+        self._stamp_ns = max(self._stamp_ns, stamp_ns)
+        return self._translator.state(self._shown, self._stamp_ns, error_ns)
+
+    async def read(self) -> Sequence[NcState]:
+        """Return what the next document tells; DeviceError."""
+        while not self._waiting:
+            came = await self._response.some()
+            if not came:
+                raise ProtocolError(self.name, "it ended the stream; is the agent restarted, or a proxy in between?")
+            for document in self._parts.feed(came):
+                self._waiting += self._states(read_streams(document, self.name))
+        states, self._waiting = self._waiting, []
+        return states
+
+    def _states(self, streams: Streams) -> Iterator[NcState]:
+        """Yield a state for each instant of a document, and one for a document in which nothing is new."""
+        if streams.instance != self._instance:
+            raise ProtocolError(self.name, "the agent was started anew; it is asked from the beginning")
+        came_ns = time.monotonic_ns()
+        since_ns, self._came_ns = (
+            self._came_ns - self._way_ns,
+            came_ns,
+        )  # what is new is no older than the last document
+        own = sorted(
+            (each for component in streams.components for each in component.observed if each.item in self._signals),
+            key=lambda each: each.sequence,
+        )
+        stamp_ns, error_ns = between(since_ns if own else came_ns - self._way_ns, came_ns, self._settings.renewed_s)
+        last_s = own[-1].time_s if own else None
+        for time_s, observed in _by_time(own):
+            for each in observed:
+                self._take(each)
+            before_s = max(0.0, last_s - time_s) if last_s is not None and time_s is not None else 0.0
+            yield self._state(stamp_ns - min(round(before_s * 1e9), came_ns - since_ns), error_ns)
+        if not own:
+            yield self._state(stamp_ns, error_ns)
+
+
+def _by_time(observed: Iterable[Observation]) -> Iterator[tuple[float | None, list[Observation]]]:
+    """Yield the observations of one instant together, in order."""
+    together: list[Observation] = []
+    for each in observed:
+        if together and each.time_s != together[0].time_s:
+            yield together[0].time_s, together
+            together = []
+        together.append(each)
+    if together:
+        yield together[0].time_s, together

@@ -1,0 +1,136 @@
+"""Reads the documents of an MTConnect agent. Pure.
+
+Source: MTConnect Standard Part 1 (header, errors) and Part 3 (streams).
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+
+from fdhil.errors import ProtocolError
+
+UNAVAILABLE = "UNAVAILABLE"
+_HOLDERS = ("Samples", "Events")
+_COMPONENTS = ("Path", "Controller")
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """What one data item shows from ``time_s`` of the agent's clock on (None: it does not say when).
+
+    ``element`` is the element's name, with its subType behind a colon; ``text`` is None where it is unavailable.
+    """
+
+    sequence: int
+    item: str
+    element: str
+    text: str | None
+    time_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Component:
+    """A path, or the controller above it, of one device, and what is observed of it."""
+
+    device: tuple[str, str]  # name, uuid
+    kind: str
+    names: tuple[str, str]  # name, componentId
+    observed: tuple[Observation, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Streams:
+    """A streams document: what is new, up to ``next_sequence`` of the agent's run ``instance``."""
+
+    instance: str
+    next_sequence: int
+    buffer_size: int
+    components: tuple[Component, ...]
+
+
+def read_streams(document: bytes, name: str) -> Streams:
+    """Return what a document of the agent ``name`` tells; ProtocolError for an error document and for no document."""
+    if b"<!DOCTYPE" in document or b"<!ENTITY" in document:
+        raise ProtocolError(name, "sends XML with declarations of its own, which no agent does; compare url")
+    try:
+        root = ElementTree.fromstring(document)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise ProtocolError(name, f"answers no MTConnect document ({error}); compare url") from None
+    if _local(root) == "MTConnectError":
+        raise ProtocolError(name, f"refuses: {_refusal(root)}; compare url, device and path with its /probe")
+    header = next((child for child in root if _local(child) == "Header"), None)
+    if _local(root) != "MTConnectStreams" or header is None:
+        raise ProtocolError(name, f"answers with a {_local(root)[:40]} document; compare url")
+    try:
+        follows, size = int(header.get("nextSequence", "")), int(header.get("bufferSize", "0"))
+    except ValueError:
+        raise ProtocolError(name, "tells no nextSequence in its header; it is too old an agent") from None
+    return Streams(header.get("instanceId", ""), follows, size, tuple(_components(root, name)))
+
+
+def _refusal(root: ElementTree.Element) -> str:
+    errors = [each for each in root.iter() if _local(each) == "Error"]
+    return "; ".join(f"{each.get('errorCode', '')} {(each.text or '').strip()}"[:200] for each in errors) or "unknown"
+
+
+def _components(root: ElementTree.Element, name: str) -> Iterator[Component]:
+    for device in (each for each in root.iter() if _local(each) == "DeviceStream"):
+        identity = device.get("name", ""), device.get("uuid", "")
+        for stream in device:
+            kind = stream.get("component", "")
+            if kind in _COMPONENTS:
+                names = stream.get("name", ""), stream.get("componentId", "")
+                yield Component(identity, kind, names, tuple(_observations(stream, name)))
+
+
+def _observations(stream: ElementTree.Element, name: str) -> Iterator[Observation]:
+    for holder in (each for each in stream if _local(each) in _HOLDERS):
+        for each in holder:
+            try:
+                sequence = int(each.get("sequence", ""))
+            except ValueError:
+                raise ProtocolError(name, f"tells a {_local(each)[:40]} without a sequence number") from None
+            text = (each.text or "").strip()
+            sub_type = each.get("subType", "")
+            element = f"{_local(each)}:{sub_type}" if sub_type else _local(each)
+            shown = None if text == UNAVAILABLE else text
+            yield Observation(sequence, each.get("dataItemId", ""), element, shown, _time_s(each.get("timestamp", "")))
+
+
+def _time_s(text: str) -> float | None:
+    try:
+        return datetime.fromisoformat(text).timestamp()
+    except (ValueError, OverflowError, OSError):
+        return None
+
+
+def _local(element: ElementTree.Element) -> str:
+    return str(element.tag).rpartition("}")[2]
+
+
+def chosen(components: Sequence[Component], device: str, path: str, name: str) -> tuple[Component, ...]:
+    """Return the path that is listened to and the controllers of its device; ProtocolError where it is not clear."""
+    paths = [each for each in components if each.kind == "Path" and (not device or device in each.device)]
+    devices = {each.device for each in paths}
+    if len(devices) != 1:
+        known = ", ".join(sorted(each.device[0] for each in components if each.kind == "Path")) or "none with a path"
+        raise ProtocolError(name, f"its devices are: {known}; give device in [nc_source.mtconnect]")
+    paths = [each for each in paths if not path or path in each.names]
+    if len(paths) != 1:
+        known = ", ".join(sorted(each.names[0] or each.names[1] for each in components if each.kind == "Path"))
+        raise ProtocolError(name, f"its paths are: {known}; give path in [nc_source.mtconnect]")
+    owner = paths[0].device
+    return (paths[0], *(each for each in components if each.kind == "Controller" and each.device == owner))
+
+
+def items_at(components: Sequence[Component], places: str) -> str | None:
+    """Return the dataItemId of the first of these places (``Line``, ``PathFeedrate:ACTUAL``, ``@id``) that is there."""
+    observed = [each for component in components for each in component.observed]
+    for place in places.split("|"):
+        for each in observed:
+            if place in (each.element, f"@{each.item}"):
+                return each.item
+    return None

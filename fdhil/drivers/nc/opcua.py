@@ -1,0 +1,148 @@
+"""Asks an NC what it does by its OPC UA server: every signal of the profile with one Read request.
+
+asyncua reconnects by itself only if it is told to, which it is not: the listener enters a source anew. Its logger is
+quiet, for what it logs is told by the errors here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import struct
+import time
+from collections.abc import Mapping, Sequence
+from types import TracebackType
+from typing import Any, Self
+
+from asyncua import Client, ua
+from asyncua.ua.uaerrors import UaError
+
+from fdhil.config import MachineConfig
+from fdhil.drivers.nc.opcua_nodes import find_nodes
+from fdhil.drivers.nc.opcua_security import secure
+from fdhil.drivers.nc.profile import Shown, Translator
+from fdhil.drivers.nc.profile_file import read_nc_profile
+from fdhil.drivers.nc.timing import between
+from fdhil.errors import ConnectError, DeviceTimeout, ProtocolError
+from fdhil.records import NcState
+
+logging.getLogger("asyncua").setLevel(logging.CRITICAL)
+LOST = (OSError, EOFError, UaError)
+NONSENSE = (struct.error, ValueError, TypeError, KeyError, AttributeError, IndexError)
+"""What asyncua lets through when bytes come that are no OPC UA."""
+_NOT_THERE = (ua.StatusCodes.BadNodeIdUnknown, ua.StatusCodes.BadNodeIdInvalid, ua.StatusCodes.BadAttributeIdInvalid)
+
+
+class OpcUa:
+    """The NC source ``opcua``."""
+
+    def __init__(self, config: MachineConfig) -> None:
+        self._settings = config.nc_source.opcua
+        self.name = f"OPC UA server at {self._settings.url.removeprefix('opc.tcp://')}"
+        self._profile = read_nc_profile(self._settings.profile, "opcua")
+        self._translator = Translator(self._profile, self.name)
+        self._client: Client | None = None
+        self._nodes: Mapping[str, ua.NodeId] = {}
+        self._next_s = 0.0
+
+    async def __aenter__(self) -> Self:
+        self._translator.forget()
+        self._client = client = Client(self._settings.url, timeout=self._settings.timeout_s)
+        try:
+            await secure(client, self._settings, self.name)
+            async with asyncio.timeout(4 * self._settings.timeout_s):
+                await client.connect()
+                self._nodes = await self._find(client)
+        except TimeoutError:
+            await self._disconnect()
+            text = f"does not answer within {4 * self._settings.timeout_s:g} s; compare url, and start the server"
+            raise ConnectError(self.name, text) from None
+        except LOST as error:
+            await self._disconnect()
+            text = f"cannot be entered ({_words(error)}); compare url, user, certificate and the server's own settings"
+            raise ConnectError(self.name, text) from None
+        except NONSENSE as error:
+            await self._disconnect()
+            raise ProtocolError(self.name, f"does not speak OPC UA ({_words(error)}); compare url") from None
+        except BaseException:
+            await self._disconnect()
+            raise
+        self._next_s = time.monotonic()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self._disconnect()
+
+    async def _disconnect(self) -> None:
+        client, self._client = self._client, None
+        if client is not None:
+            with contextlib.suppress(*LOST, *NONSENSE, TimeoutError):
+                async with asyncio.timeout(self._settings.timeout_s):
+                    await client.disconnect()
+
+    async def _find(self, client: Client) -> Mapping[str, ua.NodeId]:
+        """Return the nodes of the profile's signals; ProtocolError with what is not there."""
+        signals = self._profile.signals
+        found = await find_nodes(client, {name: signal.at for name, signal in signals.items()})
+        values = await client.uaclient.read_attributes(list(found.values()), ua.AttributeIds.Value)
+        for name, value in zip(list(found), values, strict=True):
+            if value.StatusCode is not None and value.StatusCode.value in _NOT_THERE:
+                del found[name]
+        lacking = [signal.at for name, signal in signals.items() if name not in found and not signal.optional]
+        if lacking:
+            text = f"has no {', no '.join(lacking)}; compare the profile {self._settings.profile} with a browser of it"
+            raise ProtocolError(self.name, text)
+        return found
+
+    async def read(self) -> Sequence[NcState]:
+        """Rest until it is time, ask, and return the state; DeviceError."""
+        await asyncio.sleep(max(0.0, self._next_s - time.monotonic()))
+        self._next_s = max(time.monotonic(), self._next_s + self._settings.period_s)
+        asked_ns = time.monotonic_ns()
+        values = await self._values()
+        shown = {name: _shown(value) for name, value in zip(self._nodes, values, strict=True)}
+        if all(value is None for value in shown.values()):
+            text = f"shows no value ({_status(values[0])}); is the NC behind it switched on?"
+            raise ProtocolError(self.name, text)
+        stamp_ns, error_ns = between(asked_ns, time.monotonic_ns(), self._settings.renewed_s)
+        return [self._translator.state(shown, stamp_ns, error_ns)]
+
+    async def _values(self) -> list[ua.DataValue]:
+        assert self._client is not None
+        try:
+            async with asyncio.timeout(self._settings.timeout_s):
+                values = await self._client.uaclient.read_attributes(list(self._nodes.values()), ua.AttributeIds.Value)
+        except TimeoutError:
+            text = f"did not answer within {self._settings.timeout_s:g} s; is the server still running?"
+            raise DeviceTimeout(self.name, text) from None
+        except LOST as error:
+            raise ConnectError(self.name, f"is lost ({_words(error)}); is the server still running?") from None
+        except NONSENSE as error:
+            raise ProtocolError(self.name, f"answers nonsense ({_words(error)}); compare url") from None
+        if len(values) != len(self._nodes):
+            raise ProtocolError(self.name, f"answers {len(values)} values for {len(self._nodes)} that were asked for")
+        return values
+
+
+def _shown(value: ua.DataValue) -> Shown:
+    """Return a value that is good; None for one that is not, and for what is no number and no text."""
+    if value.Value is None or (value.StatusCode is not None and not value.StatusCode.is_good()):
+        return None
+    plain: Any = value.Value.Value
+    if isinstance(plain, list | tuple):
+        return tuple(plain)
+    if isinstance(plain, ua.LocalizedText):
+        plain = plain.Text
+    return plain if isinstance(plain, bool | int | float | str) else None
+
+
+def _status(value: ua.DataValue) -> str:
+    return str(value.StatusCode.name) if value.StatusCode is not None else "no status"
+
+
+def _words(error: BaseException) -> str:
+    text = " ".join(str(error).split())[:120]
+    return text or type(error).__name__

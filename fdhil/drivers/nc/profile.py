@@ -1,0 +1,204 @@
+"""Translates what an NC's interface shows into what the NC does, by the rules of a profile. Pure.
+
+A profile names signals, where each is, and rules: the first rule that holds tells the motion. A rule that needs what
+is not told does not hold and is not passed over either: the motion is then UNKNOWN, so that a missing "feed hold"
+never leaves a "rapid" behind.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from fdhil.drivers.nc.blocks import BLOCKS, BlockReader
+from fdhil.errors import ProtocolError
+from fdhil.records import MoveKind, NcState
+
+Shown = bool | int | float | str | tuple[Any, ...] | None
+"""A value as an interface shows it; None: it shows none."""
+LARGEST_FEED_MM_MIN = 1e7
+LARGEST_OVERRIDE = 10.0
+TEXT = 400  # characters of a program's name
+_NUMBERED = re.compile(r"^\s*[NO]?0*(\d{1,9})\s*$", re.IGNORECASE)
+
+
+@dataclass(frozen=True, slots=True)
+class Signal:
+    """One value: ``at`` is its place in the interface's own words, ``scale`` takes it to the unit of NcState.
+
+    ``bit`` is taken of a whole number, ``item`` of an array. ``reads``: the value itself, or the motion that the text
+    of a block tells. One that is ``optional`` may be absent.
+    """
+
+    name: str
+    at: str
+    scale: float = 1.0
+    bit: int | None = None
+    item: int | None = None
+    reads: Literal["value", "iso_block", "klartext_block"] = "value"
+    optional: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """What a signal must be: one of ``values`` (or an array with one of them in it), or a number within bounds."""
+
+    values: tuple[bool | float | str, ...] = ()
+    at_least: float = -math.inf
+    at_most: float = math.inf
+
+    def holds(self, value: Shown) -> bool:
+        """Whether a value that is told is so."""
+        if self.values:
+            return any(each in self.values for each in (value if isinstance(value, tuple) else (value,)))
+        number = _number(value)
+        return number is not None and self.at_least <= number <= self.at_most
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """The motion is ``kind`` when every condition holds."""
+
+    kind: MoveKind
+    when: Mapping[str, Condition]
+
+    def holds(self, values: Mapping[str, Shown]) -> bool | None:
+        """Whether it holds; None where that depends on what is not told."""
+        told = {name: values.get(name) for name in self.when}
+        if any(value is not None and not self.when[name].holds(value) for name, value in told.items()):
+            return False
+        return None if None in told.values() else True
+
+
+@dataclass(frozen=True, slots=True)
+class NcProfile:
+    """How an NC shows what it does: its signals by name, and the rules of its motion in order."""
+
+    title: str
+    interface: str
+    signals: Mapping[str, Signal]
+    rules: tuple[Rule, ...]
+    notes: tuple[str, ...] = ()
+
+    def motion(self, values: Mapping[str, Shown]) -> MoveKind:
+        """Return the kind of the first rule that holds, UNKNOWN where none does or it cannot be told."""
+        for rule in self.rules:
+            holds = rule.holds(values)
+            if holds or holds is None:
+                return rule.kind if holds else MoveKind.UNKNOWN
+        return MoveKind.UNKNOWN
+
+
+class Translator:
+    """Makes states of what an interface shows, one after the other; ``name`` is the NC's in messages."""
+
+    def __init__(self, profile: NcProfile, name: str) -> None:
+        self._profile, self._name = profile, name
+        self._blocks: dict[str, BlockReader] = {}
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget the blocks before: the connection was made anew."""
+        self._blocks = {s.name: BLOCKS[s.reads]() for s in self._profile.signals.values() if s.reads in BLOCKS}
+
+    def state(self, shown: Mapping[str, Shown], stamp_ns: int, error_ns: int) -> NcState:
+        """Return what the NC does by what it shows, signal by signal; ProtocolError for what cannot be."""
+        values = {s.name: _taken(s, shown.get(s.name)) for s in self._profile.signals.values()}
+        fields = {name: self._field(name, values[name]) for name in FIELDS if name in values}
+        for name, blocks in self._blocks.items():
+            text = values[name]
+            kind = blocks.kind(text, fields.get("line")) if isinstance(text, str) else None
+            values[name] = None if kind is None else kind.value
+        return NcState(stamp_ns, error_ns, self._profile.motion(values), **fields)
+
+    def _field(self, name: str, value: Shown) -> Any:
+        """Return a field of NcState; what is not told, and a number that means none, is None."""
+        if value is None:
+            return None
+        try:
+            return FIELDS[name](value)
+        except (ValueError, TypeError, OverflowError):
+            text = f"tells {str(value)[:40]!r} as {name}; compare its place and its scale in the profile with the NC"
+            raise ProtocolError(self._name, text) from None
+
+
+def _taken(signal: Signal, shown: Shown) -> Shown:
+    """Return the item, the bit or the scaled number that a signal takes of what is shown."""
+    value = shown
+    if signal.item is not None:
+        value = value[signal.item] if isinstance(value, tuple) and signal.item < len(value) else None
+    if signal.bit is not None:
+        return bool(value >> signal.bit & 1) if isinstance(value, int) else None
+    if signal.scale != 1.0 and value is not None:
+        number = _number(value)
+        return value if number is None else number * signal.scale
+    return value
+
+
+def _number(value: Shown) -> float | None:
+    """Return a number, also one that is shown as a text; None where it is none."""
+    if isinstance(value, tuple) or value is None:
+        return None
+    try:
+        number = float(value)
+    except (ValueError, OverflowError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _within(most: float) -> Callable[[Shown], float]:
+    def check(value: Shown) -> float:
+        number = _number(value)
+        if number is None or not 0 <= number <= most:
+            raise ValueError(f"{value!r} is not from 0 to {most:g}")
+        return number
+
+    return check
+
+
+def _counted(least: int) -> Callable[[Shown], int | None]:
+    """A whole number, or one with an N or O in front; below ``least`` it means none."""
+
+    def check(value: Shown) -> int | None:
+        if isinstance(value, str):
+            found = _NUMBERED.match(value)
+            return int(found[1]) if found and int(found[1]) >= least else None
+        number = _number(value)
+        if number is None or number != round(number):
+            raise ValueError(f"{value!r} is no whole number")
+        return int(number) if number >= least else None
+
+    return check
+
+
+def _yes(value: Shown) -> bool:
+    if value not in (0, 1):  # True and False, too
+        raise ValueError(f"{value!r} is neither true nor false")
+    return bool(value)
+
+
+def _text(value: Shown) -> str | None:
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r} is no text")
+    return value.strip()[:TEXT] or None
+
+
+FIELDS: Mapping[str, Callable[[Shown], Any]] = {
+    "line": _counted(1),
+    "programmed_feed_mm_min": _within(LARGEST_FEED_MM_MIN),
+    "feed_mm_min": _within(LARGEST_FEED_MM_MIN),
+    "feed_override": _within(LARGEST_OVERRIDE),
+    "rapid_override": _within(LARGEST_OVERRIDE),
+    "feed_hold": _yes,
+    "tool": _counted(0),
+    "program": _text,
+}
+"""The signals that are fields of NcState, and how each is read; every other one serves the rules alone."""
+
+
+def fields_of(names: Iterable[str]) -> frozenset[str]:
+    """Return which of the signals are fields of NcState."""
+    return frozenset(names) & FIELDS.keys()

@@ -1,0 +1,1 @@
+"""Holds how NCs show what they do, one TOML file each."""

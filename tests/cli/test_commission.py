@@ -1,0 +1,197 @@
+"""``fdhil commission`` on a simulated drive inside this process: plans, resuming, and the set-ups that it refuses."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+import uuid
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from fdhil import config as machine_config
+from fdhil.cli.main import cli, run_safely
+from fdhil.commissioning.record import load_record
+from tests.bench import bench_toml
+from tests.drivers.peer import DrivePeer
+from tests.eds import write_eds
+
+WAITS: tuple[tuple[str, str, float], ...] = (
+    ("commissioning.survey", "LISTEN_S", 0.15),
+    ("commissioning.steps", "SETTLE_CYCLES", 120),
+    ("commissioning.steps", "AVERAGE_CYCLES", 60),
+    ("commissioning.watchdog", "STARVE_TIMEOUT_S", 0.1),
+    ("drivers.can.sdo", "RESPONSE_TIMEOUT_S", 0.2),
+    ("drivers.can.sdo", "QUIET_S", 0.1),
+)
+
+
+@dataclass
+class Bench:
+    """A drive on a bus of this process, and the command that commissions it."""
+
+    peer: DrivePeer
+    file: Path
+    capsys: pytest.CaptureFixture[str]
+
+    def commission(self, *arguments: str) -> tuple[int, str, str]:
+        """Run the command; return exit code, stdout and stderr."""
+        sys.argv[1:] = ["commission", str(self.file), *arguments]
+        code = run_safely(cli)
+        heard = self.capsys.readouterr()
+        return code, heard.out, heard.err
+
+    def say(self, old: str, new: str) -> None:
+        """Change what the configuration says."""
+        text = self.file.read_text()
+        assert old in text
+        self.file.write_text(text.replace(old, new, 1))
+
+    @property
+    def store(self) -> Path:
+        return machine_config.load(self.file).store.directory
+
+
+@pytest.fixture
+def bench(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    for module, name, value in WAITS:
+        monkeypatch.setattr(f"fdhil.{module}.{name}", value)
+    monkeypatch.setattr(sys, "argv", ["fdhil"])
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    file = tmp_path / "machine.toml"
+    bus = f'[bus.can0]\ninterface = "virtual"\nchannel = "{uuid.uuid4().hex}"\n[guard]\nclock = "sync"\n'
+    file.write_text(bench_toml("X") + "[axis.X.drive]\nnode_id = 1\n" + bus)
+    with DrivePeer(machine_config.load(file)) as peer:
+        yield Bench(peer, file, capsys)
+
+
+def test_a_dry_run_says_what_each_step_moves_and_sends_nothing(bench: Bench) -> None:
+    code, out, err = bench.commission("--room", "-10", "160", "--dry-run")
+    assert (code, err) == (0, "")
+    for words in (
+        "nothing is sent now",
+        "4 sign test: ",
+        "Moves 10 um toward plus and back",
+        "9 jog: ",
+        "Moves 5 mm toward plus at 5 mm/s, and back.",
+        "Moves 156.8 mm toward plus at 461 mm/s with 4000 mm/s2, and back, 3 times.",
+    ):
+        assert words in out, words
+    code, out, _ = bench.commission("--dry-run", "--json")
+    plan = json.loads(out)
+    assert (code, plan["dry_run"], len(plan["axes"]["X"])) == (0, True, 7)
+    assert plan["axes"]["X"][0] | {"does": ""} == {"step": "listen", "does": "", "moves": "nothing", "done_utc": None}
+    code, _, err = bench.commission("--room", "-10", "60", "--dry-run")
+    assert (code, "test rapids, which need 102 mm" in err) == (1, True)
+    assert bench.peer.heard == []
+    assert list(bench.file.parent.iterdir()) == [bench.file]
+
+
+@pytest.mark.parametrize("room", [("10", "100"), ("-10", "-1"), ("nan", "100"), ("-10", "inf")])
+def test_a_room_that_is_none_is_told(room: tuple[str, str], bench: Bench) -> None:
+    code, _, err = bench.commission("--room", *room)
+    assert (code, "--room wants two numbers of mm" in err) == (2, True)
+
+
+def test_what_was_stopped_goes_on_where_it_ended(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(*_: object) -> str:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as stopped:
+        stopped.setattr("fdhil.commissioning.steps.watchdog_test", stop)
+        code, _, err = bench.commission("--yes")
+        assert (code, err.strip()) == (130, "fdhil: stopped by the operator")
+    assert bench.peer.drive.power.state.name == "SWITCH_ON_DISABLED"
+    assert load_record(bench.store, "X") is None
+
+    code, out, _ = bench.commission("--yes")
+    assert code == 0
+    for kept in ("step 4 of 7, sign test: kept, it was done 2", "step 5 of 7, feed-forward test: kept"):
+        assert kept in out
+    assert "step 6 of 7, watchdog test: Sending" in out
+    assert "axis X is not tried by moving it: no --room was given" in out
+    first = load_record(bench.store, "X")
+    assert first is not None
+    assert first.watchdog == "proven"
+
+    heard = len(bench.peer.heard)
+    code, out, _ = bench.commission("--yes")
+    assert (code, "step 3" in out, "watchdog test: kept" in out) == (0, False, True)
+    assert not {0x000, 0x080, 0x201, 0x301} & set(bench.peer.heard[heard:])
+    again = load_record(bench.store, "X")
+    assert again is not None
+    assert again.sign_test_um == first.sign_test_um
+
+    code, out, _ = bench.commission("--yes", "--dry-run")
+    assert out.count("kept if the drive is the same") == 3
+    bench.peer.drive.set_object(0x6085, 0, 1_000_000)  # set up otherwise by its own tool
+    code, out, _ = bench.commission("--yes")
+    assert (code, "kept" in out, "step 4 of 7, sign test: Moving" in out) == (0, False, True)
+
+
+def without(peer: DrivePeer, index: int) -> None:
+    """Take an object out of the drive."""
+    dictionary = peer.drive.dictionary
+    dictionary.indices.discard(index)
+    for key in [key for key in dictionary.entries if key >> 8 == index]:
+        del dictionary.entries[key]
+
+
+def other_eds(bench: Bench) -> None:
+    """The configuration names the EDS of another maker's drive, and the profile that is made from it."""
+    eds = write_eds("elmo", bench.file.parent)
+    bench.say("node_id = 1\n", f'node_id = 1\nprofile = "cia402"\neds = "{eds.name}"\n')
+
+
+def set_object(index: int, sub: int, value: int) -> Callable[[Bench], None]:
+    return lambda bench: bench.peer.drive.set_object(index, sub, value)
+
+
+def fault(name: str, value: object) -> Callable[[Bench], None]:
+    return lambda bench: setattr(bench.peer.drive.faults, name, value)
+
+
+def said(old: str, new: str) -> Callable[[Bench], None]:
+    return lambda bench: bench.say(old, new)
+
+
+# what is wrong -> how it gets so, what is said, and whether the drive was switched on before that
+WRONG: dict[str, tuple[Callable[[Bench], None], str, bool]] = {
+    "goes on without communication": (set_object(0x6007, 0, 0), "0x6007 is 0: it goes on", False),
+    "coasts": (set_object(0x605E, 0, 0), "it coasts instead of stopping by a ramp", False),
+    "window off": (set_object(0x6065, 0, 0xFFFFFFFF), "0x6065 is off: it never notices", False),
+    "gear x 10": (set_object(0x6091, 1, 10), "its position counts 6553.6 per motor revolution", False),
+    "scale of the config": (
+        said("node_id = 1\n", "node_id = 1\nincrements_per_rev = 16384\n"), "where the config has 16384", False),
+    "rated current": (set_object(0x6075, 0, 10_000), "its rated current is 10 A (0x6075)", False),
+    "mapping": (
+        lambda b: b.peer.drive.remap(0x1A01, [(0x6041, 0, 16), (0x2101, 0, 16), (0x6078, 0, 16)]),
+        "TPDO2 maps 60410010, 21010010, 60780010", False),
+    "offset of another node": (set_object(0x1401, 1, 0x305), "RPDO2 has the COB-ID 00000305", False),
+    "other EDS": (other_eds, "choose another profile", False),
+    "other profile": (
+        said("node_id = 1\n", 'node_id = 1\nprofile = "epos4"\n'), "which profile epos4 is not made for", False),
+    "other cycle": (set_object(0x60C2, 1, 2), "it interpolates over 2 ms", False),
+    "no heartbeat consumer": (lambda b: without(b.peer, 0x1016), "it has no heartbeat consumer (0x1016)", True),
+    "heartbeat consumer of no effect": (fault("no_heartbeat_consumer", True), "its watchdog does not work", True),
+    "sign of the offset": (fault("offset_scale", -1.0), "does not add 0x60B0 to the target", True),
+    "scale of the offset": (fault("offset_scale", 2.0), "does not add 0x60B0 to the target", True),
+    "offset ignored": (fault("ignore_offset", True), "0x60B0 holds 0; check the RPDO's mapping", True),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_a_wrong_set_up_is_refused(what: str, bench: Bench) -> None:
+    spoil, says, switched_on = WRONG[what]
+    spoil(bench)
+    code, _, err = bench.commission("--yes", "--room", "-5", "150")
+    assert code == 1, err
+    assert says in err
+    assert "Traceback" not in err
+    assert (0x080 in bench.peer.heard) is switched_on
+    assert bench.peer.drive.power.state.name == "SWITCH_ON_DISABLED"
+    assert bench.peer.drive.dictionary.number(0x60B0) == 0
+    assert load_record(bench.store, "X") is None

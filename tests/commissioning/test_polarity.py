@@ -1,0 +1,111 @@
+"""A jog of a motor by its equations: whatever has a wrong sign or unit is named, whatever pulls at the axis."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fdhil.commissioning.polarity import judge_acceleration, judge_jog
+from fdhil.commissioning.set_points import straight
+from fdhil.records import Recording, SlowVoltage, frozen
+
+DT, PITCH, JOG = 0.001, 20.0, 5.0
+R, K, J, FRICTION = 0.5, 0.8, 0.075, 5.0
+
+
+def jogged(weight_nm: float = 0.0, top_mm_s: float = 5.0, way_mm: float = JOG) -> Recording:
+    """Rows of a jog to and fro; ``weight_nm`` pulls at the axis all the time."""
+    part = straight((0.0,), (way_mm,), (top_mm_s * DT,), (50.0 * top_mm_s / 5.0 * DT**2,), 20)[:, 0]
+    rest = np.zeros(300)
+    position = np.concatenate([rest, part, rest + way_mm, way_mm - part, rest])
+    speed = np.gradient(position, DT) * 2 * math.pi / PITCH
+    noise = np.random.default_rng(1).normal(size=(2, position.size))
+    torque = J * np.gradient(speed, DT) + FRICTION * np.sign(np.round(speed, 6)) + weight_nm
+    current = torque / K + 0.05 * noise[0]
+    voltage = R * current + K * speed + 0.05 * noise[1]
+    return Recording(
+        "X", DT, frozen(np.arange(position.size) * DT), frozen(voltage), frozen(current), frozen(speed),
+        frozen(position), frozen(position), "interval_mean", PITCH, None,
+    )  # fmt: skip
+
+
+def causes(jog: Recording) -> str:
+    return "; ".join(finding.cause for finding in judge_jog(jog, JOG) if finding.ok is False)
+
+
+@pytest.mark.parametrize("weight_nm", [0.0, 20.0, -20.0])
+def test_a_right_axis_passes_also_one_that_carries_a_weight(weight_nm: float) -> None:
+    jog = jogged(weight_nm)
+    assert [f.point for f in judge_jog(jog, JOG) if f.ok] == ["travel", "speed unit", "current sign", "voltage sign"]
+    lossy = replace(jog, current_a=frozen(np.where(np.arange(jog.current_a.size) % 50 == 3, np.nan, jog.current_a)))
+    assert causes(lossy) == ""
+
+
+WRONG: dict[str, tuple[Callable[[Recording], Recording], str]] = {
+    "current": (lambda r: replace(r, current_a=-r.current_a), "SignOrScale: current times speed is negative"),
+    "voltage": (
+        lambda r: replace(r, voltage_v=frozen(-(r.voltage_v if r.voltage_v is not None else 0))),
+        "SignOrScale: voltage times current, and times speed is negative",
+    ),
+    "speed": (
+        lambda r: replace(r, speed_rad_s=-r.speed_rad_s),
+        "its speed (0x606C) is -1 times what its position shows",
+    ),
+    "speed x 10": (lambda r: replace(r, speed_rad_s=r.speed_rad_s * 10), "its speed (0x606C) is 10 times"),
+    "way": (
+        lambda r: replace(r, position_mm=r.position_mm * 2),
+        "it was to go 5 mm and its position (0x6064) went 10.000",
+    ),
+    "no current": (lambda r: replace(r, current_a=r.current_a * 0), "come to nothing"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_what_is_wrong_is_named(what: str) -> None:
+    spoil, says = WRONG[what]
+    assert says in causes(spoil(jogged()))
+
+
+def test_words_that_are_swapped_are_told() -> None:
+    """A float whose two words are swapped is noise of any size."""
+    jog = jogged()
+    noise = frozen(np.random.default_rng(2).normal(size=jog.speed_rad_s.size) * 1e3)
+    assert "SignOrScale: voltage times current" in causes(replace(jog, voltage_v=noise))
+
+
+def test_a_slower_sensor_is_judged_too() -> None:
+    jog = jogged()
+    assert jog.voltage_v is not None
+    means = jog.voltage_v[: jog.voltage_v.size // 50 * 50].reshape(-1, 50).mean(axis=1)
+    slow = replace(jog, voltage_v=None, slow_voltage=SlowVoltage(0.0, 0.05, 0.0, frozen(means)))
+    assert causes(slow) == ""
+    turned = replace(slow, slow_voltage=SlowVoltage(0.0, 0.05, 0.0, frozen(-means)))
+    assert "voltage times current, and times speed is negative" in causes(turned)
+
+
+def test_without_a_voltage_nothing_is_said_of_it() -> None:
+    (voltage,) = [f for f in judge_jog(replace(jogged(), voltage_v=None), JOG) if f.point == "voltage sign"]
+    assert (voltage.ok, voltage.cause) == (None, "no voltage was heard")
+
+
+def test_a_motor_takes_power_while_it_accelerates() -> None:
+    rapid = jogged(top_mm_s=400.0, way_mm=150.0)
+    assert judge_acceleration(rapid).ok is True
+    assert rapid.voltage_v is not None
+    wrong = judge_acceleration(replace(rapid, voltage_v=frozen(-rapid.voltage_v)))
+    assert (wrong.ok, "J while it accelerated, which no motor does" in wrong.cause) == (False, True)
+
+
+def test_a_table_that_goes_another_way_is_told() -> None:
+    jog = jogged()
+    seen = replace(
+        jog, table_mm=frozen(np.where(np.arange(jog.position_mm.size) % 3 == 0, jog.position_mm + 7.0, np.nan))
+    )
+    assert [f.point for f in judge_jog(seen, JOG) if f.ok][2] == "table"
+    turned = replace(jog, table_mm=-jog.position_mm)
+    assert "its table goes -1 times the way of its motor" in causes(turned)
+    assert causes(replace(jog, table_mm=jog.position_mm * np.nan)) == ""

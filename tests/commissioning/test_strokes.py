@@ -1,0 +1,52 @@
+"""A jog and a rapid that fit into the room, and a room that is too small."""
+
+from __future__ import annotations
+
+import pytest
+
+from fdhil.commissioning.strokes import Room, plan_jog, plan_rapid
+from fdhil.config import Axis
+from fdhil.errors import DriveFault
+from tests.drivers.wire import machine
+
+
+@pytest.fixture
+def axis() -> Axis:
+    """500 mm/s with 4000 mm/s2."""
+    return machine().axis["X"]
+
+
+def test_a_jog_is_short_slow_and_toward_the_side_with_room(axis: Axis) -> None:
+    jog = plan_jog("X", axis, Room(-3.0, 40.0))
+    assert str(jog) == "5 mm toward plus at 5 mm/s"
+    assert str(jog.back()) == "5 mm toward minus at 5 mm/s"
+    assert plan_jog("X", axis, Room(-3.0, 1.0)).distance_mm == pytest.approx(-2.94)
+    slow = axis.model_copy(update={"rapid_speed_mm_s": 20.0, "max_acceleration_mm_s2": 100.0})
+    assert (
+        plan_jog("X", slow, Room(0.0, 40.0)).speed_mm_s,
+        plan_jog("X", slow, Room(0.0, 40.0)).acceleration_mm_s2,
+    ) == (2, 10)
+
+
+def test_a_room_of_nothing_is_refused(axis: Axis) -> None:
+    with pytest.raises(DriveFault, match=r"room from -0.3 to \+0.2 mm for the jog, which needs 0.5 mm .* --room"):
+        plan_jog("X", axis, Room(-0.3, 0.2))
+
+
+def test_a_rapid_is_as_fast_as_g0_where_there_is_room(axis: Axis) -> None:
+    rapid = plan_rapid("X", axis, Room(-500.0, 20.0))
+    assert rapid.speed_mm_s == 500.0
+    assert rapid.distance_mm == pytest.approx(-500.0 * (500.0 / 4000.0 + 0.025 + 0.2))
+
+
+def test_a_rapid_in_a_small_room_is_slower_and_keeps_its_plateau(axis: Axis) -> None:
+    rapid = plan_rapid("X", axis, Room(0.0, 120.0))
+    assert rapid.distance_mm == pytest.approx(0.98 * 120.0)
+    assert rapid.distance_mm == pytest.approx(rapid.speed_mm_s * (rapid.speed_mm_s / 4000.0 + 0.225))
+    assert 325.0 <= rapid.speed_mm_s < 500.0
+
+
+def test_what_would_be_no_rapid_is_refused_with_the_room_it_needs(axis: Axis) -> None:
+    with pytest.raises(DriveFault, match=r"room from -50 to \+90 mm for test rapids, which need 102 mm to one side"):
+        plan_rapid("X", axis, Room(-50.0, 90.0))
+    assert plan_rapid("X", axis, Room(-50.0, 102.0)).speed_mm_s >= 325.0

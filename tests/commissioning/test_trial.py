@@ -1,0 +1,163 @@
+"""A simulated axis is jogged, moved as by G0, identified and compared with its model; what is wrong ends it at rest."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from fdhil.commissioning import moving
+from fdhil.commissioning.master import Master
+from fdhil.commissioning.progress import Progress
+from fdhil.commissioning.record import CommissioningRecord, load_record
+from fdhil.commissioning.set_points import SetPoints
+from fdhil.commissioning.strokes import Room
+from fdhil.commissioning.trial import STEPS, Operator, Trial, try_axis
+from fdhil.config import MachineConfig
+from fdhil.errors import DeviceError, DriveFault
+from fdhil.records import ParameterSet
+from tests.drivers.peer import DrivePeer
+from tests.drivers.wire import machine
+from tests.integration.conftest import sign_off
+
+ROOM = Room(-2.0, 130.0)
+TRUE = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075}
+
+
+@dataclass
+class Bench:
+    """A simulated drive that is signed off, and what its operator was told and asked."""
+
+    peer: DrivePeer
+    config: MachineConfig
+    record: CommissioningRecord
+    steps: list[str] = field(default_factory=list)
+    asked: list[str] = field(default_factory=list)
+    saw: bool | None = None
+    at: Callable[[str], None] = lambda _step: None
+
+    def report(self, step: str) -> None:
+        self.steps.append(step)
+        self.at(step)
+
+    def look(self, question: str) -> bool | None:
+        self.asked.append(question)
+        return self.saw
+
+    def tried(self, room: Room = ROOM) -> Trial:
+        """Try the axis; afterwards it is off and stands."""
+        store = self.config.store.directory
+        try:
+            return try_axis(self.config, self.record, room, Operator(self.report, self.look), Progress(store, "X"))
+        finally:
+            assert self.peer.drive.power.state.name in ("SWITCH_ON_DISABLED", "FAULT")
+            assert self.peer.drive.dictionary.number(0x60B0) == 0
+
+    @property
+    def stands_mm(self) -> float:
+        return self.peer.drive.table_mm
+
+
+@pytest.fixture
+def quick_trial(quick_commissioning: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A shorter jog, fewer rapids, and no sensor that may deliver later."""
+    monkeypatch.setattr("fdhil.commissioning.strokes.JOG_MM", 1.0)
+    for name, value in {"TIMING_CYCLES": 100, "RAPIDS": 4, "REST_S": 0.6, "LAST_REST_S": 0.4}.items():
+        monkeypatch.setattr(f"fdhil.commissioning.trial.{name}", value)
+
+
+@pytest.fixture
+def bench(quick_trial: None, tmp_path: Path) -> Iterator[Bench]:
+    config = machine(tmp_path, bus={"interface": "virtual", "channel": uuid.uuid4().hex}, guard={"clock": "sync"})
+    with DrivePeer(config) as peer:
+        sign_off(config)
+        record = load_record(config.store.directory, "X")
+        assert record is not None
+        yield Bench(peer, config, record)
+
+
+def test_an_axis_is_tried_and_what_is_done_is_not_done_again(bench: Bench) -> None:
+    bench.saw = True
+    tried = bench.tried()
+    assert bench.steps == ["timing", "jog", "test rapids", "restore", "identification", "acceptance"]
+    assert bench.asked == ["The drive went 1 mm toward plus at 5 mm/s, and back. Is that what you saw the table do?"]
+    assert tried.found.keys() == set(STEPS)
+    assert tried.found["jog"]["seen"] == "yes"
+    assert tried.found["test rapids"]["moves"] == 4
+    assert abs(tried.found["test rapids"]["voltage_late_ms"]) < 0.05
+    for name, true in TRUE.items():
+        assert tried.found["identification"][name]["value"] == pytest.approx(true, rel=0.01), name
+    for move in tried.found["acceptance"]["moves"]:
+        assert move["left_rms_um"] < 0.1 * move["measured_rms_um"]
+    assert any(isinstance(outcome, ParameterSet) for outcome in tried.outcomes)
+    assert bench.stands_mm == pytest.approx(0.0, abs=0.05)
+
+    heard, bench.steps = len(bench.peer.heard), []
+    again = bench.tried()
+    assert bench.steps == []
+    assert {step: again.found[step] for step in STEPS[1:]} == {step: tried.found[step] for step in STEPS[1:]}
+    assert not {0x000, 0x080, 0x201} & set(bench.peer.heard[heard:])
+
+
+def test_what_the_operator_did_not_see_ends_it(bench: Bench) -> None:
+    bench.saw = False
+    with pytest.raises(DriveFault, match=r"the table did not move as the drive says; another direction: drive.sign"):
+        bench.tried()
+    assert "test rapids" not in bench.steps
+    assert bench.stands_mm == pytest.approx(0.0, abs=0.05)
+
+
+def test_a_wrong_sign_ends_it_before_a_rapid(bench: Bench) -> None:
+    bench.peer.drive.faults.signal("voltage").gain = -1.0
+    with pytest.raises(DriveFault, match="SignOrScale: voltage times current, and times speed is negative"):
+        bench.tried()
+    assert "test rapids" not in bench.steps
+
+
+def test_an_operator_who_stops_it_finds_the_axis_braked(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C in the middle of a rapid; the next trial goes on with the rapids."""
+
+    watch_power = moving.watch_power
+
+    def watch(masters: Sequence[Master], path: SetPoints) -> None:
+        if abs(path.position[0]) > 30.0 * 3276.8:
+            raise KeyboardInterrupt
+        watch_power(masters, path)
+
+    with monkeypatch.context() as impatient:
+        impatient.setattr(moving, "watch_power", watch)
+        with pytest.raises(KeyboardInterrupt):
+            bench.tried()
+    assert 30.0 < bench.stands_mm < 130.0
+    assert Progress(bench.config.store.directory, "X").done().keys() == {"jog"}
+
+
+def test_no_room_sends_nothing(bench: Bench) -> None:
+    bench.peer.heard.clear()
+    with pytest.raises(DriveFault, match="test rapids, which need 102 mm"):
+        bench.tried(Room(-50.0, 90.0))
+    assert bench.peer.heard == []
+
+
+def test_software_limits_that_are_nearer_are_respected(bench: Bench) -> None:
+    bench.peer.drive.set_object(0x607D, 1, -3277)
+    bench.peer.drive.set_object(0x607D, 2, 820_000)
+    sign_off(bench.config)
+    record = load_record(bench.config.store.directory, "X")
+    assert record is not None
+    bench.record = record
+    with pytest.raises(
+        DriveFault, match=r"stands at 0.000 mm and may go from -1.\d* to 250.\d* mm by its software limits"
+    ):
+        bench.tried()
+    assert bench.steps == ["timing"]
+
+
+def test_a_drive_that_was_set_up_anew_is_not_moved(bench: Bench) -> None:
+    bench.peer.drive.set_object(0x6065, 0, 30_000)
+    with pytest.raises(DeviceError, match="following-error window"):
+        bench.tried()
+    assert not {0x000, 0x080, 0x201} & set(bench.peer.heard)

@@ -1,0 +1,213 @@
+"""What an NC shows becomes what it does, by the rules of a profile: packaged ones, a user's own, and wrong values."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fdhil import tables
+from fdhil.drivers.nc.blocks import IsoBlocks, KlartextBlocks
+from fdhil.drivers.nc.profile import Condition, Translator
+from fdhil.drivers.nc.profile_file import profile_of, read_nc_profile
+from fdhil.errors import ConfigError, ProtocolError
+from fdhil.records import MoveKind, NcState
+
+RAPID: dict[str, dict[str, Any]] = {  # what each packaged profile is shown during a rapid
+    "mtconnect": {"execution": "ACTIVE", "block": "N20 G0 X10"},
+    "opc40502": {"status": 1, "g_functions": (90, 0, 54), "feed_override": 100.0},
+    "siemens": {"status": 3, "g_group_1": "G00", "feed_override": 100.0, "rapid_override": 50.0, "line": 7},
+    "heidenhain": {"state": 0, "block": "5 L X+10 FMAX", "feed_override": 100.0},
+    "beckhoff": {"state": 4, "g_function": 0, "line": 3, "feed_mm_min": 1e6 / 6},
+}
+OWN: dict[str, Any] = {
+    "title": "own",
+    "interface": "opcua",
+    "signals": {
+        "word": {"at": "ns=2;s=Word", "bit": 3},
+        "speed": {"at": "ns=2;s=Speed", "item": 1},
+        "feed_override": {"at": "ns=2;s=Override", "scale": 0.01, "optional": True},
+    },
+    "motion": [
+        {"kind": "hold", "when": {"word": [True]}},
+        {"kind": "rapid", "when": {"word": [False], "speed": {"at_least": 100.0}}},
+        {"kind": "rest", "when": {"speed": {"at_most": 0.0}}},
+    ],
+}
+
+
+def said(profile: str, shown: dict[str, Any]) -> NcState:
+    found = read_nc_profile(profile, "mtconnect" if profile == "mtconnect" else "opcua")
+    return Translator(found, "NC").state(shown, 10, 5)
+
+
+@pytest.mark.parametrize("name", tables.NC_PROFILES)
+def test_each_packaged_profile_knows_a_rapid_a_hold_and_a_rest(name: str) -> None:
+    profile = read_nc_profile(name, "mtconnect" if name == "mtconnect" else "opcua")
+    assert {rule.kind for rule in profile.rules} == {
+        MoveKind.HOLD, MoveKind.REST, MoveKind.RAPID, MoveKind.FEED, MoveKind.ARC,
+    }  # fmt: skip
+    assert profile.rules[0].kind is MoveKind.HOLD  # a hold is told before anything else
+    state = said(name, RAPID[name])
+    assert (state.motion, state.stamp_ns, state.error_ns) == (MoveKind.RAPID, 10, 5)
+    assert profile.notes, "it says what was never tried"
+
+
+@pytest.mark.parametrize("name", tables.NC_PROFILES)
+def test_without_any_one_signal_that_decides_nothing_is_a_rapid(name: str) -> None:
+    profile = read_nc_profile(name, "mtconnect" if name == "mtconnect" else "opcua")
+    for decides in {signal for rule in profile.rules for signal in rule.when}:
+        assert said(name, {**RAPID[name], decides: None}).motion is MoveKind.UNKNOWN
+
+
+def test_numbers_come_in_the_units_of_the_record() -> None:
+    state = said("siemens", RAPID["siemens"])
+    assert (state.feed_override, state.rapid_override, state.line, state.tool) == (1.0, 0.5, 7, None)
+    assert said("beckhoff", RAPID["beckhoff"]).feed_mm_min == pytest.approx(1e4)
+    assert said("siemens", {**RAPID["siemens"], "line": -1}).line is None
+    assert said("opc40502", {**RAPID["opc40502"], "line": "N0120"}).line == 120
+
+
+@pytest.mark.parametrize(
+    ("signal", "value"),
+    [("feed_override", 1e6), ("feed_override", -1.0), ("rapid_override", math.nan), ("line", 1.5), ("program", 3)],
+)
+def test_what_cannot_be_is_told_with_its_signal(signal: str, value: object) -> None:
+    with pytest.raises(ProtocolError, match=signal):
+        said("siemens", {**RAPID["siemens"], signal: value})
+
+
+def test_a_bit_an_item_and_bounds_decide() -> None:
+    translator = Translator(profile_of(OWN, "own"), "NC")
+
+    def kind(word: Any, *speeds: float) -> MoveKind:
+        return translator.state({"word": word, "speed": speeds}, 0, 1).motion
+
+    assert kind(0b0111, 0.0, 100.0) is MoveKind.RAPID
+    assert kind(0b1000, 0.0, 100.0) is MoveKind.HOLD
+    assert kind(0b0000, 0.0, 50.0) is MoveKind.UNKNOWN
+    assert kind(0b0000, 0.0, 0.0) is MoveKind.REST
+    assert kind(0b0000, 0.0) is MoveKind.UNKNOWN  # the array is too short
+    assert kind("text", 0.0, 100.0) is MoveKind.UNKNOWN
+
+
+shown = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=12) | st.tuples(st.integers())
+
+
+@given(st.sampled_from(sorted(tables.NC_PROFILES)), st.data())
+def test_whatever_is_shown_a_state_or_one_sentence_comes_of_it(name: str, data: st.DataObject) -> None:
+    profile = read_nc_profile(name, "mtconnect" if name == "mtconnect" else "opcua")
+    values = {signal: data.draw(shown) for signal in profile.signals}
+    try:
+        state = Translator(profile, "NC").state(values, 0, 1)
+    except ProtocolError:
+        return
+    rapid = next(rule for rule in profile.rules if rule.kind is MoveKind.RAPID)
+    plain = {key: value for key, value in values.items() if profile.signals[key].reads == "value"}
+    if state.motion is MoveKind.RAPID:
+        assert all(plain[key] is not None and rapid.when[key].holds(plain[key]) for key in rapid.when if key in plain)
+
+
+def changed(**changes: Any) -> dict[str, Any]:
+    return {**OWN, **changes}
+
+
+@pytest.mark.parametrize(
+    ("document", "path"),
+    [
+        (changed(interface="profinet"), "interface"),
+        (changed(colour="red"), "colour"),
+        (changed(signals={}), "signals"),
+        (changed(signals={"word": {"at": "ns=2;s=W", "byte": 3}}), "signals.word.byte"),
+        (changed(signals={"word": {"at": "ns=2;s=W", "scale": 0.0}}), "signals.word.scale"),
+        (changed(motion=[]), "motion"),
+        (changed(motion=[{"kind": "fast", "when": {"word": [True]}}]), "motion.0.kind"),
+        (changed(motion=[{"kind": "rapid", "when": {}}]), "motion.0.when"),
+        (changed(motion=[{"kind": "rapid", "when": {"mode": [1]}}]), "motion.1.when.mode"),
+        (changed(motion=[{"kind": "rapid", "when": {"feed_override": [1]}}]), "optional"),
+    ],
+)
+def test_a_wrong_profile_names_the_place(tmp_path: Path, document: dict[str, Any], path: str) -> None:
+    with pytest.raises(ConfigError, match=path) as caught:
+        profile_of(document, "own.toml")
+    assert "siemens" in str(caught.value)
+
+
+def test_a_profile_of_another_interface_is_refused() -> None:
+    with pytest.raises(ConfigError, match="is for mtconnect, and is used for opcua"):
+        read_nc_profile("mtconnect", "opcua")
+
+
+@pytest.mark.parametrize(
+    ("content", "text"), [(None, "cannot be read"), (b"\xff", "no TOML"), (b"#" * 70_000, "larger"), (b"a = [", "TOML")]
+)
+def test_a_file_that_cannot_be_used_is_told(tmp_path: Path, content: bytes | None, text: str) -> None:
+    path = tmp_path / "own.toml"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ConfigError, match=text):
+        read_nc_profile(str(path), "opcua")
+
+
+BLOCKS = [
+    ("N10 G0 X1", 10, MoveKind.RAPID),
+    ("X2 Y3", 11, MoveKind.RAPID),
+    ("G54", 12, MoveKind.RAPID),
+    ("g01 x3 f100", 13, MoveKind.FEED),
+    ("(G0 in a comment) X4", 14, MoveKind.FEED),
+    ("X5", 16, None),  # line 15 was not shown
+    ("X6", 17, None),
+    ("G03 X1 I1", 18, MoveKind.ARC),
+    ("G81 Z-5 R1", 19, None),  # a canned cycle has rapids and feeds
+    ("Z1", 20, None),
+    ("G00X5", 21, MoveKind.RAPID),
+    ("G0.1 X1", 40, None),
+    ("G0 X1 G1", 41, None),
+]
+
+
+def test_blocks_hold_their_word_as_far_as_none_is_left_out() -> None:
+    reader = IsoBlocks()
+    assert [reader.kind(text, line) for text, line, _ in BLOCKS] == [kind for *_, kind in BLOCKS]
+
+
+def test_without_lines_only_a_word_of_its_own_counts() -> None:
+    reader = IsoBlocks()
+    assert [reader.kind(text, None) for text in ("G0 X1", "X2", "G1 X3")] == [MoveKind.RAPID, None, MoveKind.FEED]
+
+
+@pytest.mark.parametrize(
+    ("text", "kind"),
+    [
+        ("12 L X+10 Y-5 R0 FMAX M3", MoveKind.RAPID),
+        ("L X+10 F500", MoveKind.FEED),
+        ("L Z+2 ; not FMAX", MoveKind.FEED),
+        ("C X+10 Y+5 DR+", MoveKind.ARC),
+        ("CR X+10 Y+5 R+5 DR-", MoveKind.ARC),
+        ("CC X+0 Y+0", None),
+        ("CYCL DEF 200 DRILLING", None),
+        ("CALL LBL 1", None),
+        ("TOOL CALL 3 Z S2000", None),
+        ("LBL 1", None),
+    ],
+)
+def test_klartext(text: str, kind: MoveKind | None) -> None:
+    assert KlartextBlocks().kind(text, None) is kind
+
+
+@given(st.lists(st.tuples(st.text(max_size=20), st.none() | st.integers(0, 5))))
+def test_any_text_is_read(blocks: list[tuple[str, int | None]]) -> None:
+    for reader in (IsoBlocks(), KlartextBlocks()):
+        for text, line in blocks:
+            assert reader.kind(text, line) in (None, MoveKind.RAPID, MoveKind.FEED, MoveKind.ARC)
+
+
+def test_conditions_of_numbers_and_arrays() -> None:
+    assert Condition((0,)).holds((5, 0))
+    assert not Condition((0,)).holds((5, 10))
+    assert Condition(at_least=3.0).holds("3.5")
+    assert not Condition(at_least=3.0).holds("three")

@@ -1,0 +1,185 @@
+"""A running LinuxCNC without a screen, and the stream of its demands into the simulated machine."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO, Any, Self
+
+from tests.program.linuxcnc_machine import AXIS, MACHINE, NOBODY
+from tests.sim.twin_process import TwinProcess
+
+HERE = Path(__file__).parent
+PATIENCE_S = 120.0
+AXES = "XYZ"
+# what the how-to gives for a real machine: a row of the demand for each servo cycle of 1 ms
+ROWS = r"""stdbuf -oL halsampler -t | mawk -W interactive '
+BEGIN { print "time_s,X_mm,Y_mm,Z_mm" } NF == 4 { printf "%.3f,%s,%s,%s\n", $1 / 1000, $2, $3, $4 }'"""
+
+
+class LinuxCnc:
+    """LinuxCNC, switched on and homed at 0; leaving the with block ends it.
+
+    ``hal`` are more lines of its HAL file, such as the one that loads the bridge. ``rows`` is where its demand comes
+    out, as ``fdhil sim --demand -`` reads it. AssertionError in LinuxCNC's own words when it does not do its part.
+    """
+
+    def __init__(self, speed_mm_s: float = 500.0, acceleration_mm_s2: float = 2000.0, hal: str = "") -> None:
+        self._alone = _alone()
+        self.folder = Path(tempfile.mkdtemp(prefix="fdhil-linuxcnc-"))
+        self._lines: IO[str] | None = None
+        self._write(speed_mm_s, acceleration_mm_s2, hal)
+        with socket.create_server(("127.0.0.1", 0)) as door:
+            self._start(door.getsockname()[1])
+            try:
+                self._meet(door)
+            except BaseException:
+                self.close()
+                raise
+
+    def _write(self, speed_mm_s: float, acceleration_mm_s2: float, hal: str) -> None:
+        (self.folder / "machine.hal").write_text((HERE / "machine.hal").read_text() + hal)
+        shutil.copy(HERE / "operator_by_wire.py", self.folder / "nobody_at_the_panel.py")
+        (self.folder / "nobody_at_the_panel.py").chmod(0o755)
+        limits = {"speed": speed_mm_s, "acceleration": acceleration_mm_s2}
+        ini = MACHINE.format(folder=self.folder, axes=AXES, joints=len(AXES), **limits)
+        ini += "".join(AXIS.format(letter=letter, number=number, **limits) for number, letter in enumerate(AXES))
+        (self.folder / "machine.ini").write_text(ini)
+        for name in ("machine.tbl", "machine.var", "log"):
+            (self.folder / name).touch()
+
+    def _start(self, port: int) -> None:
+        if os.geteuid() == 0:
+            for path in (self.folder, *self.folder.iterdir()):
+                os.chown(path, NOBODY, NOBODY)
+        environment = os.environ | {"HOME": str(self.folder), "OPERATOR_PORT": str(port)}
+        environment.pop("DISPLAY", None)
+        with (self.folder / "log").open("ab") as log:
+            self._child = self._as_nobody(
+                "linuxcnc", str(self.folder / "machine.ini"), environment=environment, log=log
+            )
+
+    def _as_nobody(
+        self, *command: str, environment: Mapping[str, str], log: IO[bytes], out: int | None = None
+    ) -> subprocess.Popen[bytes]:
+        """Start a command in a group of its own, as somebody else if this is root: LinuxCNC refuses to run as root."""
+        if os.geteuid() == 0:
+            command = ("setpriv", f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups", *command)
+        return subprocess.Popen(
+            command,
+            cwd=self.folder,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=log if out is None else out,
+            stderr=log,
+            start_new_session=True,
+        )
+
+    def _meet(self, door: socket.socket) -> None:
+        door.settimeout(0.2)
+        end = time.monotonic() + PATIENCE_S
+        while True:
+            try:
+                wire, _ = door.accept()
+                break
+            except TimeoutError:
+                assert self._child.poll() is None and time.monotonic() < end, self._log()
+        wire.settimeout(PATIENCE_S)
+        self._lines = wire.makefile("rw")
+        wire.close()
+        self._answer()
+
+    def _answer(self) -> None:
+        assert self._lines is not None
+        line = self._lines.readline()
+        told: dict[str, Any] = json.loads(line) if line else {"failed": "LinuxCNC has ended"}
+        assert "done" in told, f"{told}\n{self._log()}"
+
+    def _log(self) -> str:
+        files = ("log", "linuxcnc_print.txt", "linuxcnc_debug.txt")
+        return "\n".join((self.folder / name).read_text()[-2000:] for name in files if (self.folder / name).exists())
+
+    def order(self, order: str, **what: Any) -> None:
+        """Give an order and wait until the operator has done it."""
+        assert self._lines is not None
+        self._lines.write(json.dumps({"order": order, **what}) + "\n")
+        self._lines.flush()
+        self._answer()
+
+    def run(self, program: str) -> None:
+        """Run a program to its end; the machine stands then."""
+        self.start(program)
+        self.order("rest")
+
+    def start(self, program: str) -> None:
+        """Start a program."""
+        path = self.folder / "program.ngc"
+        path.write_text(program)
+        path.chmod(0o644)
+        self.order("run", program=str(path))
+
+    @contextmanager
+    def driving(self, twin: TwinProcess) -> Iterator[None]:
+        """Let what is ordered drive the simulated machine until the end of the block, which ends its demand."""
+        with (self.folder / "log").open("ab") as log:
+            sampling = self._as_nobody("sh", "-c", ROWS, environment=os.environ, log=log, out=subprocess.PIPE)
+        assert sampling.stdout is not None
+        pouring = threading.Thread(target=_pour, args=(sampling.stdout, twin), name="demand")
+        pouring.start()
+        try:
+            yield
+        finally:
+            _end(sampling)
+            pouring.join()
+            sampling.stdout.close()
+            twin.close_panel()
+
+    def close(self) -> None:
+        """End LinuxCNC: its operator leaves, and it cleans up after itself."""
+        if self._lines is not None:
+            self._lines.close()
+            with suppress(subprocess.TimeoutExpired):
+                self._child.wait(PATIENCE_S)
+        _end(self._child)
+        self._alone.close()
+        shutil.rmtree(self.folder)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _alone() -> IO[bytes]:
+    """Wait until no other test has a LinuxCNC: a computer runs one at a time."""
+    lock = (Path(tempfile.gettempdir()) / "fdhil-linuxcnc.lock").open("ab")
+    fcntl.flock(lock, fcntl.LOCK_EX)
+    return lock
+
+
+def _pour(rows: IO[bytes], twin: TwinProcess) -> None:
+    for line in rows:
+        twin.send_line(line.decode().rstrip())
+
+
+def _end(child: subprocess.Popen[bytes]) -> None:
+    """End a process and whatever it has started, if it has not ended."""
+    with suppress(ProcessLookupError):
+        os.killpg(child.pid, signal.SIGTERM)
+    try:
+        child.wait(PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        os.killpg(child.pid, signal.SIGKILL)
+        child.wait()

@@ -1,0 +1,127 @@
+#!/usr/bin/python3
+"""The operator of a LinuxCNC machine without a screen: switches it on, homes it, and does what is ordered by TCP.
+
+LinuxCNC starts this in place of its display, with the system's Python; it ends with the connection, and LinuxCNC with
+it. Orders and answers are lines of JSON: ``{"order": "run", "program": "/a/part.ngc"}`` gives ``{"done": "run"}`` or
+``{"failed": ...}`` in LinuxCNC's own words.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import linuxcnc  # type: ignore[import-not-found]  # the package's own module, for the system's Python alone
+
+JOINTS = 3
+PATIENCE_S = 300.0
+
+
+class Failed(Exception):
+    """LinuxCNC did not do what was ordered."""
+
+
+class Operator:
+    """Gives orders and waits, by LinuxCNC's status alone, until they are done."""
+
+    def __init__(self) -> None:
+        self.command, self.status, self.errors = linuxcnc.command(), linuxcnc.stat(), linuxcnc.error_channel()
+
+    def order(self, what: Callable[..., None], *arguments: Any) -> None:
+        """Give an order and wait until it is done."""
+        what(*arguments)
+        if self.command.wait_complete(PATIENCE_S) in (-1, linuxcnc.RCS_ERROR):
+            raise Failed(f"{what.__name__}{arguments} was not done; {self._words()}")
+
+    def wait(self, ready: Callable[[Any], bool]) -> None:
+        """Poll until something is so."""
+        end = time.monotonic() + PATIENCE_S
+        while time.monotonic() < end:
+            self.status.poll()
+            if ready(self.status):
+                return
+            time.sleep(0.005)
+        raise Failed(f"the machine did not get there; {self._words()}")
+
+    def _words(self) -> str:
+        said = []
+        while (error := self.errors.poll()) is not None:
+            said.append(str(error[1]).strip())
+        return "LinuxCNC says: " + ("; ".join(said) or "nothing")
+
+    def prepare(self) -> None:
+        """Switch the machine on and home it where it stands."""
+        self.order(self.command.state, linuxcnc.STATE_ESTOP_RESET)
+        self.order(self.command.state, linuxcnc.STATE_ON)
+        self.order(self.command.mode, linuxcnc.MODE_MANUAL)
+        for joint in range(JOINTS):
+            self.command.home(joint)
+        self.wait(lambda status: all(status.homed[:JOINTS]))
+        self.order(self.command.mode, linuxcnc.MODE_AUTO)
+
+    def run(self, program: str) -> None:
+        """Start a program from its first line."""
+        self.order(self.command.program_open, program)
+        self.order(self.command.auto, linuxcnc.AUTO_RUN, 0)
+        self.wait(lambda status: status.interp_state != linuxcnc.INTERP_IDLE)
+
+    def rest(self) -> None:
+        """Wait until the program is over and the machine stands."""
+        self.wait(lambda status: status.interp_state == linuxcnc.INTERP_IDLE and bool(status.inpos))
+        if words := self._words().removeprefix("LinuxCNC says: nothing"):
+            raise Failed(words)
+
+    def obey(self, order: dict[str, Any]) -> None:
+        """Do one order."""
+        match order["order"]:
+            case "run":
+                self.run(order["program"])
+            case "rest":
+                self.rest()
+            case "override":
+                self.command.feedrate(order["value"])
+            case "rapid_override":
+                self.command.rapidrate(order["value"])
+            case "pause":
+                self.command.auto(linuxcnc.AUTO_PAUSE)
+            case "resume":
+                self.command.auto(linuxcnc.AUTO_RESUME)
+            case "abort":
+                self.command.abort()
+            case other:
+                raise Failed(f"nobody knows the order {other!r}")
+
+
+def main() -> None:
+    """Serve whoever started LinuxCNC."""
+    with (
+        socket.create_connection(("127.0.0.1", int(os.environ["OPERATOR_PORT"]))) as wire,
+        wire.makefile("rw") as lines,
+    ):
+
+        def answer(**what: Any) -> None:
+            lines.write(json.dumps(what) + "\n")
+            lines.flush()
+
+        try:
+            operator = Operator()
+            operator.prepare()
+            answer(done="prepare")
+        except (Failed, linuxcnc.error) as error:
+            answer(failed=str(error))
+            sys.exit(1)
+        for line in lines:
+            order = json.loads(line)
+            try:
+                operator.obey(order)
+                answer(done=order["order"])
+            except (Failed, linuxcnc.error) as error:
+                answer(failed=str(error))
+
+
+main()

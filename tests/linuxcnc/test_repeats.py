@@ -1,0 +1,48 @@
+"""What fdhil learns in one run of a program holds for the next, if LinuxCNC orders the same again: does it?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdhil.records import Float
+from tests.linuxcnc.machine import LinuxCnc
+from tests.sim.twin_process import TwinProcess, write_config
+
+pytestmark = pytest.mark.debian
+
+PART = """G21 G90 G17 G64 P0.02
+F9000
+G1 X30 Y20
+G3 X10 Y40 I-20
+G1 X0 Y0
+G4 P0.3
+G0 X40 Y10
+G1 X60 Y30
+G0 X0 Y0
+M2
+"""
+
+
+def motions(reference_mm: Float) -> list[Float]:
+    """The demand (n, axes) of each stretch between two rests."""
+    moves = np.abs(np.diff(reference_mm, axis=0)).max(axis=1) > 0
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], moves.astype(int), [0]])))
+    return [reference_mm[a : b + 1] for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def test_between_two_rests_every_run_is_the_same_to_the_last_digit(tmp_path: Path) -> None:
+    """A rest may last a cycle more or less: LinuxCNC's dwell ends when its task looks at the clock."""
+    config = write_config(tmp_path, 'pace = "lockstep"\nmodbus = false')
+    with TwinProcess(config, "--demand", "-", "--trace", tmp_path / "trace.csv") as twin:
+        with LinuxCnc() as nc, nc.driving(twin):
+            for _ in range(3):
+                nc.run(PART)
+        assert twin.event("finished")["starved"] == 0
+    table = np.genfromtxt(tmp_path / "trace.csv", delimiter=",", names=True)
+    runs = motions(np.column_stack([table["X_reference_mm"], table["Y_reference_mm"]]))
+    assert len(runs) == 6
+    for here, there in ((0, 2), (0, 4), (1, 3), (1, 5)):
+        assert np.array_equal(runs[here], runs[there])
