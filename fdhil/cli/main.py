@@ -21,10 +21,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
         "fdhil.cli.init:init",
         "Make a machine's configuration from nothing: the NC's files, the drives, questions.",
     ),
-<<<<<<< HEAD
     "paper": ("fdhil.cli.paper:paper", "Reproduce the paper that fdhil goes back to, claim by claim."),
-=======
->>>>>>> 221a5e6a005198518506e567578cf56589057a1b
     "scan": ("fdhil.cli.commissioning:scan", "List what is on the bus: nodes, identity, state, heartbeat."),
     "check": ("fdhil.cli.commissioning:check", "Check that the machine on the bus is the one in the config."),
     "commission": ("fdhil.cli.commission:commission", "Commission the drives, step by step."),
