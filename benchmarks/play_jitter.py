@@ -27,6 +27,7 @@ from tests.sim.twin_process import write_config
 
 HERE = Path(__file__).parent
 SETPOINTS = "[axis.{}.setpoints]\ntravel_mm = [-50.0, 50.0]\n"
+HEARTBEAT = "[play]\nheartbeat_s = 0.2\n"  # it is the lateness that is asked for, and not whether a drive bears it
 DRIVES_PRIORITY = 40  # a real drive has a processor of its own
 
 
@@ -50,7 +51,7 @@ def machine(folder: Path, period_ms: float, interface: str | None) -> Iterator[P
     """Run the simulated machine; yields the path of the config with which others join it."""
     bus = f'interface = "socketcan"\nchannel = "{interface}"' if interface else 'interface = "socketcand"\nport = 0'
     path = write_config(folder, bus=bus, sim="modbus = false")
-    text = path.read_text() + SETPOINTS.format("X") + SETPOINTS.format("Y")
+    text = path.read_text() + SETPOINTS.format("X") + SETPOINTS.format("Y") + HEARTBEAT
     text = text.replace("sync_period_s = 0.001", f"sync_period_s = {period_ms / 1e3:g}")
     path.write_text(text)
     command = [sys.executable, "-m", "fdhil", "sim", str(path), "--json"]
