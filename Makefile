@@ -8,7 +8,7 @@ VCAN   := bash tests/integration/vcan-vm.sh -t 900
 # a child process need not translate fdhil anew
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo test test-vcan test-full loaded lint bench study lock clean
+.PHONY: help setup docs demo test test-vcan test-full loaded lint bench study lock clean
 
 help:            ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -44,9 +44,10 @@ test: setup      ## the default tests: in-process bus and loopback hub, no Debia
 test-vcan: setup ## the integration suite and the socket tests on a real SocketCAN interface
 	@$(VCAN) $(BIN)/python -m pytest -q -p no:cacheprovider -m socketcan tests
 
-test-full: test  ## adds the tests against programs of others: LinuxCNC (linuxcnc-uspace), a CANopen stack (nodejs, npm)
+test-full: test  ## adds the tests against programs of others: LinuxCNC (linuxcnc-uspace), a CANopen stack (nodejs, npm), a browser (chromium)
 	@command -v rs274 >/dev/null || { echo "make test-full needs rs274: apt-get install linuxcnc-uspace" >&2; exit 1; }
 	@command -v npm >/dev/null || { echo "make test-full needs npm: apt-get install nodejs npm" >&2; exit 1; }
+	@command -v chromium >/dev/null || { echo "make test-full needs chromium: apt-get install chromium" >&2; exit 1; }
 	@npm ci --prefix tests/foreign --ignore-scripts --no-audit --no-fund --silent
 	@$(BIN)/python -m pytest -q -m debian
 
@@ -61,6 +62,9 @@ lint: setup      ## ruff, mypy, import-linter, deptry, codespell, and the house 
 	@$(BIN)/deptry .
 	@$(BIN)/codespell
 	@! grep -n '://' requirements.lock || { echo "requirements.lock names an address" >&2; exit 1; }
+
+docs: setup      ## the site of the documents, in out/site; a broken link is an error
+	@$(BIN)/python -m sphinx -W --keep-going -q -b html docs out/site
 
 bench: setup     ## the benchmarks; results go to docs/benchmarks.md
 	@$(BIN)/python -m benchmarks

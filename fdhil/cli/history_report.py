@@ -1,78 +1,156 @@
-"""The stored history as one HTML page."""
+"""The stored history as one page: how the drives are, then why."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from fdhil.cli.history_course import BAND, MANY, AxisHistory, over_temperature, over_time
 from fdhil.cli.history_trends import moved, slope_rows
+from fdhil.cli.history_verdict import IN_ORDER, LATEST_HEAD, Refusals, latest_rows, sentences
 from fdhil.cli.parameter_view import DISPLAY, MEANING, cell, half_of
 from fdhil.config import MachineConfig
+from fdhil.report import Page, Section, Table, deliver
+from fdhil.report.chart import svg
+
+MOST_REVISIONS = 50
+WIDTH, HEIGHT = 4.8, 2.6  # of a course, inches
+MEANINGS: Mapping[str, str] = {
+    "R": "resistance of the winding",
+    "L": "inductance of the winding",
+    "K": "torque per ampere",
+    "Jt": "inertia at the motor's shaft",
+    "ft": "friction that grows with speed",
+    "Cd": "dry friction",
+    "friction_at_rapid": "all friction at the rapid speed",
+    "Jt/K": "inertia, in amperes",
+    "ft/K": "friction that grows with speed, in amperes",
+    "Cd/K": "dry friction, in amperes",
+}
 
 
 def write_report(
-    machine: MachineConfig, rows: Sequence[Mapping[str, Any]], health: Mapping[str, Mapping[str, Any]], path: Path
+    machine: MachineConfig,
+    histories: Sequence[AxisHistory],
+    refused: Mapping[str, Refusals],
+    path: Path,
+    pdf: Path | None = None,
 ) -> None:
-    """Write the report of revisions and health (see ``fdhil history --json``). FdhilError without extra ``report``."""
-    from fdhil.report import Page, write
-
-    axes = sorted({row["axis"] for row in rows})
-    sections = [_axis_section(axis, [row for row in rows if row["axis"] == axis], health.get(axis)) for axis in axes]
-    headline = [(f"axis {axis}", f"{sum(row['axis'] == axis for row in rows)} revisions") for axis in axes]
-    page = Page(f"{machine.machine.name}: identified drives", "parameters with 95 % intervals", headline, sections)
-    write(page, path)
-
-
-def _axis_section(axis: str, rows: Sequence[Mapping[str, Any]], told: Mapping[str, Any] | None) -> Any:
-    from fdhil.report import Section, Table
-
-    names = list(rows[0]["parameters"])
-    table = Table(
-        head=["revision", "time (UTC)", "degC", "windows", *(f"{name} {DISPLAY[name][0]}" for name in names)],
-        rows=[
-            [
-                str(row["revision"]),
-                row["time"][:19].replace("T", " "),
-                "" if row["temperature_c"] is None else f"{row['temperature_c']:.2f}",
-                str(row["windows_used"]),
-                *(cell(name, its["value"], half_of(its), " ") for name, its in row["parameters"].items()),
-            ]
-            for row in rows
-        ],
-        caption=f"Published parameter sets of axis {axis}; {MEANING}",
+    """Write the report of every axis that was ever seen. FdhilError without the extra ``report``."""
+    sections = [_verdict(machine, histories, refused)]
+    sections += [_axis_section(history, refused.get(history.axis, Refusals())) for history in histories]
+    page = Page(
+        f"{machine.machine.name}: how its drives are",
+        f"Identified from rapid moves; {_span(histories)}. {MEANING.capitalize()}.",
+        [_tile(history, refused.get(history.axis, Refusals())) for history in histories],
+        sections,
     )
-    tables = [table] if told is None else [table, *_health_tables(told)]
-    return Section(
-        f"Axis {axis}",
-        tables=tables,
-        figures=[("Course of each parameter", _svg(rows, {axis: told} if told else {}))],
-        wide=True,
+    deliver(page, path, pdf)
+
+
+def _span(histories: Sequence[AxisHistory]) -> str:
+    times = [window["time"] for history in histories for window in (history.told or {}).get("windows", ())]
+    times += [row["time"] for history in histories for row in history.rows]
+    return f"from {min(times)[:10]} to {max(times)[:10]}" if times else "nothing was identified yet"
+
+
+def _tile(history: AxisHistory, refused: Refusals) -> tuple[str, str]:
+    limits = (history.told or {}).get("limits", {})
+    if any(limit["reached"] for limit in limits.values()):
+        return f"axis {history.axis}", "limit reached"
+    if not (history.told or {}).get("windows") and not history.rows:
+        return f"axis {history.axis}", "not identified"
+    first = min((limit["date"] for limit in limits.values()), default=None)
+    said = sentences(history, refused)[0]
+    return (
+        f"axis {history.axis}",
+        f"limit {first[:10]}" if first else "in order" if said == IN_ORDER else "look below",
     )
 
 
-def _health_tables(told: Mapping[str, Any]) -> list[Any]:
+def _verdict(machine: MachineConfig, histories: Sequence[AxisHistory], refused: Mapping[str, Refusals]) -> Section:
+    """Return what to know first: a sentence or more of each axis, and its newest values beside what they should be."""
+    shares = machine.maintenance.model_dump()
+    rows = [[history.axis, text] for history in histories
+            for text in sentences(history, refused.get(history.axis, Refusals()))]  # fmt: skip
+    latest = [
+        Table(LATEST_HEAD, latest_rows(history, shares), f"Axis {history.axis}: the newest published parameters")
+        for history in histories
+        if history.rows
+    ]
+    return Section("How they are", "", [Table(("axis", "what to know"), rows), *latest])
+
+
+def _axis_section(history: AxisHistory, refused: Refusals) -> Section:
+    many = max((len(history.estimates(name)) for name in history.names()), default=0) > MANY
+    shown = "" if not many else (
+        f"Of more than {MANY} rapids the median of each day is drawn, and a band that holds its estimates from the "
+        f"{BAND[0]:.0f}th to the {BAND[1]:.0f}th percentile."
+    )  # fmt: skip
+    tables = [*_health_tables(history.told), *_refused_tables(refused), *_revision_tables(history.rows)]
+    return Section(f"Axis {history.axis}", shown, tables, _pictures(history))
+
+
+def _pictures(history: AxisHistory) -> list[tuple[str, str]]:
+    pictures = []
+    for name in history.names():
+        what = f"{name.partition('_')[0]}, {MEANINGS[name]}"
+        pictures.append((f"{what}, over time", svg(over_time(history, name), WIDTH, HEIGHT)))
+    for name in history.names():
+        if (course := over_temperature(history, name)) is not None:
+            what = f"{name.partition('_')[0]}, {MEANINGS[name]}"
+            caption = f"{what}, over the temperature of the slide-way, which it follows"
+            pictures.append((caption, svg(course, WIDTH, HEIGHT)))
+    return pictures
+
+
+def _health_tables(told: Mapping[str, Any] | None) -> list[Table]:
     """Return slopes with dates of the limits, and the changes, each where there are any."""
-    from fdhil.report import Table
-
+    if told is None:
+        return []
     slopes = Table(
         head=["parameter", "per kelvin", "per day", "maintenance limit"],
         rows=slope_rows(told),
         caption=f"Slopes since the last change; {MEANING}",
     )
     changes = Table(
-        head=["time", "window", "parameters", "likely cause"],
-        rows=[[c["time"], str(c["window"]), moved(c), c["cause"]] for c in told["changes"]],
+        head=["time", "window", "what moved", "likely cause"],
+        rows=[[_minute(c["time"]), str(c["window"]), moved(c), c["cause"]] for c in told["changes"]],
         caption="Changes",
     )
     return [table for table in (slopes, changes) if table.rows]
 
 
-def _svg(rows: Sequence[Mapping[str, Any]], health: Mapping[str, Mapping[str, Any]]) -> str:
-    from fdhil.cli.history_plot import courses
+def _refused_tables(refused: Refusals) -> list[Table]:
+    if not refused.refused:
+        return []
+    rows = [[code, str(count), text, time] for code, count, text, time in refused.reasons]
+    caption = f"Rapids that were not believed: {refused.refused} of {refused.seen}"
+    return [Table(("reason", "how often", "what the last one said", "when"), rows, caption)]
 
-    sink = io.StringIO()
-    courses(rows, health).savefig(sink, format="svg")
-    text = sink.getvalue()
-    return text[text.index("<svg") :]
+
+def _revision_tables(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
+    if not rows:
+        return []
+    names = list(dict.fromkeys(name for row in rows for name in row["parameters"]))
+    head = ["revision", "time (UTC)", "degC", "windows", *(f"{name} {DISPLAY[name][0]}" for name in names)]
+    newest = rows[-MOST_REVISIONS:][::-1]
+    left_out = len(rows) - len(newest)
+    cells = [
+        [
+            str(row["revision"]),
+            _minute(row["time"]),
+            "" if row["temperature_c"] is None else f"{row['temperature_c']:.2f}",
+            str(row["windows_used"]),
+            *(cell(name, its["value"], half_of(its), " ") for name, its in row["parameters"].items()),
+        ]
+        for row in newest
+    ]
+    more = f"; {left_out} older ones are left out (fdhil history --json lists them)" if left_out else ""
+    caption = f"Published parameter sets, newest first{more}; {MEANING}"
+    return [Table(head, cells, caption, folded=f"{len(rows)} published parameter sets")]
+
+
+def _minute(time: str) -> str:
+    return time[:16].replace("T", " ")

@@ -45,9 +45,14 @@ def cell(name: str, value: float | None, half: float | None, between: str = "\n"
     if -1 <= digits <= 6:
         places = max(0, digits)
         return f"{shown:.{places}f}{between}±{width:.{places}f}"
-    return f"{shown:.{max(1, min(6, _figures(shown, width)))}g}{between}±{width:.1g}"
+    if digits < 0 and abs(shown) < 1e6:
+        return f"{round(shown, digits):.0f}{between}±{round(width, digits):.0f}"
+    return _with_exponent(shown, width, between)
 
 
-def _figures(value: float, width: float) -> int:
-    """Return how many figures of a value say something beside an interval of this width."""
-    return math.floor(math.log10(abs(value) / width)) + 2 if abs(value) > width else 1
+def _with_exponent(value: float, width: float, between: str) -> str:
+    """Return value and half width with one exponent for both, to the same place."""
+    exponent = math.floor(math.log10(max(abs(value), width)))
+    places = max(0, exponent - math.floor(math.log10(width)))
+    scale = 10.0**exponent
+    return f"({value / scale:.{places}f}{between}±{width / scale:.{places}f})e{exponent}"

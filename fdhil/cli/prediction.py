@@ -38,6 +38,7 @@ class Asked:
     from_history: bool
     out: Path | None
     report: Path | None
+    pdf: Path | None
     as_json: bool
 
 
@@ -61,6 +62,7 @@ def _shared(wanted: Callable[..., int]) -> Callable[..., int]:
             click.option(
                 "--report", type=OutputFile(), help="Write an HTML page: a map of the error, its worst places."
             ),
+            click.option("--pdf", type=OutputFile(".pdf"), help="Print that page as PDF (needs chromium)."),
             click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else."),
         )
     ):
@@ -109,8 +111,7 @@ def predict(asked: Asked, sensitivity: bool, tolerance_um: float | None, since: 
         columns["contour_std_um"] = (std_um, 4)
     if asked.out is not None:
         _write(asked.out, columns)
-    if asked.report is not None:
-        _report(asked.report, asked, config, predicted)
+    _report(asked, config, predicted)
     if asked.as_json:
         click.echo(json.dumps(document, allow_nan=False))
         return 0
@@ -177,8 +178,7 @@ def correct(asked: Asked, method: str | None) -> int:
     predicted = forecast.predicted_gain(planned, models, config, asked.from_history)
     if asked.out is not None:
         _write(asked.out, _correction_columns(planned))
-    if asked.report is not None:
-        _report(asked.report, asked, config, planned, predicted)
+    _report(asked, config, planned, predicted)
     if asked.as_json:
         click.echo(json.dumps(_correction_document(str(asked.program), planned, predicted, models), allow_nan=False))
     else:
@@ -186,12 +186,12 @@ def correct(asked: Asked, method: str | None) -> int:
     return 1 if planned.refused else 0
 
 
-def _report(
-    path: Path, asked: Asked, config: MachineConfig, found: Prediction | Correction, predicted: Gain | None = None
-) -> None:
-    """Write the page of a prediction or correction; FdhilError without the extra ``report``."""
+def _report(asked: Asked, config: MachineConfig, found: Prediction | Correction, predicted: Gain | None = None) -> None:
+    """Write the page of a prediction or correction where one was asked for; FdhilError without the extra ``report``."""
+    if asked.report is None and asked.pdf is None:
+        return
     from fdhil.records import Prediction
-    from fdhil.report import require, write
+    from fdhil.report import deliver, require
 
     require()
     from fdhil.report.path import correction_page, prediction_page
@@ -203,9 +203,10 @@ def _report(
     elif asked.model_path is not None:
         parameters = f"the parameters of {asked.model_path.name}"
     if isinstance(found, Prediction):
-        write(prediction_page(name, machine, found, parameters), path)
+        page = prediction_page(name, machine, found, parameters)
     else:
-        write(correction_page(name, machine, found, parameters, predicted), path)
+        page = correction_page(name, machine, found, parameters, predicted)
+    deliver(page, asked.report, asked.pdf)
 
 
 def inputs(

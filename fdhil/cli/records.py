@@ -18,6 +18,10 @@ from fdhil.errors import RecordingError
 from fdhil.store import suffixes
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from fdhil.cli.history_course import AxisHistory
+    from fdhil.cli.history_verdict import Refusals
     from fdhil.records import Outcome, Window
     from fdhil.store.rows import Revision
 
@@ -129,7 +133,7 @@ def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) ->
     if plot is not None:
         from fdhil.cli.history_plot import write_plot
 
-        write_plot(rows, told, plot)
+        write_plot(_by_axis(machine, rows, told, ()), plot)
     if as_json:
         parts = {key: {name: of_axis[key] for name, of_axis in told.items()} for key in HEALTH}
         click.echo(json.dumps({"schema": "fdhil-history-1", "revisions": rows} | parts))
@@ -152,6 +156,37 @@ def _history(machine: machine_config.MachineConfig, axis: str | None) -> tuple[l
 
     with History.read(machine.store.directory, partial(click.echo, err=True)) as stored:
         return [_row(revision) for revision in stored.revisions(axis)], health(stored, machine, axis)
+
+
+def _refused(machine: machine_config.MachineConfig) -> dict[str, Refusals]:
+    """Return by axis which of the newest windows were not believed."""
+    from fdhil.cli.history_trends import NEWEST_WINDOWS
+    from fdhil.cli.history_verdict import refusals_of
+    from fdhil.store.history import History
+
+    with History.read(machine.store.directory) as stored:
+        windows = stored.windows(limit=NEWEST_WINDOWS)
+    axes = dict.fromkeys(window.axis for window in windows)
+    return {axis: refusals_of([window for window in windows if window.axis == axis]) for axis in axes}
+
+
+def _by_axis(
+    machine: machine_config.MachineConfig, rows: list[dict[str, Any]], told: dict[str, Any], seen: Iterable[str]
+) -> list[AxisHistory]:
+    """Return the history of each axis that is known of, in the order of the config."""
+    from fdhil.cli.history_course import AxisHistory
+
+    known = {*(row["axis"] for row in rows), *told, *seen}
+    axes = [axis for axis in machine.axis if axis in known] + sorted(known - set(machine.axis))
+    return [
+        AxisHistory(
+            axis,
+            [row for row in rows if row["axis"] == axis],
+            told.get(axis),
+            machine.axis[axis].nominal.model_dump() if axis in machine.axis else {},
+        )
+        for axis in axes
+    ]
 
 
 def _row(revision: Revision) -> dict[str, Any]:
@@ -193,13 +228,15 @@ def export(recording: Path, out: Path, format_name: str | None, columns: Path | 
 @click.command(cls=Writing)
 @click.argument("config", type=FILE)
 @click.option("--out", required=True, type=OutputFile(), help="The HTML file to write.")
+@click.option("--pdf", type=OutputFile(".pdf"), help="Also print it as PDF (needs chromium).")
 @AS_JSON
-def report(config: Path, out: Path, as_json: bool) -> None:
+def report(config: Path, out: Path, pdf: Path | None, as_json: bool) -> None:
     """Write an HTML report of the stored history of CONFIG's machine."""
     machine = machine_config.load(config)
     from fdhil.cli.history_report import write_report
 
     rows, told = _history(machine, None)
-    write_report(machine, rows, told, out)
+    refused = _refused(machine)
+    write_report(machine, _by_axis(machine, rows, told, refused), refused, out, pdf)
     if as_json:
         click.echo(json.dumps({"schema": "fdhil-report-1", "file": str(out), "revisions": len(rows)}))

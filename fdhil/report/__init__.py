@@ -1,8 +1,9 @@
-"""Reports: the paper's figures for a machine, and one self-contained HTML page around them.
+"""Reports: pictures for a machine, and one self-contained HTML page around them, printed as PDF where wanted.
 
 Needs the extra ``report`` (matplotlib, jinja2); importing this package does not import them.
 """
 
-from fdhil.report.page import Page, Section, Table, require, write
+from fdhil.report.page import Page, Section, Table, html, require, write
+from fdhil.report.pdf import deliver, find_browser, write_pdf
 
-__all__ = ["Page", "Section", "Table", "require", "write"]
+__all__ = ["Page", "Section", "Table", "deliver", "find_browser", "html", "require", "write", "write_pdf"]

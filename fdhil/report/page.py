@@ -1,24 +1,29 @@
-"""One self-contained HTML page: no script, no font, no picture from elsewhere."""
+"""One self-contained HTML page: it carries its pictures and its scripts, and loads nothing from elsewhere."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
+from xml.sax.saxutils import quoteattr
 
 from fdhil.errors import FdhilError
+from fdhil.report.typography import typeset, typeset_markup
 from fdhil.store.output import open_output
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table: ``head`` names the columns, each row has as many cells."""
+    """A table: ``head`` names the columns, each row has as many cells; ``folded`` is the line it opens from."""
 
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
     caption: str = ""
+    folded: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,11 +60,38 @@ def require() -> None:
 
 def write(page: Page, path: Path) -> None:
     """Render ``page`` to ``path``, whole or not at all. OutputError when it cannot be written."""
+    text = html(page)
+    with open_output(path) as file:
+        file.write(text.encode())
+
+
+def html(page: Page, now: datetime | None = None) -> str:
+    """Return the page as one HTML document. FdhilError without the extra ``report``."""
     require()
     from jinja2 import Environment
 
-    template = files("fdhil.report").joinpath("page.html.j2").read_text("utf-8")
+    made_by = f"fdhil {version('fdhil')}"
+    written = (now or datetime.now(UTC)).strftime("%Y-%m-%d %H:%M UTC")
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    text = environment.from_string(template).render(page=page, is_word=_is_word)
-    with open_output(path) as file:
-        file.write(text.encode())
+    environment.filters.update(typeset=typeset, picture=_picture)
+    return environment.from_string(_carried("page.html.j2")).render(
+        page=page,
+        is_word=_is_word,
+        made_by=made_by,
+        stamp=f"Written {written} by {made_by}",
+        live=any("<metadata>" in svg for section in page.sections for _, svg in section.figures),
+        uplot_css=_carried("uplot/uPlot.min.css"),
+        uplot_js=_carried("uplot/uPlot.iife.min.js"),
+        page_js=_carried("page.js"),
+    )
+
+
+def _carried(name: str) -> str:
+    return files("fdhil.report").joinpath(name).read_text("utf-8")
+
+
+def _picture(svg: str, caption: str) -> str:
+    """Return a picture with its text typeset; one that does not say what it shows says its caption."""
+    if "aria-label=" not in svg[:1000]:
+        svg = svg.replace("<svg", f'<svg role="img" aria-label={quoteattr(caption)}', 1)
+    return typeset_markup(svg)

@@ -10,7 +10,7 @@ from fdhil.prediction.contour import WINDOW_S
 from fdhil.prediction.gain import Gain, plus_minus
 from fdhil.records import Correction, Float, Prediction, Trajectory, Zone
 from fdhil.report import figures
-from fdhil.report.figures import Curve
+from fdhil.report.figures import Curve, Place
 from fdhil.report.page import Page, Section, Table
 
 MOST_PLACES, FEW_PLACES = 8, 4
@@ -49,7 +49,7 @@ def correction_page(
     else:
         cases = [("uncorrected", before), (f"{planned.method} correction", after)]
         told = ""
-        verdict = [*_figures("corrected, predicted", after), *_promise(predicted)]
+        verdict = _promise(after, predicted)
     return Page(
         title=f"Correction of {name}",
         subtitle=f"Planned for {machine} with the method {planned.method}{_with(parameters)}; nothing was sent.",
@@ -63,13 +63,17 @@ def correction_page(
     )
 
 
-def _promise(predicted: Gain | None) -> list[tuple[str, str]]:
-    """Say how far the prediction of the gain goes; the model against itself is no gain."""
+def _promise(after: Prediction, predicted: Gain | None) -> list[tuple[str, str]]:
+    """Say what is predicted to be left, and how far that goes; the model against itself is no gain."""
+    left, largest = _figures("corrected, predicted", after)
     if predicted is None or predicted.half_um is None:
-        return [("how well the model fits this machine", "not known here")]
+        return [left, largest, ("how well the model fits this machine", "not known here")]
     sure = predicted.at_least
-    spread = [("95 % interval of it, RMS", plus_minus(predicted.half_um, 2) + " um")]
-    return [*spread, ("predicted smaller by at least", "not sure" if sure is None else f"{sure:.1f} x")]
+    return [
+        (f"{left[0]}, with its 95 % interval", f"{after.rms_um:.2f} {plus_minus(predicted.half_um, 2)} um"),
+        largest,
+        ("predicted smaller by at least", "not sure" if sure is None else f"{sure:.1f} x"),
+    ]
 
 
 def _with(parameters: str) -> str:
@@ -114,17 +118,21 @@ def _flat(reference: Trajectory, positions: Prediction | None, plane: tuple[str,
 def _along(cases: Sequence[tuple[str, Prediction]]) -> Section:
     reference = cases[0][1].reference
     pictures = []
+    largest, least = figures.common_scale([predicted.contour_um for _, predicted in cases])
+    same = "" if len(cases) == 1 else "; the colours mean the same in each of these maps"
     for plane in planes(reference):
+        path = _flat(reference, None, plane)
+        named = [Place(str(k), *path[row]) for k, (_, row) in enumerate(worst_places(cases[0][1]), 1)]
         for label, predicted in cases:
-            largest = float(predicted.contour_um.max())
-            caption = f"{label}, plane {plane[0]}{plane[1]}: the colours reach to {_um(largest)}"
-            path = _flat(reference, None, plane)
-            pictures.append((caption, figures.error_map(path, predicted.contour_um, largest, plane)))
+            caption = f"{label}, plane {plane[0]}{plane[1]}: {_um(float(predicted.contour_um.max()))} at most{same}"
+            picture = figures.error_map(path, predicted.contour_um, largest, plane, named, least)
+            pictures.append((caption, picture))
     errors = {label: predicted.contour_um for label, predicted in cases}
     pictures.append(("Contour error over time", figures.contour_errors(reference.dt_s, errors)))
     return Section(
         "Where the error is",
-        "The contour error is the distance of the table from the path, wherever on the path it should be.",
+        "The contour error is the distance of the table from the path, wherever on the path it should be. The numbers "
+        "are the places that are enlarged below.",
         figures=pictures,
     )
 
@@ -153,8 +161,11 @@ def worst_places(predicted: Prediction) -> list[tuple[Zone, int]]:
 
 def _places(cases: Sequence[tuple[str, Prediction]]) -> Section:
     before = cases[0][1]
-    pictures = [_place(cases, zone, row) for zone, row in worst_places(before)]
-    text = "The largest zones, in the order of the path (paper: Figures 11 to 20)."
+    pictures = []
+    for number, (zone, row) in enumerate(worst_places(before), 1):
+        caption, picture = _place(cases, zone, row)
+        pictures.append((f"{number}: {caption}", picture))
+    text = "The largest zones, in the order of the path, with the numbers that they have in the map."
     return Section("Its worst places enlarged", text if pictures else "No zone stands out.", figures=pictures)
 
 
@@ -218,15 +229,17 @@ def nearest_mm(predicted: Prediction, rows: slice) -> Float:
 def _zones(before: Prediction, after: Prediction | None) -> Section:
     reference = before.reference
     largest = sorted(before.zones, key=lambda zone: -zone.max_um)[:MOST_ROWS]
+    numbers = {row: str(k) for k, (_, row) in enumerate(worst_places(before), 1)}
     rows = []
     for zone in sorted(largest, key=lambda zone: zone.start_s):
         row = before.worst_row(zone)
-        cells = [f"{zone.start_s:.2f} - {zone.end_s:.2f}", str(reference.line[row] or ""), zone.where, zone.cause]
+        times = f"{zone.start_s:.2f} to {zone.end_s:.2f}"
+        cells = [numbers.get(row, ""), times, str(reference.line[row] or ""), zone.where, zone.cause]
         cells.append(f"{zone.max_um:.1f}")
         rows.append(cells if after is None else [*cells, f"{after.contour_um[before.rows(zone)].max():.2f}"])
     if not rows:
         return Section("Zones", "No zone stands out.")
     left_out = len(before.zones) - len(rows)
     text = f"The {MOST_ROWS} largest; {left_out} smaller ones are left out (--json lists them)." if left_out else ""
-    head = ["time s", "line", "where", "cause", "max um"]
-    return Section("Zones", text, [Table(head if after is None else [*head, "corrected, max um"], rows)])
+    head = ["place", "time (s)", "line", "where", "cause", "at most (um)"]
+    return Section("Zones", text, [Table(head if after is None else [*head, "corrected, at most (um)"], rows)])

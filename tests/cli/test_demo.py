@@ -71,7 +71,7 @@ def test_what_was_believed_stands_beside_the_truth() -> None:
     assert realistic_page.headline(believed) == ("on a realistic machine smaller by", "4.0 x")
     rows = realistic_page.parameter_rows(believed)
     assert [row[1] for row in rows] == [*PARAMETERS, "load"]
-    assert rows[-1][3] == "2.5 ±0.002 N.m"
+    assert rows[-1][3] == "2.500 ±0.002 N.m"
     assert realistic_page.verdict_rows(believed)[0] == ["X", "4 of 4", "the six and load", ""]
     told = _realistic(believed)
     assert told["axes"]["X"]["terms"] == {"load": 2.5}

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import html
 import json
+import re
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -100,9 +102,67 @@ def test_the_plot_and_the_report_show_it(worn: Path, tmp_path: Path, capsys: Any
     assert (tmp_path / "plot.png").stat().st_size > 50_000
     assert fdhil("report", worn, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
     page = (tmp_path / "report.html").read_text()
-    assert 'class="figures wide"' in page
     for words in ("Slopes since the last change", "a changed load", "maintenance limit"):
         assert words in page
+
+
+def test_the_report_begins_with_how_the_drives_are(worn: Path, tmp_path: Path, capsys: Any) -> None:
+    """What to do next, the newest values beside nominal ones, then a course of each parameter with both."""
+    document = json.loads(fdhil("history", worn, "--json", capsys=capsys)[1])
+    assert fdhil("report", worn, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
+    page = (tmp_path / "report.html").read_text()
+    verdict, _, axis = page.partition("<h2>Axis X</h2>")
+    limit = document["limits"]["X"]["ft"]
+    assert f"ft will reach its limit of {1e3 * limit['limit']:.4g} mN·m·s about {limit['date'][:10]}" in verdict
+    cells = re.findall(r"<tr><td[^>]*>Jt</td>(.*?)</tr>", verdict, re.S)
+    assert "+13." in cells[0]
+    assert "g·m²" in cells[0]
+    assert [p for p in PARAMETERS if f"<figcaption>{p}, " not in axis] == []
+    (inertia,) = re.findall(r"<figure>((?:(?!<figure>).)*)<figcaption>Jt, ", axis, re.S)
+    told = json.loads(html.unescape(re.findall(r"<metadata>(.*?)</metadata>", inertia, re.S)[0]))
+    assert told["panels"][0]["levels"] == [["nominal", 75]]
+    assert [label for label, _ in told["marks"]] == ["a changed load"]
+
+
+def test_rapids_that_were_not_believed_are_in_the_report(tmp_path: Path, capsys: Any) -> None:
+    """An axis of which nothing was believed is seen too, and why."""
+    path = tmp_path / "machine.toml"
+    path.write_text(BENCH)
+    with History.open(config_of(tmp_path, ("X", "Y")).store.directory) as history:
+        for k in range(3):
+            stamp = Stamp(START_S + 86_400 * k, "boot", k)
+            history.add_window(outcome(accepted=False, of=window(axis="Y")), "", stamp)
+            history.add_window(outcome(of=window(axis="X")), "", stamp)
+    assert fdhil("report", path, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
+    page = (tmp_path / "report.html").read_text()
+    assert "None of 3 rapids was believed, most often (3 ×) because of MissingStage(cruise): no plateau." in page
+    assert "Rapids that were not believed: 3 of 3" in page
+    assert "<dt>axis Y</dt><dd>not identified</dd>" in page
+    assert "<h2>Axis Y</h2>" in page
+
+
+def test_a_long_store_is_a_small_page(tmp_path: Path, capsys: Any) -> None:
+    """Of many rapids each day's median is drawn, and where most of its estimates lie."""
+    path = tmp_path / "machine.toml"
+    path.write_text(BENCH)
+    rng = np.random.default_rng(1)
+    made = outcome(of=window())
+    assert made.estimate is not None
+    with History.open(config_of(tmp_path, ("X", "Y")).store.directory) as history:
+        for k in range(240):
+            values = made.estimate.values * (1 + 0.01 * rng.standard_normal(6))
+            estimate = replace(made.estimate, values=frozen(values))
+            history.add_window(replace(made, estimate=estimate), "", Stamp(START_S + 7_200 * k, "boot", k))
+    assert fdhil("report", path, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
+    page = (tmp_path / "report.html").read_text()
+    assert len(page) < 600_000
+    told = json.loads(html.unescape(re.findall(r"<metadata>(.*?)</metadata>", page, re.S)[0]))
+    (median, *_) = told["panels"][0]["traces"]
+    assert median["label"].startswith("median of the day")
+    assert len(median["y"]) == 21
+    assert all(
+        low < middle < high for low, middle, high in zip(median["low"], median["y"], median["high"], strict=True)
+    )
 
 
 def test_an_axis_that_there_is_not_is_refused(worn: Path, capsys: Any) -> None:

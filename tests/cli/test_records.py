@@ -192,7 +192,8 @@ def test_a_report_is_one_page_without_anything_from_elsewhere(machine: Path, tmp
     page = out.read_text()
     assert "Axis X" in page
     assert "<svg" in page
-    assert "<script" not in page
+    assert "<script " not in page  # none with an address
+    assert "default-src 'none'" in page  # and the browser is told to load nothing
 
 
 @pytest.mark.parametrize("command", ["replay", "history", "report", "export", "run", "status", "arm", "disarm"])

@@ -190,6 +190,11 @@ def test_small_pictures() -> None:
     assert cell("R", 0.5, half_of({"low": 0.488, "high": 0.512}), " ") == "500 ±12"
     assert cell("K", 0.8, half_of({"low": None, "high": None}), " ") == "0.8 (no ±)"
     assert cell("K", None, None) == "-"
+    # value and half width end at the same place, whatever their size
+    assert cell("bus_sag", 1.4234e-6, 6.4e-8, " ") == "(1.42 ±0.06)e-6"
+    assert cell("bus_sag", 0.0053, 2.3e-5, " ") == "0.00530 ±0.00002"
+    assert cell("bus_sag", 12_345.0, 234.0, " ") == "12300 ±200"
+    assert cell("bus_sag", 1.2345e7, 2.34e5, " ") == "(1.23 ±0.02)e7"
 
 
 def test_lines_of_the_daemon_as_json(capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,7 +14,8 @@ from fdhil.correction import plan
 from fdhil.prediction import predict
 from fdhil.prediction.models import nominal_models
 from fdhil.records import Correction, frozen
-from fdhil.report import figures, write
+from fdhil.report import figures, maps, write
+from fdhil.report.drawing import drawing
 from fdhil.report.path import APART_MM, correction_page, nearest_mm, planes, prediction_page, worst_places
 from tests.bench import bench_config
 from tests.paths import bench_trajectory, smooth, trajectory
@@ -122,11 +123,11 @@ def test_points_hold_the_largest_error_of_each_place() -> None:
     circle = 50 * np.column_stack([np.cos(angle), np.sin(angle)])
     error = np.ones(n)
     error[n // 7] = 80.0
-    with figures._drawing() as (_, axes, _svg):
-        seen = figures._as_points(axes, circle, error).get_array()
+    with drawing() as made:
+        seen = maps._as_points(made.axes, circle, error).get_array()
     assert seen is not None
     row, column = np.unravel_index(int(np.argmax(seen)), seen.shape)
-    at = circle.min(axis=0) + (np.array([column, row]) + 0.5) * np.ptp(circle, axis=0).max() / figures.POINTS
+    at = circle.min(axis=0) + (np.array([column, row]) + 0.5) * np.ptp(circle, axis=0).max() / maps.POINTS
     assert seen.max() == 80.0
     assert np.linalg.norm(at - circle[n // 7]) < 1.0
 

@@ -80,11 +80,12 @@ def test_the_page_needs_nothing_from_elsewhere(tmp_path: Path) -> None:
     write(page, tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text("utf-8")
     assert "A &lt;machine&gt;" in text
-    assert "3.5 um" in text
+    assert "3.5 µm" in text
     assert "<td>2</td>" in text
     loaded = re.findall(r"""(?:src|href)=["']([^"'#][^"']*)""", text)
     assert loaded == []
-    assert "<script" not in text
+    assert re.findall(r"<script[^>]", text) == []  # none with an address
+    assert "default-src 'none'" in text  # and the browser is told to load nothing
     assert not list(tmp_path.rglob("*.part"))
 
 

@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 @click.option(
     "--realtime", is_flag=True, help="Run the twin on the host's clock instead of as fast as the bus answers."
 )
+@click.option("--pdf", is_flag=True, help="Print the report as report.pdf too (needs chromium).")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of tables.")
-def demo(out: Path, realtime: bool, as_json: bool) -> int:
+def demo(out: Path, realtime: bool, pdf: bool, as_json: bool) -> int:
     """Run the whole loop on the simulated machine: no hardware, no root, under a minute.
 
     Starts the twin (drives, sensors, NC), the guard and the daemon; commissions the drives; shuttles the axes and
@@ -33,16 +34,19 @@ def demo(out: Path, realtime: bool, as_json: bool) -> int:
     from fdhil.cli.demo.loop import run_loop
     from fdhil.cli.demo.realistic import run_realistic
     from fdhil.cli.demo.report import page
-    from fdhil.report import write
+    from fdhil.report import deliver, find_browser
 
     def say(text: str) -> None:
         if not as_json or sys.stderr.isatty():
             click.echo(text, err=as_json)
 
+    if pdf:
+        find_browser()  # said before the work, not after it
     loop = run_loop(out, realtime, say)
     realistic = run_realistic(out / "realistic", realtime, say)
     report = out / "report.html"
-    write(page(loop, [realistic_page.headline(realistic)], [realistic_page.section(realistic)]), report)
+    laid_out = page(loop, [realistic_page.headline(realistic)], [realistic_page.section(realistic)])
+    deliver(laid_out, report, report.with_suffix(".pdf") if pdf else None)
     if as_json:
         click.echo(json.dumps({**_document(loop, report), "realistic": _realistic(realistic)}))
     else:

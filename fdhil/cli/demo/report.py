@@ -123,7 +123,8 @@ def identified_rows(axis: str, truth: Parameters, found: Published) -> list[list
         found_text, deviation = cell(name, value, INTERVAL_95 * std, " "), f"{100 * (value / true - 1):+.2f} %"
         rows.append([axis, name, f"{true * factor:.5g} {unit}", found_text, deviation])
     for name, value in found.parameters.terms:
-        rows.append([axis, name, "", f"{value:.4g} ±{INTERVAL_95 * found.std[name]:.2g} {unit_of(name)}", ""])
+        shown = cell(name, value, INTERVAL_95 * found.std[name], " ")
+        rows.append([axis, name, "", f"{shown} {unit_of(name)}".rstrip(), ""])
     return rows
 
 
@@ -149,9 +150,17 @@ def _identified(loop: Loop) -> Section:
     pictures = []
     for axis, (window, fit_percent) in loop.cold.items():
         found = loop.published[axis][0].parameters
-        pictures.append((f"{axis}: measured signals of a rapid (paper: Figure 4)", figures.signals(window)))
         pictures.append(
-            (f"{axis}: model against drive (Figure 8)", figures.model_against_drive(window, found, fit_percent))
+            (
+                f"Axis {axis}: voltage, current and speed of one rapid move, as measured (Figure 4 of the paper)",
+                figures.signals(window),
+            )
+        )
+        pictures.append(
+            (
+                f"Axis {axis}: the model, given the measured voltage, against the drive; below, the rest (Figure 8)",
+                figures.model_against_drive(window, found, fit_percent),
+            )
         )
     received, lost = loop.frames
     return Section(
@@ -171,10 +180,17 @@ def _drifted(loop: Loop) -> Section:
             (f"{first.temperature_c:.1f} degC", cold, first.parameters),
             (f"{last.temperature_c:.1f} degC", warm, last.parameters),
         ]
-        pictures.append((f"{axis}: estimated torque of a rapid, cold and warm (Figure 5)", figures.torque(cases)))
-    for symbol, number in (("ft", 6), ("Cd", 7)):
+        pictures.append(
+            (
+                f"Axis {axis}: torque of a rapid move with cold and with warm slide-ways, from the model (Figure 5)",
+                figures.torque(cases),
+            )
+        )
+    for symbol, meaning, number in (("ft", "Viscous friction", 6), ("Cd", "Coulomb friction", 7)):
         series = {axis: _series(sets, symbol) for axis, sets in loop.published.items()}
-        caption = f"Drift of {symbol} with the slide-way temperature (Figure {number})"
+        caption = (
+            f"{meaning} {symbol} over the temperature of the slide-ways, with its 95 % intervals (Figure {number})"
+        )
         pictures.append((caption, figures.drift(symbol, UNITS[symbol], series)))
     return Section(
         "Drift with the slide-ways' temperature",
@@ -232,11 +248,11 @@ def _predicted(loop: Loop) -> Section:
             Curve(label, _xy(drifted.predicted_mm), dashed=True),
         ]
         pictures.append((f"Effect at E of {label} (Figure {number})", figures.corner(curves, POINTS["E"], 0.2)))
-    worst = [[f"{z.start_s:.2f} - {z.end_s:.2f}", z.where, f"{z.max_um:.1f}", z.cause] for z in loop.predicted.zones]
+    worst = [[f"{z.start_s:.2f} to {z.end_s:.2f}", z.where, f"{z.max_um:.1f}", z.cause] for z in loop.predicted.zones]
     return Section(
         "Predicted before the cut",
         "The closed loops of both drives were simulated with the identified parameters; nothing of this was measured.",
-        tables=[Table(("time s", "where", "max um", "cause"), worst, "Zones of the path, 10 m/min")],
+        tables=[Table(("time (s)", "where", "at most (um)", "cause"), worst, "Zones of the path, 10 m/min")],
         figures=pictures,
     )
 
@@ -265,22 +281,29 @@ def _corrected(loop: Loop) -> Section:
         tables=[Table(CUT_HEAD, cut_rows(loop), "Contour error, 10 m/min")],
         figures=[
             (
-                "Contour error along the path (Figure 16 closes this loop)",
+                "Contour error along the path, each pass as measured at the table (the loop of Figure 16, closed)",
                 figures.contour_errors(loop.config.machine.sync_period_s, errors),
             ),
-            *(
-                (
-                    f"Where the error is, {cut.label}: the colours reach to {cut.max_um:.1f} um",
-                    figures.error_map(cut.reference_mm, cut.contour_um, cut.max_um),
-                )
-                for cut in (before, loop.cuts[2])
-            ),
+            *_maps((before, loop.cuts[2])),
             (f"Area A, measured, {larger} (Figure 17)", figures.corner(measured, POINTS["A"], 6.0)),
             (f"The straight behind A, measured, {larger} (Figure 18)", figures.corner(measured, (20.0, 55.0), 12.0)),
             (f"Area E, measured, {larger}", figures.corner(measured, POINTS["E"], 6.0)),
             (f"Rounded path at the end of A, simulated, {larger} (Figure 20)", _rounded_figure(rounded, inverse)),
         ],
     )
+
+
+def _maps(cuts: Sequence[Cut]) -> list[tuple[str, str]]:
+    """Return a map of each pass, all with one scale of colours."""
+    largest, least = figures.common_scale([cut.contour_um for cut in cuts])
+    places = [figures.Place(name, *at) for name, at in POINTS.items()]
+    return [
+        (
+            f"Where the error is, {cut.label}: {cut.max_um:.1f} um at most; the colours mean the same in both maps",
+            figures.error_map(cut.reference_mm, cut.contour_um, largest, places=places, least_um=least),
+        )
+        for cut in cuts
+    ]
 
 
 def _rounded_figure(mirror: Correction, inverse: Correction) -> str:

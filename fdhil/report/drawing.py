@@ -1,0 +1,85 @@
+"""Draws with matplotlib into inline SVG that says what it shows, in words and, for the page's script, in numbers."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from xml.sax.saxutils import escape, quoteattr
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+INK, REFERENCE = "#1d2733", "#9aa5b1"
+# colours that stay apart in print and for colour-blind readers (Okabe and Ito)
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+LEFT, RIGHT, BELOW, ABOVE = 0.8, 0.2, 0.55, 0.35  # margins, inches
+LETTERS_PER_INCH = 15.5  # of a legend
+HANDLE_LETTERS = 8  # what a legend's line takes beside its name
+LEGEND_LINE = 0.2  # inches
+
+
+@dataclass(slots=True)
+class Drawing:
+    """A figure under way: ``alt`` and ``data`` may be set until it is left, then ``svg`` holds it."""
+
+    figure: Figure
+    axes: Axes
+    alt: str = ""
+    data: Mapping[str, Any] | None = None
+    svg: str = ""
+
+
+@contextmanager
+def drawing(width: float = 6.4, height: float = 3.6, above: float = ABOVE) -> Iterator[Drawing]:
+    """A figure with one pair of axes, ``above`` them a margin, all in inches."""
+    from matplotlib import style
+    from matplotlib.figure import Figure
+
+    with style.context(Path(__file__).with_name("fdhil.mplstyle")):
+        figure = Figure(figsize=(width, height))
+        # fixed margins: matplotlib's own layout would draw every figure twice
+        box = (LEFT / width, BELOW / height, 1 - (LEFT + RIGHT) / width, 1 - (BELOW + above) / height)
+        made = Drawing(figure, figure.add_axes(box))
+        yield made
+        text = io.StringIO()
+        figure.savefig(text, format="svg", metadata=dict.fromkeys(("Creator", "Date", "Format", "Type")))
+    made.svg = _inline(text.getvalue(), made.alt, made.data)
+
+
+def _inline(text: str, alt: str, data: Mapping[str, Any] | None) -> str:
+    """Return the SVG for a page that holds several: with identifiers of its own, what it shows, and its numbers."""
+    body = text[text.index("<svg") :]
+    mark = f"f{zlib.crc32(body.encode()):08x}"
+    body = re.sub(r'id="', f'id="{mark}-', body)
+    body = re.sub(r'(xlink:href="#|url\(#)', rf"\g<1>{mark}-", body)
+    told = "" if data is None else f"<metadata>{escape(json.dumps(data, separators=(',', ':')))}</metadata>"
+    words = f' role="img" aria-label={quoteattr(alt)}' if alt else ""
+    start, _, rest = body.partition(">")
+    return f"{start}{words}>{told}{rest}"
+
+
+def legend_rows(labels: list[str], width: float) -> tuple[int, int]:
+    """Return columns and rows of a legend that is not wider than ``width`` inches."""
+    letters = HANDLE_LETTERS + max(map(len, labels), default=0)
+    columns = max(1, min(len(labels), int(width * LETTERS_PER_INCH / letters)))
+    return columns, -(-len(labels) // columns)
+
+
+def legend_above(axes: Axes, columns: int, handles: list[Any] | None = None) -> None:
+    """Put the legend above the picture, where it covers nothing; a click on a name hides its curve."""
+    found = axes.get_legend_handles_labels()[0] if handles is None else handles
+    legend = axes.legend(
+        handles=found, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, borderpad=0.1, borderaxespad=0.3
+    )
+    for k, (handle, text) in enumerate(zip(found, legend.get_texts(), strict=True)):
+        if hasattr(handle, "set_gid"):
+            handle.set_gid(f"trace-{k}")
+        text.set_gid(f"legend-{k}")

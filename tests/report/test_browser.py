@@ -1,0 +1,71 @@
+"""A page in a real browser: pictures come alive, enlarge, hide curves; and it prints on paper."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdhil.report import Page, Section, Table, figures, find_browser, html, maps, write_pdf
+from fdhil.report.pdf import run_browser
+from tests.report.test_report import PARAMETERS, curves, window
+
+pytestmark = pytest.mark.debian
+
+USED = """<script>
+const picture = document.querySelectorAll("figure")[1].querySelector("svg"), place = picture.getBoundingClientRect();
+picture.setPointerCapture = () => {};
+function at(kind, x, y) {
+  const where = { clientX: place.left + x, clientY: place.top + y, pointerId: 1 };
+  picture.dispatchEvent(new PointerEvent(kind, where));
+}
+at("pointerdown", 100, 100); at("pointermove", 200, 150); at("pointerup", 200, 150);
+document.querySelectorAll("figure")[2].querySelector('[id*="-legend-1"]').dispatchEvent(new MouseEvent("click"));
+</script></body>"""
+
+
+def page() -> Page:
+    """One picture of each kind: a chart of two panels, a map, a place enlarged."""
+    path = curves()[0].path_mm
+    pictures = [
+        ("model", figures.model_against_drive(window(), PARAMETERS, 99.5)),
+        ("map", maps.error_map(path, np.linspace(0, 9, 200), 9.0)),
+        ("corner", figures.corner(curves(), (5.0, 5.0), 1.0)),
+    ]
+    rows = [[str(k), f"{k} um"] for k in range(80)]
+    return Page(
+        "A page", "subtitle", [("after", "3.5 um")], [Section("One", "text", [Table(["a", "b"], rows)], pictures)]
+    )
+
+
+def shown(text: str, folder: Path) -> str:
+    """Return the document as the browser has it after its scripts ran."""
+    source, found = folder / "page.html", folder / "dom.html"
+    source.write_text(text, "utf-8")
+    with found.open("w") as file:
+        run_browser(find_browser(), folder, "--dump-dom", "--virtual-time-budget=2000", source.as_uri(), output=file)
+    return found.read_text("utf-8")
+
+
+def test_pictures_come_alive(tmp_path: Path) -> None:
+    document = shown(html(page()).replace("</body>", USED), tmp_path)
+    assert document.count('class="uplot') == 2
+    assert len(re.findall(r'<svg[^>]*class="still"', document)) == 1
+    (reading,) = re.findall(r"<output>(X [^<]*)</output>", document)
+    assert re.fullmatch(r"X \d\.\d\d mm, Y \d\.\d\d mm: [\d.]+ µm", reading)
+    assert len(re.findall(r'<svg[^>]*class="zoomed"', document)) == 1
+    assert re.search(r'<g id="[^"]*trace-1" class="off"', document)
+
+
+def test_a_page_is_printed_with_pictures_that_were_drawn_for_it(tmp_path: Path) -> None:
+    whole = page()
+    (section,) = whole.sections
+    lines = replace(section, figures=[section.figures[0], section.figures[2]])  # a scale of colours is an image
+    write_pdf(replace(whole, sections=[lines]), tmp_path / "page.pdf")
+    printed = (tmp_path / "page.pdf").read_bytes()
+    assert printed.startswith(b"%PDF")
+    assert 2 <= len(re.findall(rb"/Type /Page\b", printed)) <= 4
+    assert b"/Subtype /Image" not in printed  # curves and text, no picture of a screen

@@ -1,0 +1,125 @@
+"""Charts: what is drawn and what the page's script is told; units as they are printed; maps that can be compared."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil.errors import FdhilError
+from fdhil.records import frozen
+from fdhil.report import Page, figures, maps, write_pdf
+from fdhil.report.chart import MOST_POINTS, Chart, Panel, Trace, svg, thinned
+from fdhil.report.drawing import legend_rows
+from fdhil.report.typography import typeset, typeset_markup
+from tests.report.test_report import PARAMETERS, window
+
+
+def told(picture: str) -> dict[str, Any]:
+    """What the page's script is told of a picture."""
+    (text,) = re.findall(r"<metadata>(.*?)</metadata>", picture, re.DOTALL)
+    found: dict[str, Any] = json.loads(html.unescape(text))
+    return found
+
+
+def test_a_long_curve_keeps_its_peaks() -> None:
+    x = np.arange(100_000.0)
+    y = np.sin(x / 7000)
+    y[54_321], y[99_999], y[500] = 9.0, -7.0, np.nan
+    at, drawn = thinned(x, y)
+    assert at.size <= MOST_POINTS
+    assert np.all(np.diff(at) > 0)
+    assert drawn[at == 54_321] == 9.0
+    assert drawn[at == 99_999] == -7.0
+
+
+def test_the_script_is_told_what_is_drawn() -> None:
+    """A grid that several curves have is told once; what is lost is null; bounds stand beside their values."""
+    x = frozen([3.0, 1.0, 2.0])
+    bars = Trace("points", x, frozen([30.0, 10.0, 20.0]), style="points", low=x, high=frozen([33.0, 11.0, 22.0]))
+    line = Trace("line", frozen([1.0, 2.0, 3.0]), frozen([1.0, np.nan, 1 / 3]))
+    chart = Chart("time (s)", [Panel("um", [bars, line], levels=[("limit", 40.0)])], "words", marks=[("step", 2.0)])
+    found = told(svg(chart))
+    assert found["grids"] == [[1, 2, 3]]
+    (panel,) = found["panels"]
+    assert [trace["x"] for trace in panel["traces"]] == [0, 0]
+    assert panel["traces"][0]["y"] == [10, 20, 30]
+    assert panel["traces"][0]["high"] == [11, 22, 33]
+    assert panel["traces"][1]["y"] == [1, None, 0.33333]
+    assert (panel["levels"], found["marks"]) == ([["limit", 40]], [["step", 2]])
+
+
+def test_seconds_since_1970_keep_all_their_digits() -> None:
+    day = Trace("day", frozen([1_800_000_000.0, 1_800_086_400.0]), frozen([1.0, 2.0]))
+    assert told(svg(Chart("time (UTC)", [Panel("", [day])], "", in_time=True)))["grids"] == [[1800000000, 1800086400]]
+
+
+def test_an_overlay_shows_what_is_between_its_curves() -> None:
+    """Model and drive cannot be told apart on one scale: their difference has a panel of its own."""
+    overlay, between = told(figures.model_against_drive(window(), PARAMETERS, 99.5))["panels"]
+    drive, model = (np.array(trace["y"]) for trace in overlay["traces"])
+    assert np.allclose(between["traces"][0]["y"], drive - model, atol=1e-3)
+
+
+def test_every_picture_says_what_it_shows() -> None:
+    """For those who cannot see it, with its numbers."""
+    picture = figures.contour_errors(0.001, {"before": np.full(9, 100.0), "after": np.full(9, 0.2)})
+    (words,) = re.findall(r'aria-label="([^"]*)"', picture)
+    assert words == "Contour error along the path: before 100 um RMS, 100 um at most; after 0.2 um RMS, 0.2 um at most."
+
+
+def test_a_legend_is_never_wider_than_its_picture() -> None:
+    assert legend_rows(["a", "b", "c"], 3.8) == (3, 1)
+    assert legend_rows(["uncorrected", "mirror of the paper", "inverse", "inverse, warm"], 3.8)[1] > 1
+    assert legend_rows(["a name that is much longer than the picture is wide " * 3], 3.8) == (1, 1)
+
+
+def test_maps_that_are_compared_have_one_scale() -> None:
+    before, after = np.linspace(0.0, 100.0, 50), np.linspace(0.0, 0.5, 50)
+    assert figures.common_scale([before, 0.5 * before]) == (100.0, None)
+    largest, least = figures.common_scale([before, after])
+    assert largest == 100.0
+    assert least is not None
+    assert 0.0 < least < 0.5
+
+
+def test_a_map_has_start_direction_and_named_places() -> None:
+    angle = np.linspace(0.0, np.pi, 200)
+    arc = 50 * np.column_stack([np.cos(angle), np.sin(angle)])
+    picture = maps.error_map(arc, angle, 4.0, places=[maps.Place("1", 0.0, 50.0)])
+    assert ">start<" in picture
+    assert ">1<" in picture
+    found = told(picture)
+    left, top, right, bottom = found["box"]
+    (low, high), worst = found["x"], found["at"][-1]
+    assert (left < right, top < bottom) == (True, True)
+    assert low < -50.0 < 50.0 < high
+    assert worst == [-50.0, 0.0, 3.14]
+
+
+def test_units_are_typeset_and_names_are_not() -> None:
+    told_plain = "24.1 um RMS, 5.39 +- 0.02 N.m.s at 20 degC, 157 x smaller, (1.42 ±0.06)e-6 1/W, 530 mohm -> 1 kg.m2"
+    assert (
+        typeset(told_plain)
+        == "24.1 µm RMS, 5.39 ± 0.02 N·m·s at 20 °C, 157 × smaller, (1.42 ±0.06)·10⁻⁶ 1/W, 530 mΩ → 1 kg·m²"
+    )
+    for name in ("um.ngc", "part_um.ngc", "sum", "X 1.3", "/um/part.ngc", "G1 X60"):
+        assert typeset(name) == name
+    assert typeset_markup('<text class="um">um</text>') == '<text class="um">µm</text>'
+
+
+def test_without_a_browser_there_is_no_pdf_and_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(FdhilError, match="apt-get install chromium"):
+        write_pdf(Page("t", "s"), tmp_path / "page.pdf")
+    browser = tmp_path / "chromium"
+    browser.write_text("#!/bin/sh\necho 'no display' >&2\n")
+    browser.chmod(0o755)
+    with pytest.raises(FdhilError, match=r"printed nothing \(no display\); print the HTML page"):
+        write_pdf(Page("t", "s"), tmp_path / "page.pdf")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["chromium"]
