@@ -183,9 +183,11 @@ def test_changes_of_side_are_counted_beyond_a_band() -> None:
     assert correcting.turns(wave, 10.0) == 0
 
 
-def test_a_view_holds_what_is_near() -> None:
-    view = drawings.View((0.0, 10.0), (5.0, 5.0), 5.0)
-    assert view.holds(np.array([[5.0, 5.0], [12.0, 5.0]])).tolist() == [True, False]
+def test_a_view_holds_what_is_near_its_level() -> None:
+    view = drawings.View((0.0, 10.0), 5.0, 2.0)
+    assert view.holds(np.array([[5.0, 5.0], [12.0, 5.0], [5.0, 8.0]])).tolist() == [True, False, False]
+    assert view.shown(np.array([5.001])).tolist() == [5.001]
+    assert drawings.View((0.0, 1.0), 5.0, 2.0, fine=True).shown(np.array([5.001])) == pytest.approx([1.0])
 
 
 def test_the_command_tells_its_document_and_refuses_a_folder_that_cannot_be(
