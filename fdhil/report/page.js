@@ -141,14 +141,16 @@ function map(picture, told) {
   let start = null;
   picture.addEventListener("pointerdown", (event) => { start = point(event); picture.setPointerCapture(event.pointerId); event.preventDefault(); });
   picture.addEventListener("pointermove", (event) => {
-    const here = point(event), [x, y] = millimetres(here);
+    const here = point(event);
+    if (start) setBox(frame, start, here);
+    if (!told.names) return;
+    const [x, y] = millimetres(here);
     let text = `${told.names[0]} ${x.toFixed(3)} mm, ${told.names[1]} ${y.toFixed(3)} mm`;
     if (told.at) {
       const near = told.at.reduce((a, b) => Math.hypot(b[0] - x, b[1] - y) < Math.hypot(a[0] - x, a[1] - y) ? b : a);
       text = `${told.names[0]} ${near[0].toFixed(2)} mm, ${told.names[1]} ${near[1].toFixed(2)} mm: ${figures4(near[2])} ${told.unit}`;
     }
     note.textContent = text;
-    if (start) setBox(frame, start, here);
   });
   picture.addEventListener("pointerleave", () => { note.textContent = ""; });
   picture.addEventListener("pointerup", (event) => {

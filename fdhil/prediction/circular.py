@@ -1,0 +1,105 @@
+"""Evaluates a circle run in both directions as ISO 230-4 does: circular deviation, hysteresis, radial deviation.
+
+Pure. Deviations are radial, about the least-squares centre of both runs together, as for a ball bar, which cannot tell
+where the programmed centre is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdhil.errors import RecordingError
+from fdhil.records import Float, frozen
+
+GRID = 720  # angles at which the runs are compared
+NEAR = 0.2  # of the radius: rows farther from the circle lead to it or away from it
+TURN = 2 * np.pi
+
+
+@dataclass(frozen=True, slots=True)
+class Circular:
+    """Radial deviations (GRID,) um at equal angles from the first axis on, for each direction of the run."""
+
+    radius_mm: float
+    counter_um: Float
+    clockwise_um: Float
+
+    @property
+    def deviations_um(self) -> tuple[float, float]:
+        """G of the counter-clockwise and of the clockwise run: what lies between its two concentric circles.
+
+        Their common centre is the least-squares centre of the run itself.
+        """
+        counter, clockwise = (np.ptp(_centred(run)) for run in (self.counter_um, self.clockwise_um))
+        return float(counter), float(clockwise)
+
+    @property
+    def both_um(self) -> float:
+        """G(b): what lies between two concentric circles around both runs."""
+        return float(np.ptp(np.concatenate([self.counter_um, self.clockwise_um])))
+
+    @property
+    def hysteresis_um(self) -> float:
+        """H: the largest radial difference between the runs at one angle."""
+        return float(np.abs(self.counter_um - self.clockwise_um).max())
+
+    @property
+    def radial_um(self) -> tuple[float, float]:
+        """F max and F min: the farthest from the programmed circle, outside (+) and inside (-)."""
+        both = np.concatenate([self.counter_um, self.clockwise_um])
+        return float(both.max()), float(both.min())
+
+
+def evaluate(path_mm: Float, radius_mm: float, centre_mm: tuple[float, float] | None = None) -> Circular:
+    """Evaluate a path (n, 2) that runs the circle in both directions, each for 360 degrees or more.
+
+    Of each run the middle 360 degrees count, so that starting and stopping do not. Without a centre it is the middle
+    of what the path covers. RecordingError when there are no two such runs.
+    """
+    centre = (path_mm.min(axis=0) + path_mm.max(axis=0)) / 2 if centre_mm is None else np.asarray(centre_mm)
+    away = path_mm - centre
+    radius = np.hypot(*away.T)
+    on = np.abs(radius - radius_mm) < NEAR * radius_mm
+    if np.count_nonzero(on) < GRID // 8:
+        raise RecordingError(f"the path runs no circle of {radius_mm:g} mm radius; check the radius")
+    angle, deviation_um = np.unwrap(np.arctan2(away[on, 1], away[on, 0])), (radius[on] - radius_mm) * 1e3
+    turned = angle - angle[0]
+    split = int(np.argmax(np.abs(turned)))
+    runs = {}
+    for part in (slice(0, split + 1), slice(split, None)):
+        there = angle[part]
+        if abs(there[-1] - there[0]) < TURN - 1e-3:
+            text = "the circle is not run through 360 degrees in both directions"
+            raise RecordingError(f"{text}; run it with G2 and G3, each a little more than once around")
+        runs[bool(there[-1] > there[0])] = _middle_turn(there, deviation_um[part])
+    both = _centred(np.concatenate([runs[True], runs[False]]))
+    return Circular(radius_mm, frozen(both[:GRID]), frozen(both[GRID:]))
+
+
+def _middle_turn(angle: Float, deviation_um: Float) -> Float:
+    """Return the deviation (GRID,) at equal angles over the middle 360 degrees of a run."""
+    inside = np.abs(angle - (angle[0] + angle[-1]) / 2) <= TURN / 2
+    at = np.mod(angle[inside], TURN)
+    order = np.argsort(at, kind="stable")
+    found: Float = np.interp(np.arange(GRID) * TURN / GRID, at[order], deviation_um[inside][order], period=TURN)
+    return found
+
+
+def _centred(deviation_um: Float) -> Float:
+    """Return deviations (GRID,) or (2 GRID,) about their least-squares centre, exact where it is micrometres away."""
+    angle = np.arange(deviation_um.size) * TURN / GRID
+    across, along = (2 * np.mean(deviation_um * wave) for wave in (np.cos(angle), np.sin(angle)))
+    return np.asarray(deviation_um - across * np.cos(angle) - along * np.sin(angle))
+
+
+def circle_program(axes: tuple[str, str], radius_mm: float, feed_mm_min: float) -> str:
+    """Return an NC program that runs the circle twice around in each direction, around where it starts."""
+    plane = {("X", "Y"): "G17", ("X", "Z"): "G18", ("Y", "Z"): "G19"}[axes]
+    a, b = axes
+    # seen along the normal axis, Z to X turns as G18 counts: there G2 and G3 change places
+    turns = ("G3", "G2") if plane != "G18" else ("G2", "G3")
+    centre = f"{dict(X='I', Y='J', Z='K')[a]}{-radius_mm:g} {dict(X='I', Y='J', Z='K')[b]}0"
+    arcs = [f"{turn} {a}{radius_mm:g} {b}0 {centre} P2 F{feed_mm_min:g}\nG4 P0.5" for turn in turns]
+    return "\n".join(["G21 G90 G94 G91.1", plane, f"G0 {a}{radius_mm:g} {b}0", "G4 P0.5", *arcs, "M2", ""])
