@@ -42,6 +42,10 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "replay": ("fdhil.cli.records:replay", "Analyse a recorded window again, bit by bit as the daemon did."),
     "history": ("fdhil.cli.records:history", "Show how the parameters moved."),
     "report": ("fdhil.cli.records:report", "Write an HTML report of the stored history."),
+    "acceptance": (
+        "fdhil.cli.acceptance:acceptance",
+        "Write the acceptance report: proofs, parameters, circular test.",
+    ),
     "export": ("fdhil.cli.records:export", "Write a recording as CSV."),
 }
 
