@@ -8,7 +8,7 @@ VCAN   := bash tests/integration/vcan-vm.sh -t 900
 # a child process need not translate fdhil anew
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo test test-vcan test-full loaded lint bench study lock clean
+.PHONY: help setup docs demo test test-vcan test-full loaded lint bench study lock clean
 
 help:            ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -62,6 +62,9 @@ lint: setup      ## ruff, mypy, import-linter, deptry, codespell, and the house 
 	@$(BIN)/deptry .
 	@$(BIN)/codespell
 	@! grep -n '://' requirements.lock || { echo "requirements.lock names an address" >&2; exit 1; }
+
+docs: setup      ## the site of the documents, in out/site; a broken link is an error
+	@$(BIN)/python -m sphinx -W --keep-going -q -b html docs out/site
 
 bench: setup     ## the benchmarks; results go to docs/benchmarks.md
 	@$(BIN)/python -m benchmarks

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
-from fdhil.identification.derivatives import ZERO_FORCING_1, Operator
+from fdhil.cli.paper import operators
+from fdhil.identification.derivatives import Operator
 
 
 def _savitzky_golay(half: int) -> Operator:
@@ -16,13 +16,6 @@ def _savitzky_golay(half: int) -> Operator:
 
 
 OPERATORS: Mapping[str, Operator] = {
-    op.name: op
-    for op in (
-        ZERO_FORCING_1,
-        Operator("zero_forcing_3_tap", (-1, 0, 1), ((math.sqrt(2) - 1) / 2, -math.sqrt(2), (1 + math.sqrt(2)) / 2)),
-        Operator("central", (-1, 0, 1), (-0.5, 0.0, 0.5)),
-        Operator("backward", (-1, 0), (-1.0, 1.0)),
-        _savitzky_golay(3),
-        _savitzky_golay(7),
-    )
+    **operators.OPERATORS,
+    **{operator.name: operator for operator in (_savitzky_golay(3), _savitzky_golay(7))},
 }

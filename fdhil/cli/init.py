@@ -63,12 +63,12 @@ def init(
         raise OutputError(f"{file} is there already, and init never overwrites; name another file, or move it away")
     given = _answers(answers) if answers is not None else {}
     from fdhil.commissioning.init.linuxcnc import read_linuxcnc  # late: --help imports nothing heavy
-    from fdhil.commissioning.init.making import make, text_of
+    from fdhil.commissioning.init.making import conclude, make
 
     nc = read_linuxcnc(ini) if ini is not None else None
     ask = _ask if answers is None and not as_json else None
     draft = make(file, given, nc, ask, None if offline else _look(places, file.parent), _can_interface())
-    text = text_of(draft, file, "fdhil init")
+    text = conclude(draft, file)
     if not dry_run:
         with file.open("x", encoding="utf-8") as out:  # whatever came there meanwhile is kept
             out.write(text)
@@ -121,8 +121,6 @@ def _can_interface() -> Told | None:
 
 def _ask(asked: Asked) -> Any:
     """Ask the operator until the answer is a possible value; None where the proposal is taken."""
-    from fdhil.config.reading import checked_value
-
     click.echo(f"\n{asked.path}: {asked.meaning}" if asked.meaning else f"\n{asked.path}", err=True)
     click.echo(f"  where: {asked.where}", err=True)
     if asked.proposal is not None:
@@ -133,7 +131,7 @@ def _ask(asked: Asked) -> Any:
         if said == default:
             return None
         try:
-            return checked_value(asked.path, said)
+            return asked.check(said)
         except ConfigError as error:
             click.echo(f"  {error.faults[0].what}; once more", err=True)
 

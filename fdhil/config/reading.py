@@ -104,11 +104,12 @@ def checked(section: type[S], values: Mapping[str, Any], path: str) -> S:
 
 
 def checked_value(path: str, value: Any) -> Any:
-    """Check the value of one key, as ``axis.X.nominal.R``; ConfigError. What has no key of its own stays as it is."""
-    field = field_at(path)
+    """Check the value of one key, as ``axis.X.nominal.R``, and return it as it is used; ConfigError."""
+    field, (*outer, key) = field_at(path), path.split(".")
     if field is None:
-        return value
-    kind: Any = Annotated[(field.annotation, *field.metadata)]
+        near = _near_key(_section(tuple(outer)), key)
+        raise ConfigError(path, [ConfigFault(path, "is no key of this section", near)])
+    kind: Any = Annotated[(field.annotation, *field.metadata)] if field.metadata else field.annotation
     try:
         return TypeAdapter(kind).validate_python(value)
     except ValidationError as error:

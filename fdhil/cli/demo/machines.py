@@ -14,13 +14,14 @@ def machine_document(*more: str) -> dict[str, Any]:
     """Return the configuration of the demonstration's machine as a parsed file; ``more`` names what it has besides."""
     document: dict[str, Any] = {}
     for name in (PAPER, *more):
-        _merge(document, tomllib.loads(Path(__file__).with_name(name).read_text("utf-8")))
+        merge(document, tomllib.loads(Path(__file__).with_name(name).read_text("utf-8")))
     return document
 
 
-def _merge(document: dict[str, Any], more: Mapping[str, Any]) -> None:
+def merge(document: dict[str, Any], more: Mapping[str, Any]) -> None:
+    """Put what another file says into a document, table by table."""
     for key, value in more.items():
         if isinstance(value, Mapping):
-            _merge(document.setdefault(key, {}), value)
+            merge(document.setdefault(key, {}), value)
         else:
             document[key] = value

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from fdhil.commissioning.init.told import Told
-from fdhil.config.reading import field_at
-from fdhil.errors import ConfigFault
+from fdhil.config.reading import checked_value, field_at
+from fdhil.errors import ConfigError, ConfigFault
 
 OPERATOR = "asked: the operator's word"
 ANSWERS = "from the answers"
@@ -16,14 +17,19 @@ ANSWERS = "from the answers"
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """A question to the operator: the key's path, what it means, where its value is found, and what is proposed."""
+    """A question to the operator: the key's path, what it means, where its value is found, and what is proposed.
+
+    ``check`` returns the value of what was said; ConfigError with the reason where it is none.
+    """
 
     path: str
     meaning: str
     where: str
     proposal: Told | None
+    check: Check
 
 
+Check = Callable[[str], Any]
 Ask = Callable[[Asked], Any]
 """Return the operator's value; None: the proposal."""
 
@@ -38,13 +44,21 @@ class Draft:
     notes: list[str] = field(default_factory=list)
 
     def take(self, table: Mapping[str, Any], path: str = "") -> None:
-        """Take the nested tables of an answers file, whose keys are the configuration's."""
+        """Take the nested tables of an answers file, whose keys are the configuration's; what is wrong is missing."""
         for key, value in table.items():
             here = f"{path}.{key}" if path else key
             if isinstance(value, Mapping) and value:
                 self.take(value, here)
             else:
-                self.values[here] = Told(value, ANSWERS)
+                self._take(here, value)
+
+    def _take(self, path: str, value: Any) -> None:
+        if not isinstance(value, Mapping) and ".options." not in path:  # those are python-can's own
+            try:
+                value = checked_value(path, value)
+            except ConfigError as error:
+                self.missing += error.faults
+        self.values[path] = Told(value, ANSWERS)
 
     def tell(self, path: str, told: Told) -> None:
         """Take what a device or a file tells; an answer stays, and where both differ that is noted."""
@@ -63,16 +77,16 @@ class Draft:
         """Whether a table, or any key in it, is there."""
         return path in self.values or any(key.startswith(f"{path}.") for key in self.values)
 
-    def settle(self, path: str, where: str, proposal: Told | None = None) -> None:
-        """Have a value for a key: a known one, else the operator's, else the proposal; without any it is missing."""
-        known = self.values.get(path)
-        if known is not None and not known.guessed:
+    def settle(self, path: str, where: str, proposal: Told | None = None, check: Check | None = None) -> None:
+        """Have a value for a key: what is known, else the operator's, else a guess; without any it is missing."""
+        proposal = self.values.get(path) or proposal
+        if proposal is not None and not proposal.guessed:
+            self.values[path] = proposal
             return
-        proposal = known or proposal
         meaning = field_at(path)
         words = meaning.description or "" if meaning is not None else ""
         if self.ask is not None:
-            answer = self.ask(Asked(path, words, where, proposal))
+            answer = self.ask(Asked(path, words, where, proposal, check or partial(checked_value, path)))
             proposal = proposal if answer is None else Told(answer, OPERATOR)
         if proposal is None:
             self.missing.append(ConfigFault(path, f"is not known: {words}", where))

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from fdhil.commissioning.init.draft import Draft
+from fdhil.commissioning.init.draft import OPERATOR, Draft
 from fdhil.commissioning.init.drives import FoundBus, FoundDrive, needs_dc_link
 from fdhil.commissioning.init.linuxcnc import Machine, Scale
 from fdhil.commissioning.init.questions import QUESTIONS, Question
@@ -16,13 +18,21 @@ from fdhil.config.reading import checked
 from fdhil.drivers.cia402.abilities import GENERIC
 from fdhil.drivers.cia402.profile import DriveProfile
 from fdhil.drivers.cia402.profile_file import NO_OFFSET_ADVICE, load_profile, no_offset
-from fdhil.errors import ConfigFault
+from fdhil.errors import ConfigError, ConfigFault
 
 UNITS_OF_CURRENT = {
     "drive.rated_current_a": ("permille_of_rated", "share_of_rated"),
     "drive.rated_torque_nm": ("permille_of_rated_torque",),
 }
 NO_OTHER_WINDOW = (0, 0xFFFFFFFF)
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """The drives that were found; ``complete``: there are no others, for the nodes of every bus were asked."""
+
+    drives: Sequence[FoundDrive]
+    complete: bool
 
 
 def settle_machine(draft: Draft, buses: Sequence[FoundBus], name: str) -> None:
@@ -35,12 +45,22 @@ def settle_machine(draft: Draft, buses: Sequence[FoundBus], name: str) -> None:
                 "takes scales and ratings from the drives"
             )
         if bus.sync_period_s is not None:
-            draft.tell("machine.sync_period_s", Told(round(bus.sync_period_s, 5), "heard: SYNC on the bus"))
+            draft.tell("machine.sync_period_s", Told(_cycle(bus.sync_period_s), "heard: SYNC on the bus"))
     cycles = {drive.cycle_s for bus in buses for drive in bus.drives} - {None}
     usual = Told(0.001, "guessed: usual; it is the NC's cycle", guessed=True)
     if len(cycles) == 1:
         usual = Told(cycles.pop(), "guessed: the drives' own cycle, 0x60C2; it must be the NC's", guessed=True)
     draft.settle("machine.sync_period_s", "the NC's cycle: how often it sends SYNC", usual)
+
+
+def _cycle(heard_s: float) -> float:
+    """Return the period that an NC is set to, a multiple of a quarter of a millisecond, where one is near.
+
+    >>> _cycle(0.000993), _cycle(0.0011)
+    (0.001, 0.0011)
+    """
+    usual_s = max(1, round(heard_s / 0.00025)) * 0.00025
+    return rounded(usual_s if abs(heard_s - usual_s) < 0.05 * usual_s else round(heard_s, 5))
 
 
 def axis_names(draft: Draft, nc: Machine | None, drives: Sequence[FoundDrive]) -> list[str]:
@@ -50,21 +70,34 @@ def axis_names(draft: Draft, nc: Machine | None, drives: Sequence[FoundDrive]) -
     if names:
         return names
     usual = "XYZUVW"[: len(drives)] or "X"
-    draft.settle("axes", "the letters that the NC's programs have", Told(usual, "one for each drive", guessed=True))
+    draft.settle("axes", "their letters in the NC's programs", Told(usual, "one for each drive", True), _letters)
     told = draft.values.pop("axes")
-    return list(dict.fromkeys("".join(str(told.value).upper().split())))
+    return list(dict.fromkeys(told.value))
+
+
+def _letters(said: str) -> str:
+    letters = "".join(said.upper().replace(",", " ").split())
+    if not (letters.isascii() and letters.isalpha()):
+        raise ConfigError("axes", [ConfigFault("axes", "must be letters, as X Y Z")])
+    return letters
+
+
+def _one_of(path: str, words: Sequence[str], said: str) -> str:
+    if said not in words:
+        raise ConfigError(path, [ConfigFault(path, f"must be {' or '.join(words)}")])
+    return said
 
 
 def settle_axis(
     draft: Draft,
     axis: str,
     others: Sequence[str],
-    drives: Sequence[FoundDrive] | None,
+    found: Found,
     nc: Machine | None,
     folder: Path,
 ) -> None:
-    """Settle [axis.X]; ``others`` are the axes before it, ``drives`` None where no bus was looked at."""
-    drive = _settle_drive(draft, axis, others, drives)
+    """Settle [axis.X]; ``others`` are the axes before it, ``found`` what is on the buses."""
+    drive = _settle_drive(draft, axis, others, found)
     profile = _settle_profile(draft, axis, drive, folder)
     for key, told in (drive.told if drive is not None else {}).items():
         draft.tell(f"axis.{axis}.{key}", told)
@@ -82,21 +115,19 @@ def settle_axis(
         )
 
 
-def _settle_drive(
-    draft: Draft, axis: str, others: Sequence[str], drives: Sequence[FoundDrive] | None
-) -> FoundDrive | None:
+def _settle_drive(draft: Draft, axis: str, others: Sequence[str], found: Found) -> FoundDrive | None:
     """Settle which drive moves the axis; return it where it was found on a bus."""
     path = f"axis.{axis}.drive"
     taken = [_place(draft, other) for other in others]
-    free = [drive for drive in drives or () if (drive.bus, drive.node_id, drive.logical_axis) not in taken]
+    free = [drive for drive in found.drives if (drive.bus, drive.node_id, drive.logical_axis) not in taken]
     if f"{path}.node_id" not in draft.values:
         next_id = Told(max((place[1] for place in taken), default=0) + 1, "guessed: in the order of the axes", True)
-        if drives is not None and not free:
-            what = f"has no drive: {len(drives)} found, {len(others)} given to other axes"
+        if found.complete and not free:
+            what = f"has no drive: {len(found.drives)} found, {len(others)} given to other axes"
             advice = "check its supply and wiring, or leave the axis out; --offline looks at no bus"
             draft.missing.append(ConfigFault(path, what, advice))
             return None
-        only = drives is not None and len(drives) == 1
+        only = found.complete and len(found.drives) == 1
         first = (
             Told(free[0].node_id, "the drive on the bus" if only else "guessed: in the order on the bus", not only)
             if free
@@ -105,10 +136,10 @@ def _settle_drive(
         where = "found: " + "; ".join(drive.name for drive in free) if free else "the drive's switches or tool"
         draft.settle(f"{path}.node_id", where, first)
     chosen = _place(draft, axis)
-    found = [drive for drive in free if drive.node_id == chosen[1]]
-    exact = [drive for drive in found if drive.logical_axis == chosen[2]]
-    drive = next(iter(exact or ([] if f"{path}.logical_axis" in draft.values else found)), None)
-    if drive is None and drives is not None:
+    alike = [drive for drive in free if drive.node_id == chosen[1]]
+    exact = [drive for drive in alike if drive.logical_axis == chosen[2]]
+    drive = next(iter(exact or ([] if f"{path}.logical_axis" in draft.values else alike)), None)
+    if drive is None and found.complete:
         what = f"is {chosen[1]}, which is not on the bus"
         draft.missing.append(ConfigFault(f"{path}.node_id", what, "; ".join(d.name for d in free) or "none is left"))
     if drive is not None:
@@ -221,8 +252,9 @@ def _settle_correction(draft: Draft, axis: str, profile: DriveProfile | None) ->
     path = f"axis.{axis}.correction"
     if not draft.has_table(path) and draft.ask is not None:
         where = "yes or no; even with yes nothing is sent before `fdhil commission` and `fdhil arm`"
-        draft.settle(path, where, Told("no", "nothing is written to a drive unless it is asked for"))
-        if draft.values.pop(path).value in (True, "yes", "y"):
-            draft.values[path] = Told({}, "")
+        no = Told("no", "nothing is written to a drive unless it is asked for", guessed=True)
+        draft.settle(path, where, no, partial(_one_of, path, ("yes", "no")))
+        if draft.values.pop(path).value == "yes":
+            draft.values[path] = Told({}, OPERATOR)
     if draft.has_table(path) and profile is not None and not profile.takes_offset:
         draft.notes.append(f"axis {axis}: {no_offset(profile)}; {NO_OFFSET_ADVICE}")

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from fdhil.commissioning.init.draft import Ask, Draft
 from fdhil.commissioning.init.drives import FoundBus
-from fdhil.commissioning.init.interview import axis_names, settle_axis, settle_machine
+from fdhil.commissioning.init.interview import Found, axis_names, settle_axis, settle_machine
 from fdhil.commissioning.init.linuxcnc import Machine
 from fdhil.commissioning.init.told import Told
-from fdhil.config import CanBus, CorrectionLimits, parse, toml_document
+from fdhil.config import CanBus, CorrectionLimits, parse, toml_document, unlikely
 from fdhil.config.axis import Axis
 from fdhil.config.offset_bounds import limit_faults
 from fdhil.config.reading import checked
@@ -46,15 +47,19 @@ def make(
     """
     draft = Draft(ask)
     draft.take(answers)
+    if draft.missing:
+        raise ConfigError(str(file), draft.missing)
     for path, told in (nc.told if nc else {}).items():
         draft.tell(path, told)
     draft.notes += nc.notes if nc else []
-    buses = [look(name, settings) for name, settings in _buses(draft, interface)] if look else []
+    ways = list(_buses(draft, interface, offline=look is None))
+    buses = [look(name, settings) for name, settings in ways] if look else []
     settle_machine(draft, buses, file.stem)
-    drives = [drive for bus in buses for drive in bus.drives] if look else None
-    names = axis_names(draft, nc, drives or ())
+    drives = [drive for bus in buses for drive in bus.drives]
+    complete = bool(buses) and all(bus.master is None for bus in buses)
+    names = axis_names(draft, nc, drives)
     for place, axis in enumerate(names):
-        settle_axis(draft, axis, names[:place], drives, nc, file.parent)
+        settle_axis(draft, axis, names[:place], Found(drives, complete), nc, file.parent)
     if draft.missing:
         raise ConfigError(str(file), draft.missing)
     for axis in names:
@@ -62,13 +67,17 @@ def make(
     return draft
 
 
-def _buses(draft: Draft, interface: Told | None) -> Iterator[tuple[str, CanBus]]:
+def _buses(draft: Draft, interface: Told | None, *, offline: bool) -> Iterator[tuple[str, CanBus]]:
     """Settle the way onto the bus and yield its settings; several where the answers have several."""
     if not draft.has_table("bus"):
         where = "socketcan for an adapter that `ip link` lists; docs/how-to/can-adapter.md has the others"
-        way = None if interface is None else Told("socketcan", interface.source)
+        if interface is None and offline:
+            interface = Told("can0", "guessed: no bus was looked at", guessed=True)
+        way = None if interface is None else replace(interface, value="socketcan")
         draft.settle("bus.can0.interface", where, way)
-        if draft.get("bus.can0.interface") == "socketcan":
+        if draft.get("bus.can0.interface") == "socketcand":
+            draft.settle("bus.can0.port", "the hub tells it when it starts; `fdhil sim` does")
+        elif "bus.can0.interface" in draft.values:
             draft.settle("bus.can0.channel", "the interface's name, as `ip link` lists it", interface)
     if draft.missing:
         raise ConfigError("bus", draft.missing)
@@ -95,16 +104,36 @@ def _fit_limits(draft: Draft, axis: str) -> None:
             return
 
 
-def text_of(draft: Draft, file: Path, made_by: str) -> str:
-    """Return the file's text; ConfigError where what it says cannot be of one machine."""
+def conclude(draft: Draft, file: Path) -> str:
+    """Return the file's text. What cannot be of one machine is asked again; ConfigError where nobody can be asked.
+
+    What can be, but hardly is, is noted.
+    """
+    while True:
+        text = text_of(draft, file)
+        try:
+            config = parse(toml_document(text.encode(), str(file)), str(file), file.parent)
+        except ConfigError as error:
+            wrong = [fault for fault in error.faults if fault.path in draft.values]
+            if draft.ask is None or not wrong:
+                raise
+            for fault in wrong:
+                kept = draft.values[fault.path]
+                draft.values[fault.path] = Told(kept.value, "as it was", guessed=True)
+                draft.settle(fault.path, f"it cannot be: {fault.what}")
+        else:
+            draft.notes += unlikely(config)
+            return text
+
+
+def text_of(draft: Draft, file: Path) -> str:
+    """Return the commented file."""
     guessed = sum(told.guessed for told in draft.values.values())
     head = (
-        f"Made by {made_by}. Behind each value stands who said so; {guessed} are guessed: check these. A line that "
-        "begins with # and no space is a setting at its default; the comment above each line says what it is."
+        f"{file.name}, made by fdhil init. Behind each value stands who said so; {guessed} are guessed: check these. "
+        "A line that begins with # and no space is a setting at its default; the comment above a line says what it is."
     )
-    text = filled(draft.document, {path: told.source for path, told in draft.values.items()}, head)
-    parse(toml_document(text.encode(), str(file)), str(file), file.parent)
-    return text
+    return filled(draft.document, {path: told.source for path, told in draft.values.items()}, head)
 
 
 def guessed(draft: Draft) -> Sequence[str]:

@@ -1,0 +1,90 @@
+"""fdhil paper: every equation, figure and claim of the paper, put to trials on simulated machines."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from fdhil.errors import OutputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from fdhil.cli.paper.claims import Claim
+
+RUNS = 50
+
+
+@click.command()
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), required=True,
+              help="Folder for paper.html, paper.json and the pictures.")  # fmt: skip
+@click.option("--runs", type=click.IntRange(2, 10_000), default=RUNS, show_default=True,
+              help="Noisy recordings behind each error of an estimator.")  # fmt: skip
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of a table.")
+def paper(out: Path, runs: int, as_json: bool) -> int:
+    """Reproduce the paper that fdhil goes back to, claim by claim.
+
+    Each claim is put to trials in simulated scenarios, which are configs/paper.toml with a few keys changed: it holds,
+    holds with a condition, or is not reproduced. Nothing is sent anywhere. It takes less than a minute or so.
+    """
+    from importlib.metadata import version
+
+    from fdhil.cli.paper.page import document, page, write_pictures
+    from fdhil.report import require, write
+    from fdhil.store.output import open_output
+
+    require()
+    _make(out)
+    claims = gather(runs, lambda text: click.echo(text, err=True) if sys.stderr.isatty() or not as_json else None)
+    files = write_pictures(claims, out)
+    told = document(claims, runs, version("fdhil"), files)
+    write(page(claims), out / "paper.html")
+    with open_output(out / "paper.json") as file:
+        file.write(json.dumps(told, indent=1, ensure_ascii=False).encode())
+    if as_json:
+        click.echo(json.dumps(told))
+    else:
+        _table(claims, out / "paper.html")
+    return 0
+
+
+def gather(runs: int, say: Callable[[str], object]) -> list[Claim]:
+    """Put all claims to their trials, in the order of the paper; ``say`` hears what is being done."""
+    from fdhil.cli.paper import correcting, estimating, measuring, predicting
+
+    say(f"identifying one rapid {runs} times by every method")
+    found = estimating.claims(runs)
+    say("measuring the machine, cold and warm")
+    found += measuring.claims()
+    say("cutting the path in every scenario")
+    structure, *predicted = predicting.claims()
+    say("correcting it")
+    return [structure, *found, *predicted, *correcting.claims(predicted)]
+
+
+def _make(out: Path) -> None:
+    try:
+        (out / "pictures").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"the folder {out} cannot be made: {error.strerror}; choose another --out") from None
+
+
+def _table(claims: list[Claim], report: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from fdhil.cli.paper.page import SUMMARY_HEAD, counts, summary_rows
+
+    console = Console()
+    table = Table(title="The paper, claim by claim", title_justify="left")
+    for name in SUMMARY_HEAD:
+        table.add_column(name)
+    for row in summary_rows(claims):
+        table.add_row(*row)
+    console.print(table)
+    told = ", ".join(f"{number} {verdict}" for verdict, number in counts(claims).items())
+    console.print(f"{told}. Page: {report}")

@@ -1,0 +1,159 @@
+"""The machine that is measured: the twin's physics, which shares no numerics with the model that predicts it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fdhil.cli.paper.scenarios import machine
+from fdhil.config import Axis, MachineConfig
+from fdhil.identification.windows import find_windows
+from fdhil.records import Float, Parameters, Recording, Window, frozen
+from fdhil.sim.drive.physics import Physics, true_parameters
+
+FULL_SCALE = 70.0  # V, A and rad/s: all three signals of figure 4 share its axis
+COLD_C, WARM_C = 20.0, 22.0
+STROKE_MM = 500.0
+LEAD_S, REST_S = 0.2, 0.3
+SMOOTHED_ROWS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """What a drive may have that the paper's model has not: a load, a ripple of it (N.m), a dead band (um)."""
+
+    load_nm: float = 0.0
+    ripple_nm: float = 0.0
+    backlash_um: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """A rapid: how far, how fast, and how hard it accelerates."""
+
+    distance_mm: float
+    speed_mm_s: float
+    acceleration_mm_s2: float
+
+    @staticmethod
+    def measured(speed_share: float = 1.0) -> Move:
+        """Return that of figure 4, or a slower one."""
+        axis = machine().axis["X"]
+        return Move(STROKE_MM, speed_share * axis.rapid_speed_mm_s, axis.max_acceleration_mm_s2)
+
+
+QUICK = Move(400.0, 500.0, 4000.0)
+"""The rapid of a quicker machine: more than twice as fast, and ten times the acceleration."""
+
+
+@dataclass(frozen=True, slots=True)
+class Signals:
+    """What is recorded, (n,) each: mean voltage of each cycle; current, speed and table at its begin."""
+
+    voltage_v: Float
+    current_a: Float
+    speed_rad_s: Float
+    table_mm: Float
+
+
+def plant(axis: str = "X", celsius: float = COLD_C) -> Parameters:
+    """Return the measured machine's parameters at a temperature of its slide-ways."""
+    config = machine()
+    told = config.sim.axis[axis]
+    rise = celsius - config.sim.thermal.ambient_c
+    base = true_parameters(config.axis[axis].nominal, told)
+    return base.changed(ft=base.ft * (1 + told.ft_per_kelvin * rise), Cd=base.Cd * (1 + told.Cd_per_kelvin * rise))
+
+
+def run(
+    axis: Axis,
+    period_s: float,
+    parameters: Parameters,
+    demand_mm: Float,
+    load_nm: Float | None = None,
+    trouble: Trouble = Trouble(),
+) -> Signals:
+    """Run a drive along a demand (n,), which it gets in whole increments as over a bus, under a load (n,) or none."""
+    mm_per_rad = axis.screw_pitch_mm / (2 * math.pi)
+    per_rev = axis.drive.increments_per_rev
+    counts = np.rint(demand_mm * per_rev / axis.screw_pitch_mm)
+    counts = np.concatenate([counts, counts[-1:], counts[-1:]])
+    start = counts[0] * 2 * math.pi / per_rev
+    backlash = trouble.backlash_um * 1e-3 / mm_per_rad
+    drive = Physics(parameters, axis.regulators, period_s, per_rev, angle_rad=start, backlash_rad=backlash)
+    rows = np.empty((4, demand_mm.size))
+    for k in range(demand_mm.size):
+        drive.load_torque_nm = trouble.load_nm + trouble.ripple_nm * math.sin(drive.angle_rad)
+        if load_nm is not None:
+            drive.load_torque_nm += float(load_nm[k])
+        rows[1:, k] = drive.current_a, drive.speed_rad_s, drive.table_rad * mm_per_rad
+        p0, p1, p2 = counts[k : k + 3].tolist()
+        drive.cycle(True, (p0, p1, (p1 - p0) / period_s, (p2 - p1) / period_s, 0.0, 0.0, 0.0, 0.0))
+        rows[0, k] = drive.voltage_mean_v
+    return Signals(*rows)
+
+
+def cut(config: MachineConfig, models: Mapping[str, Parameters], demand_mm: Mapping[str, Float]) -> Float:
+    """Return where the table goes (n, axes), mm, when the machine follows a demand."""
+    period_s = config.machine.sync_period_s
+    axes = [run(config.axis[name], period_s, models[name], path).table_mm for name, path in demand_mm.items()]
+    return np.column_stack(axes)
+
+
+def stroke(move: Move, period_s: float, strokes: int = 1) -> Float:
+    """Return the demand (n,) mm of rapids to and fro: trapezoids of speed, rounded over 20 ms."""
+    ramp_s = move.speed_mm_s / move.acceleration_mm_s2
+    duration_s = move.distance_mm / move.speed_mm_s + ramp_s
+    t = np.arange(0.0, duration_s + REST_S, period_s)
+    speed = np.clip(np.minimum(t, duration_s - t) * move.acceleration_mm_s2, 0.0, move.speed_mm_s)
+    lead = np.zeros(round(LEAD_S / period_s))
+    speeds = np.concatenate([lead, *(speed * (-1) ** k for k in range(strokes))])
+    smooth = np.convolve(speeds, np.full(SMOOTHED_ROWS, 1.0 / SMOOTHED_ROWS))[: speeds.size]
+    return np.concatenate([[0.0], np.cumsum(smooth) * period_s])
+
+
+def rapid(
+    parameters: Parameters,
+    celsius: float = COLD_C,
+    trouble: Trouble = Trouble(),
+    strokes: int = 1,
+    move: Move | None = None,
+) -> Recording:
+    """Record rapids of the measured machine's X axis, without noise; ``move`` is left out for those of figure 4."""
+    config = machine()
+    move = move or Move.measured()
+    axis, period_s = config.axis["X"], config.machine.sync_period_s
+    demand = stroke(move, period_s, strokes)
+    signals = run(axis, period_s, parameters, demand, trouble=trouble)
+    return Recording(
+        axis="X",
+        dt_s=period_s,
+        time_s=frozen(np.arange(demand.size) * period_s),
+        voltage_v=frozen(signals.voltage_v),
+        current_a=frozen(signals.current_a),
+        speed_rad_s=frozen(signals.speed_rad_s),
+        position_mm=frozen(signals.table_mm),
+        demand_mm=frozen(demand),
+        voltage_sampling="interval_mean",
+        pitch_mm=axis.screw_pitch_mm,
+        rapid_speed_rad_s=move.speed_mm_s * axis.rapid_speed_rad_s / axis.rapid_speed_mm_s,
+        temperature_c=celsius,
+    )
+
+
+def noisy(recording: Recording, share: float, seed: int) -> list[Window]:
+    """Return the rapids of a recording with white noise, a ``share`` of the full scale on each signal."""
+    assert recording.voltage_v is not None
+    scatter = share * FULL_SCALE * np.random.default_rng(seed).standard_normal((3, recording.time_s.size))
+    return find_windows(
+        replace(
+            recording,
+            voltage_v=frozen(recording.voltage_v + scatter[0]),
+            current_a=frozen(recording.current_a + scatter[1]),
+            speed_rad_s=frozen(recording.speed_rad_s + scatter[2]),
+            position_mm=frozen(np.round(recording.position_mm, 3)),
+        )
+    )

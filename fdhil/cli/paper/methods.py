@@ -1,0 +1,123 @@
+"""Runs operators and methods over many noisy recordings of one rapid, and tells their errors and the bound."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fdhil.cli.paper.bench import FULL_SCALE, noisy
+from fdhil.cli.paper.operators import OPERATORS
+from fdhil.config import Identification
+from fdhil.identification.derivatives import ZERO_FORCING_1, Operator
+from fdhil.identification.estimators import least_squares, maximum_likelihood, partial_moments
+from fdhil.identification.filtering import zero_phase
+from fdhil.identification.motion import Noise, prepare
+from fdhil.identification.windows import find_windows
+from fdhil.records import PARAMETERS, Bool, Float, Parameters, Recording, Window, frozen
+
+NOISES = (0.001, 0.005, 0.01)
+NO_LOWPASS_HZ = 1e5
+LOWPASSES_HZ = (NO_LOWPASS_HZ, Identification().lowpass_hz, 150.0)
+METHODS = (*OPERATORS, "partial_moments", "maximum_likelihood")
+
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Relative errors (runs, low-passes, methods, 6) at a noise, those with a raw voltage (runs, 6), and the bound."""
+
+    noise: float
+    of: Float
+    raw_voltage: Float
+    bound: Float
+
+    def rms(self, lowpass: int) -> Float:
+        """Return the RMS errors (methods, 6)."""
+        return np.asarray(np.sqrt((self.of[:, lowpass] ** 2).mean(axis=0)))
+
+    def over_bound(self, lowpass: int) -> Float:
+        """Return each method's RMS error over the bound, the geometric mean of the six, (methods,)."""
+        return np.asarray(np.exp(np.log(self.rms(lowpass) / self.bound).mean(axis=1)))
+
+
+def compare(parameters: Parameters, recording: Recording, runs: int) -> list[Errors]:
+    """Return the errors of all methods at each of ``NOISES``, each over ``runs`` recordings."""
+    true = vector(parameters)
+    found = []
+    for noise in NOISES:
+        of, raw = [], []
+        for seed in range(runs):
+            windows = noisy(recording, noise, seed)
+            likely = maximum_likelihood.estimate(windows, Identification()).values
+            of.append([[*_two_steps(windows, hz), likely] for hz in LOWPASSES_HZ])
+            raw.append(least_squares_of(_voltage_left_raw(windows), NO_LOWPASS_HZ))
+        relative = np.array(of) / true - 1.0, np.array(raw) / true - 1.0
+        found.append(Errors(noise, *relative, bound(parameters, recording, noise) / true))
+    return found
+
+
+def vector(parameters: Parameters) -> Float:
+    """Return the six parameters (6,)."""
+    return np.array([getattr(parameters, name) for name in PARAMETERS])
+
+
+def _two_steps(windows: Sequence[Window], lowpass_hz: float) -> list[Float]:
+    """Return [R, L, K, Jt, ft, Cd] by least squares with each operator, then by partial moments."""
+    found = [least_squares_of(windows, lowpass_hz, operator) for operator in OPERATORS.values()]
+    steps = partial_moments.horizon_steps(Identification(lowpass_hz=lowpass_hz), windows[0].dt_s)
+    return [*found, _solved([partial_moments.moments(window, steps) for window in windows])]
+
+
+def least_squares_of(
+    windows: Sequence[Window],
+    lowpass_hz: float,
+    operator: Operator = ZERO_FORCING_1,
+    rows: Sequence[Bool] | None = None,
+) -> Float:
+    """Return [R, L, K, Jt, ft, Cd] (6,) by least squares, of all or some ``rows`` (n,) of each window."""
+    parts = []
+    for k, window in enumerate(windows):
+        signals = least_squares.align(window, Identification(lowpass_hz=lowpass_hz))
+        if rows is not None:
+            signals = replace(signals, usable=signals.usable & rows[k])
+        parts.append(least_squares.regressors(signals, window.dt_s, operator))
+    return _solved(parts)
+
+
+def _solved(parts: Sequence[tuple[Float, Float]]) -> Float:
+    electrical, mechanical = (np.vstack([part[k] for part in parts]) for k in (0, 1))
+    values: Float = least_squares.solve_two_steps(electrical, mechanical)[0][least_squares.ORDER]
+    return values
+
+
+def _voltage_left_raw(windows: Sequence[Window]) -> list[Window]:
+    """Return the windows with the low-pass on current and speed alone."""
+    hz = Identification().lowpass_hz
+    return [
+        replace(
+            window,
+            current_a=frozen(zero_phase(window.current_a, hz, window.dt_s)),
+            speed_rad_s=frozen(zero_phase(window.speed_rad_s, hz, window.dt_s)),
+        )
+        for window in windows
+    ]
+
+
+def left_raw_of(parameters: Parameters, recording: Recording, noise: float) -> tuple[Float, Float]:
+    """Return the relative error of L (1,) with the low-pass on every signal, and with none on the voltage."""
+    windows, true = noisy(recording, noise, 0), vector(parameters)
+    alike = least_squares_of(windows, Identification().lowpass_hz) / true - 1.0
+    apart = least_squares_of(_voltage_left_raw(windows), NO_LOWPASS_HZ) / true - 1.0
+    place = PARAMETERS.index("L")
+    return alike[[place]], apart[[place]]
+
+
+def bound(parameters: Parameters, recording: Recording, noise: float) -> Float:
+    """Return the standard deviations (6,) of Cramer and Rao that the rows in which the drive surely moves allow."""
+    theta = np.append(vector(parameters), 0.0)
+    motion = prepare(find_windows(recording)[0])
+    problem = maximum_likelihood.pose([motion], theta, [Noise(*np.full(3, noise * FULL_SCALE).tolist())])
+    scales = maximum_likelihood.typical(theta, [motion])
+    slope = maximum_likelihood.jacobian(problem, theta, problem.residuals(theta), range(6), scales)
+    return np.asarray(np.sqrt(np.diag(np.linalg.inv(slope.T @ slope))))

@@ -1,0 +1,18 @@
+"""The derivative operators that the paper may have compared: its own, [4], and three rivals; it names none of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from fdhil.identification.derivatives import ZERO_FORCING_1, Operator
+
+OPERATORS: Mapping[str, Operator] = {
+    operator.name: operator
+    for operator in (
+        ZERO_FORCING_1,
+        Operator("zero_forcing_3_tap", (-1, 0, 1), ((math.sqrt(2) - 1) / 2, -math.sqrt(2), (1 + math.sqrt(2)) / 2)),
+        Operator("central", (-1, 0, 1), (-0.5, 0.0, 0.5)),
+        Operator("backward", (-1, 0), (-1.0, 1.0)),
+    )
+}

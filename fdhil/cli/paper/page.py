@@ -1,0 +1,168 @@
+"""Lays the claims out as one page and as one document for machines."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from fdhil.cli.paper.claims import Claim, Trial, Verdict
+from fdhil.cli.paper.scenarios import SCENARIOS
+from fdhil.report import Page, Section, Table
+from fdhil.store.output import open_output
+
+SCHEMA = "fdhil-paper-1"
+CITATION = (
+    'X. Desforges, A. Habbadi, G. Dessein, "Trajectory shortcoming prediction from physical parameter estimation"'
+)
+SHOWN, NOT_SHOWN = "✓", "✗"
+SUMMARY_HEAD = ("claim", "place in the paper", "verdict", "shown in")
+
+
+def counts(claims: Sequence[Claim]) -> dict[str, int]:
+    """Return how many claims have each verdict."""
+    found = Counter(claim.verdict for claim in claims)
+    return {verdict.value: found[verdict] for verdict in Verdict}
+
+
+def summary_rows(claims: Sequence[Claim]) -> list[list[str]]:
+    """Return one row per claim for ``SUMMARY_HEAD``."""
+    return [[claim.key, claim.source, claim.verdict.value, _shown(claim)] for claim in claims]
+
+
+def _shown(claim: Claim) -> str:
+    shown = sum(claim.shown_by(scenario) for scenario in claim.scenarios)
+    return f"{shown} of {len(claim.scenarios)} scenarios"
+
+
+def page(claims: Sequence[Claim]) -> Page:
+    """Return the page: the verdicts first, the scenarios, then claim by claim."""
+    return Page(
+        title="The paper, claim by claim",
+        subtitle=f"{CITATION}: every equation, figure and claim put to trials on simulated machines.",
+        headline=[(verdict, str(number)) for verdict, number in counts(claims).items()],
+        sections=[_verdicts(claims), *(_section(claim) for claim in claims), _scenarios(claims)],
+    )
+
+
+def _verdicts(claims: Sequence[Claim]) -> Section:
+    return Section(
+        "Verdicts",
+        "A trial is a number that has to lie within bounds in a scenario. A claim holds where all its scenarios show "
+        "it, with a condition where some do, and is not reproduced where none does. Nothing but this rule decides. "
+        "The safety ceiling of offsets on a machine does not apply: nothing here moves.",
+        tables=[Table(SUMMARY_HEAD, summary_rows(claims))],
+    )
+
+
+def _section(claim: Claim) -> Section:
+    condition = f": {claim.condition}" if claim.condition else ""
+    parts = [
+        claim.says,
+        f"The paper's value: {claim.paper}.",
+        f"Rule: {claim.rule}.",
+        f"Verdict: {claim.verdict.value}{condition}.",
+        claim.note,
+    ]
+    return Section(
+        f"{claim.source}: {claim.verdict.value}",
+        " ".join(part for part in parts if part),
+        tables=[_trials(claim), *claim.tables],
+        figures=[(picture.caption, picture.svg) for picture in claim.pictures],
+    )
+
+
+def _trials(claim: Claim) -> Table:
+    """Return a row a scenario, a column each thing that is measured, its bounds in the head."""
+    columns = list(dict.fromkeys((trial.what, trial.unit, trial.bounds) for trial in claim.trials))
+    cells = {(trial.scenario, trial.what): cell(trial) for trial in claim.trials}
+    head = ["scenario", *(f"{what}{f', {unit}' * bool(unit)} ({bounds})" for what, unit, bounds in columns)]
+    rows = [[scenario, *(cells.get((scenario, what), "") for what, _, _ in columns)] for scenario in claim.scenarios]
+    if len(columns) > 4:  # a long table is read more easily than a wide one
+        head = ["measured", *claim.scenarios]
+        rows = [
+            [f"{what}{f', {unit}' * bool(unit)} ({bounds})", *(cells.get((s, what), "") for s in claim.scenarios)]
+            for what, unit, bounds in columns
+        ]
+    return Table(head, rows, f"{SHOWN} lies within its bounds, {NOT_SHOWN} does not")
+
+
+def cell(trial: Trial) -> str:
+    """Return a trial's value with its mark."""
+    return f"{trial.value:.4g} {SHOWN if trial.holds else NOT_SHOWN}"
+
+
+def _scenarios(claims: Sequence[Claim]) -> Section:
+    used = {scenario for claim in claims for scenario in claim.scenarios}
+    rows = [
+        [name, scenario.title, ", ".join(f"{key} = {value}" for key, value in _once(scenario.changes).items())]
+        for name, scenario in SCENARIOS.items()
+        if name in used
+    ]
+    return Section(
+        "Scenarios",
+        "All are configs/paper.toml with the keys named here changed, the same for each axis.",
+        tables=[Table(("scenario", "what it is", "changed keys"), rows)],
+    )
+
+
+def _once(changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the changes with those of all axes told once."""
+    return {key.replace("axis.X.", "axis.*."): value for key, value in changes.items() if not key.startswith("axis.Y.")}
+
+
+def document(claims: Sequence[Claim], runs: int, version: str, files: Mapping[str, Sequence[str]]) -> dict[str, Any]:
+    """Return what ``paper.json`` holds; ``files`` are the names of each claim's pictures."""
+    return {
+        "schema": SCHEMA,
+        "fdhil": version,
+        "paper": CITATION,
+        "runs": runs,
+        "counts": counts(claims),
+        "scenarios": {
+            name: {"title": scenario.title, "changes": dict(scenario.changes), "programmed": scenario.programmed}
+            for name, scenario in SCENARIOS.items()
+        },
+        "claims": [_claim(claim, files[claim.key]) for claim in claims],
+    }
+
+
+def _claim(claim: Claim, files: Sequence[str]) -> dict[str, Any]:
+    return {
+        "key": claim.key,
+        "kind": claim.kind,
+        "source": claim.source,
+        "says": claim.says,
+        "paper": claim.paper,
+        "rule": claim.rule,
+        "verdict": claim.verdict.value,
+        "condition": claim.condition or None,
+        "note": claim.note or None,
+        "trials": [_trial(trial) for trial in claim.trials],
+        "tables": [
+            {"caption": t.caption, "head": list(t.head), "rows": [list(row) for row in t.rows]} for t in claim.tables
+        ],
+        "pictures": [
+            {"file": file, "caption": picture.caption} for file, picture in zip(files, claim.pictures, strict=True)
+        ],
+    }
+
+
+def _trial(trial: Trial) -> dict[str, Any]:
+    """Return a trial as JSON has it, where no number is infinite."""
+    numbers = {"value": trial.value, "least": trial.least, "most": trial.most}
+    told = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+    return {"scenario": trial.scenario, "what": trial.what, "unit": trial.unit, **told, "holds": trial.holds}
+
+
+def write_pictures(claims: Sequence[Claim], folder: Path) -> dict[str, list[str]]:
+    """Write each picture below ``folder`` as an SVG file; return the names of each claim's, from that folder."""
+    names: dict[str, list[str]] = {}
+    for claim in claims:
+        names[claim.key] = [f"pictures/{claim.key}-{k}.svg" for k in range(1, len(claim.pictures) + 1)]
+        for name, picture in zip(names[claim.key], claim.pictures, strict=True):
+            with open_output(folder / name) as file:
+                file.write(picture.svg.encode())
+    return names

@@ -1,0 +1,262 @@
+"""fdhil init: answers, questions, LinuxCNC's files and drives become a file that every command accepts."""
+
+from __future__ import annotations
+
+import io
+import json
+import threading
+import tomllib
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+
+from fdhil import config as machine_config
+from fdhil.cli.demo.toml import to_toml
+from fdhil.cli.main import cli, run_safely
+from fdhil.config.template import filled
+from tests.commissioning.test_linuxcnc_files import HAL_TEXT, INI
+from tests.drivers.peer import DrivePeer
+from tests.drivers.wire import machine
+
+Said = Callable[..., tuple[int, str, str]]
+ROOT = Path(__file__).parents[2]
+SHEET: dict[str, Any] = {
+    "nominal": {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075},
+    "regulators": {"voltage_limit_v": 300.0},
+    "drive": {"profile": "fdhil_twin", "rated_current_a": 50.0},
+}
+RAPID = {"screw_pitch_mm": 20.0, "rapid_speed_mm_s": 500.0, "max_acceleration_mm_s2": 4000.0}
+
+
+@pytest.fixture
+def fdhil(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Said:
+    """Run a command in this process, ``said`` on its standard input: exit code, stdout and stderr."""
+    monkeypatch.setattr("fdhil.cli.init.INTERFACES", Path("no interfaces"))
+    monkeypatch.setattr("fdhil.commissioning.scan.LISTEN_S", 0.2)
+    monkeypatch.setattr("fdhil.drivers.can.sdo.QUIET_S", 0.1)
+    monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.2)
+
+    def run(*arguments: object, said: str = "") -> tuple[int, str, str]:
+        monkeypatch.setattr("sys.argv", ["fdhil", *map(str, arguments)])
+        monkeypatch.setattr("sys.stdin", io.StringIO(said))
+        code = run_safely(cli)
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return run
+
+
+@pytest.fixture
+def bus() -> dict[str, Any]:
+    """A bus inside this process."""
+    return {"can0": {"interface": "virtual", "channel": uuid.uuid4().hex}}
+
+
+@pytest.fixture
+def peer(bus: dict[str, Any]) -> Iterator[DrivePeer]:
+    """A simulated drive on that bus."""
+    with DrivePeer(machine(bus=bus["can0"])) as running:
+        yield running
+
+
+def written(folder: Path, **tables: Any) -> Path:
+    path = folder / "answers.toml"
+    path.write_text(to_toml(tables))
+    return path
+
+
+def test_linuxcncs_files_and_few_answers_make_a_machine(fdhil: Said, tmp_path: Path) -> None:
+    (tmp_path / "mill.ini").write_text(INI.replace("X Y Z", "X Y"))
+    (tmp_path / "drives.hal").write_text(HAL_TEXT)
+    sheet = SHEET | {"screw_pitch_mm": 10.0}
+    answers = written(tmp_path, axis={"X": sheet | {"correction": {"max_offset_um": 40.0}}, "Y": sheet})
+    file = tmp_path / "mill.toml"
+    arguments = ("init", file, "--from-linuxcnc", tmp_path / "mill.ini", "--answers", answers, "--offline")
+    code, out, err = fdhil(*arguments)
+    assert code == 0, err
+    assert "next: fdhil doctor" in out
+    made = machine_config.load(file)
+    x, y = made.axis["X"], made.axis["Y"]
+    assert (made.machine.name, made.machine.sync_period_s, made.nc.profile) == ("Mill No 3", 0.002, "linuxcnc")
+    assert (x.rapid_speed_mm_s, x.drive.increments_per_rev, x.drive.sign) == (400.0, 10000, 1)
+    assert (y.drive.increments_per_rev, y.drive.sign) == (8192, -1)
+    assert (x.correction is not None, y.correction is not None) == (True, False)
+    text = file.read_text()
+    assert "rapid_speed_mm_s = 400.0  # LinuxCNC: [TRAJ] MAX_LINEAR_VELOCITY" in text
+    assert "# travel per motor revolution" in text or "# table travel per motor revolution" in text
+    assert "R = 0.5  # from the answers" in text
+    assert "Cd = 2.0  # guessed: 5 % of the continuous torque; the first rapids tell it" in text
+    assert "/work" not in text
+
+
+def test_what_is_missing_is_named_at_once_and_nothing_is_written(fdhil: Said, tmp_path: Path) -> None:
+    file = tmp_path / "m.toml"
+    code, out, err = fdhil("init", file, "--answers", written(tmp_path, axis={"X": RAPID}), "--offline", "--json")
+    assert (code, err) == (2, "")
+    faults = [fault["path"].removeprefix("axis.X.") for fault in json.loads(out)["error"]["faults"]]
+    assert faults == [
+        "drive.profile", "drive.increments_per_rev", "nominal.R", "nominal.L", "nominal.K", "nominal.Jt",
+        "regulators.current_limit_a", "regulators.voltage_limit_v",
+    ]  # fmt: skip
+    assert not file.exists()
+
+
+def test_a_file_that_is_there_is_kept(fdhil: Said, tmp_path: Path) -> None:
+    file = tmp_path / "m.toml"
+    file.write_text("mine")
+    code, _, err = fdhil("init", file, "--offline")
+    assert code == 3
+    assert "never overwrites" in err
+    assert file.read_text() == "mine"
+
+
+def test_a_dry_run_prints_the_file_and_writes_none(fdhil: Said, tmp_path: Path) -> None:
+    axis = SHEET | RAPID | {"drive": SHEET["drive"] | {"increments_per_rev": 65536}}
+    answers = written(tmp_path, axis={"X": axis})
+    code, out, err = fdhil("init", tmp_path / "m.toml", "--answers", answers, "--offline", "--dry-run")
+    assert code == 0
+    assert machine_config.parse(tomllib.loads(out)).axis["X"].nominal.R == 0.5
+    assert "would be written" in err
+    assert not (tmp_path / "m.toml").exists()
+
+
+def test_an_unknown_answer_is_refused_with_a_suggestion(fdhil: Said, tmp_path: Path) -> None:
+    axis = SHEET | RAPID | {"drive": SHEET["drive"] | {"increments_per_rev": 65536}, "screw_pich_mm": 5.0}
+    code, _, err = fdhil("init", tmp_path / "m.toml", "--answers", written(tmp_path, axis={"X": axis}), "--offline")
+    assert code == 2
+    assert "axis.X.screw_pich_mm: is no key of this section (did you mean 'screw_pitch_mm'?)" in err
+
+
+@pytest.mark.parametrize(
+    ("tables", "words"),
+    [
+        ({"bus": {"can0": {"interface": "tin"}}}, "bus.can0.interface"),
+        ({"axis": {"X": {"drive": {"profile": "epos5"}}}}, "axis.X.drive.profile"),
+        ({"axis": {"X": {"drive": {"profile": "cia402", "eds": "lost.eds"}}}}, "lost.eds"),
+        ({"axis": {"X": 3}}, "axis.X"),
+        ({"axis": {"X": {"screw_pitch_mm": "wide"}}}, "screw_pitch_mm"),
+        ({"machine": {"sync_period_s": "often"}}, "sync_period_s"),
+    ],
+)
+def test_a_wrong_answer_is_told_by_its_key(tables: dict[str, Any], words: str, fdhil: Said, tmp_path: Path) -> None:
+    code, _, err = fdhil("init", tmp_path / "m.toml", "--answers", written(tmp_path, **tables), "--offline")
+    assert code in (2, 3)
+    assert words in err
+    assert "Traceback" not in err
+
+
+def test_the_drive_tells_its_scales_and_the_operator_the_rest(
+    fdhil: Said, peer: DrivePeer, bus: dict[str, Any], tmp_path: Path
+) -> None:
+    """A wrong answer is asked again, an empty line takes the proposal."""
+    lines = [
+        "tin can", "virtual", bus["can0"]["channel"], "", "", "X1", "X", "20", "500", "4 m/s2", "4000", "0,5", "0.5",
+        "0.005", "", "0.075", *[""] * 8, "yes",
+    ]  # fmt: skip
+    file = tmp_path / "m.toml"
+    code, out, err = fdhil("init", file, said="\n".join(lines) + "\n")
+    assert code == 0, err
+    assert err.count("once more") == 4
+    assert "node 1 (fdhil twin drive" in err
+    made = machine_config.load(file).axis["X"]
+    assert (made.drive.profile, made.drive.increments_per_rev, made.nominal.K) == ("fdhil_twin", 65536, 0.8)
+    assert (made.nominal.Jt, made.correction is not None) == (0.075, True)
+    assert "check axis.X.nominal.K = 0.8: guessed: the drive's rated torque" in out
+    assert set(peer.heard) == {*range(0x601, 0x680)}, "only SDO requests, to every node-ID once"
+
+
+def test_numbers_that_cannot_be_of_one_machine_are_asked_again(
+    fdhil: Said, bus: dict[str, Any], tmp_path: Path
+) -> None:
+    """5 H instead of 5 mH is seen at the end, and only that is asked again."""
+    lines = [
+        "virtual", bus["can0"]["channel"], "", "", "X", "", "fdhil_twin", "20", "65536", "500", "4000", "50", "0.5",
+        "5", "0.8", "0.075", "", "300", *[""] * 8, "no", "0.005", "12.566",
+    ]  # fmt: skip
+    file = tmp_path / "m.toml"
+    code, out, err = fdhil("init", file, "--offline", said="\n".join(lines) + "\n")
+    assert code == 0, (err, out)
+    assert "it cannot be" in err
+    assert machine_config.load(file).axis["X"].nominal.L == 0.005
+
+
+def test_who_goes_away_leaves_nothing(fdhil: Said, tmp_path: Path) -> None:
+    code, _, err = fdhil("init", tmp_path / "m.toml", "--offline", said="socketcan\n")
+    assert code == 130
+    assert "stopped by the operator" in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_beside_an_nc_nothing_is_sent(fdhil: Said, peer: DrivePeer, bus: dict[str, Any], tmp_path: Path) -> None:
+    """The drive is known by its node-ID alone, so that its scales are asked; the period is heard."""
+    axis = SHEET | RAPID | {"drive": SHEET["drive"] | {"increments_per_rev": 65536}}
+    answers = written(tmp_path, axis={"X": axis}, bus=bus, machine={"sync_period_s": 0.001})
+    stop = threading.Event()
+    with can.Bus(interface="virtual", channel=bus["can0"]["channel"]) as nc:
+
+        def run() -> None:
+            while not stop.wait(0.002):
+                nc.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+
+        thread = threading.Thread(target=run)
+        thread.start()
+        try:
+            code, out, err = fdhil("init", tmp_path / "m.toml", "--answers", answers)
+        finally:
+            stop.set()
+            thread.join()
+    assert code == 0, err
+    assert set(peer.heard) == {0x80}
+    assert "an NC runs it (SYNC heard), so no drive was asked" in out
+
+
+def test_an_answer_that_the_drive_contradicts_is_noted(
+    fdhil: Said, peer: DrivePeer, bus: dict[str, Any], tmp_path: Path
+) -> None:
+    sheet = SHEET | RAPID | {"drive": {"increments_per_rev": 4096}}
+    code, out, err = fdhil("init", tmp_path / "m.toml", "--answers", written(tmp_path, axis={"X": sheet}, bus=bus))
+    assert code == 0, err
+    assert "note: axis.X.drive.increments_per_rev: the answers say 4096, the drive 65536" in out
+    assert machine_config.load(tmp_path / "m.toml").axis["X"].drive.increments_per_rev == 4096
+
+
+def test_an_axis_without_a_drive_is_refused(fdhil: Said, peer: DrivePeer, bus: dict[str, Any], tmp_path: Path) -> None:
+    sheet = SHEET | RAPID
+    answers = written(tmp_path, axis={"X": sheet, "Y": sheet}, bus=bus)
+    code, _, err = fdhil("init", tmp_path / "m.toml", "--answers", answers)
+    assert code == 2
+    assert "axis.Y.drive: has no drive: 1 found, 1 given to other axes" in err
+    answers = written(tmp_path, axis={"X": SHEET | RAPID | {"drive": {"node_id": 9}}}, bus=bus)
+    code, _, err = fdhil("init", tmp_path / "m.toml", "--answers", answers)
+    assert code == 2
+    assert "axis.X.drive.node_id: is 9, which is not on the bus (node 1 (fdhil twin drive" in err
+
+
+def test_a_pc_without_can_says_what_to_give(fdhil: Said, tmp_path: Path) -> None:
+    code, _, err = fdhil("init", tmp_path / "m.toml", "--answers", written(tmp_path, axis={"X": SHEET}))
+    assert code == 2
+    assert "bus.can0.interface" in err
+    assert "can-adapter.md" in err
+
+
+def test_the_pcs_own_can_interface_is_proposed(fdhil: Said, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, kind in (("can3", 280), ("eth0", 1)):
+        (tmp_path / "net" / name).mkdir(parents=True)
+        (tmp_path / "net" / name / "type").write_text(f"{kind}\n")
+    monkeypatch.setattr("fdhil.cli.init.INTERFACES", tmp_path / "net")
+    axis = SHEET | RAPID | {"drive": SHEET["drive"] | {"increments_per_rev": 65536}}
+    code, _, err = fdhil("init", tmp_path / "m.toml", "--answers", written(tmp_path, axis={"X": axis}), "--offline")
+    assert code == 0, err
+    made = machine_config.load(tmp_path / "m.toml").bus["can0"]
+    assert (made.interface, made.channel) == ("socketcan", "can3")
+
+
+@pytest.mark.parametrize("name", ["sim", "realistic", "four-axes", "vcan", "machine-template"])
+def test_a_configuration_written_with_its_comments_means_the_same(name: str) -> None:
+    document = tomllib.loads((ROOT / "configs" / f"{name}.toml").read_text("utf-8"))
+    again = tomllib.loads(filled(document, {"machine.name": 'a "source" \\ of it'}, "head"))
+    assert again == document

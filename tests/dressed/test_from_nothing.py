@@ -1,0 +1,207 @@
+"""From nothing to a corrected move, with drives of every make: init by answers, check, commission, arm, move.
+
+The machine is one; what fdhil knows of it is the file that init made. What the drive does not tell is answered.
+"""
+
+from __future__ import annotations
+
+import json
+import uuid
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil import config as machine_config
+from fdhil import correction
+from fdhil.arming.guard_settings import settings_of
+from fdhil.cia402 import pack
+from fdhil.cli.demo.toml import to_toml
+from fdhil.commissioning.config_check import check_machine
+from fdhil.commissioning.record import save_record
+from fdhil.commissioning.steps import commission
+from fdhil.config import MachineConfig
+from fdhil.errors import DriveFault
+from fdhil.guard import core
+from fdhil.guard.frames import Listener
+from fdhil.guard.path import CorrectedPath
+from fdhil.guard.protocol import Mode
+from fdhil.guard.state import Inputs, Output, Request, initial
+from fdhil.records import Float, Parameters, Trajectory
+from tests.bench import AXIS, bench_document
+from tests.daemon.shop import fdhil
+from tests.dressed.test_set_up import on_a_bus, quick
+from tests.dressed.wardrobe import OUTFITS, Outfit, started
+from tests.drivers.peer import DrivePeer
+from tests.guard.machine import FACTS_GIVEN
+from tests.sim.bench_twin import PERIOD_S, TwinInHand, smooth, trajectory
+from tests.sim.rig import NO_NOISE
+
+Capture = pytest.CaptureFixture[str]
+__all__ = ["quick"]  # a fixture: shorter waits than on a real machine
+PROGRAM = "program-1"
+EVERY = pytest.mark.parametrize("outfit", OUTFITS, ids=lambda outfit: outfit.name)
+# what a retrofitter reads from labels, data sheets and the drive's tool, where the drive does not tell it
+KNOWN = {
+    "drive.increments_per_rev": 65536,
+    "drive.rated_current_a": 50.0,
+    "drive.rated_torque_nm": 1.0,
+    "drive.dc_link_v": 300.0,
+    "regulators.current_limit_a": 200.0,
+    "regulators.voltage_limit_v": 300.0,
+    **{f"nominal.{key}": value for key, value in AXIS["nominal"].items()},
+}
+
+
+def answers_of(outfit: Outfit, machine: MachineConfig) -> dict[str, Any]:
+    """What the drives cannot tell of this machine."""
+    axis = machine.axis["X"]
+    bus = machine.bus["can0"]
+    drive = {key: value for key, value in outfit.drive.items() if key == "logical_axis"}
+    if outfit.profile in ("cia402", "schunk"):
+        drive["profile"] = outfit.profile
+    return {
+        "bus": {"can0": {"interface": bus.interface, "channel": bus.channel}},
+        "guard": {"clock": "sync"},
+        "axis": {
+            "X": {
+                "screw_pitch_mm": axis.screw_pitch_mm,
+                "rapid_speed_mm_s": axis.rapid_speed_mm_s,
+                "max_acceleration_mm_s2": axis.max_acceleration_mm_s2,
+                "correction": dict(AXIS["correction"]),
+            }
+            | ({"drive": drive} if drive else {})
+        },
+    }
+
+
+def made(outfit: Outfit, machine: MachineConfig, folder: Path, capsys: Capture) -> MachineConfig:
+    """Run init until it has all it needs; what it misses it names, and is told."""
+    file, answers = folder / "machine.toml", answers_of(outfit, machine)
+    given = folder / "answers.toml"
+    given.write_text(to_toml(answers))
+    code, out, err = fdhil("init", file, "--answers", given, "--json", capsys=capsys)
+    assert code == 2, out + err
+    missing = [fault["path"] for fault in json.loads(out)["error"]["faults"]]
+    assert not file.exists()
+    for path in missing:
+        key = path.removeprefix("axis.X.")
+        table, _, name = key.partition(".")
+        answers["axis"]["X"].setdefault(table, {})[name] = KNOWN[key]
+    given.write_text(to_toml(answers))
+    code, out, err = fdhil("init", file, "--answers", given, capsys=capsys)
+    assert code == 0, out + err
+    return machine_config.load(file)
+
+
+class Guarded:
+    """The machine with the guard's core beside it, as its process runs it: one decision after each SYNC."""
+
+    def __init__(self, twin: TwinInHand, config: MachineConfig, folder: Path, path: CorrectedPath) -> None:
+        self.settings = settings_of(config, "can0", folder, "")
+        self.listener, self.state = Listener(self.settings), initial(self.settings)
+        self.twin, self.path, self.outputs = twin, path, list[Output]()
+        self.request: Request | None = None
+        self.heard = len(twin.wire)
+        self.tick = 0
+        twin.each_cycle = self.turn
+
+    def turn(self) -> None:
+        """Hear the frames of one cycle; its SYNC is the first of them."""
+        for can_id, data in self.twin.wire[self.heard :]:
+            if can_id == 0x080:
+                self._decide(data)
+            else:
+                self.listener.take(can_id, data, self.tick * PERIOD_S)
+        self.heard = len(self.twin.wire)
+
+    def _decide(self, sync: bytes) -> None:
+        self.tick += 1
+        now_s = self.tick * PERIOD_S
+        axes, bus = self.listener.at_sync(sync, now_s, now_s)
+        inputs = Inputs(True, axes, bus, alarms=self.listener.alarms(), path=self.path, request=self.request)
+        self.request = None
+        self.state, output = core.step(self.state, inputs, self.settings)
+        self.outputs.append(output)
+        if output.offsets is not None:
+            for axis, offset in zip(self.settings.axes, output.offsets, strict=True):
+                self.twin.machine.receive("can0", (axis.offset.cob_id, pack(axis.offset.entries, [offset])))
+
+
+def to_and_fro() -> Trajectory:
+    """A feed move out and back, at rest at both ends."""
+    way = np.concatenate([np.linspace(0, 15, 200), np.linspace(15, 0, 200)])
+    rest = np.zeros(70)
+    return trajectory(smooth(np.concatenate([rest, way, rest])[:, None]), axes="X")
+
+
+def planned(config: MachineConfig, demand: Trajectory) -> Float:
+    """The offset (n,) um that the file's model asks for."""
+    models = {axis: Parameters(**settings.nominal.model_dump()) for axis, settings in config.axis.items()}
+    found = correction.plan(demand, models, config, "inverse")
+    assert not found.refused
+    return found.offset_um["X"]
+
+
+def off_path_um(twin: TwinInHand, demand: Trajectory) -> float:
+    """Let the NC play, and return by how much the table leaves the demand at most, the constant delay aside."""
+    begin = len(twin.table)
+    twin.machine.nc.play("move", demand)
+    twin.run_until("finished")
+    table, path = np.array(twin.table[begin:])[:, 0], demand.position_mm["X"]
+    n = len(path) - 60
+    return 1e3 * min(float(np.abs(table[late : late + n] - path[:n]).max()) for late in range(60))
+
+
+def corrected_on_line(machine: MachineConfig, config: MachineConfig, folder: Path) -> None:
+    """Commission over the bus, then arm the guard on the machine, and move."""
+    save_record(commission(config, "X"), config.store.directory)
+    demand = to_and_fro()
+    offset_um = planned(config, demand)
+    per_mm = config.axis["X"].scaling.increments_per_mm
+    rows = tuple(tuple(round(x) for x in column * per_mm) for column in (demand.position_mm["X"], offset_um * 1e-3))
+    path = CorrectedPath(0, rows[:1], rows[1:], True, PROGRAM)
+    before = off_path_um(started(machine), demand)
+    twin = started(machine)
+    guard = Guarded(twin, config, folder, path)
+    twin.run(200)
+    guard.request = Request("arm", True, PROGRAM, FACTS_GIVEN)
+    twin.run(20)
+    assert guard.state.mode is Mode.ARMED, guard.outputs[-20:]
+    after = off_path_um(twin, demand)
+    assert any(output.offsets and any(output.offsets) for output in guard.outputs)
+    assert after < before / 4, (before, after)
+
+
+def corrected_by_the_demand(config: MachineConfig) -> None:
+    """A drive without an offset is refused where one would be sent; the NC is given the corrected demand instead."""
+    with pytest.raises(DriveFault, match="corrected demand"):
+        commission(config, "X")
+    assert np.abs(planned(config, to_and_fro())).max() > 10
+
+
+@EVERY
+def test_from_nothing(outfit: Outfit, tmp_path: Path, capsys: Capture) -> None:
+    with on_a_bus(outfit, tmp_path) as (_, machine):
+        walked_through(outfit, machine, tmp_path, capsys)
+
+
+def test_the_simulated_drive_needs_least(tmp_path: Path, capsys: Capture) -> None:
+    bus = {"can0": {"interface": "virtual", "channel": uuid.uuid4().hex}}
+    machine = machine_config.parse(bench_document("X") | {"bus": bus, "sim": {"noise": NO_NOISE}})
+    with DrivePeer(machine):
+        walked_through(Outfit("fdhil_twin", "", on_line=True), machine, tmp_path, capsys)
+
+
+def walked_through(outfit: Outfit, machine: MachineConfig, folder: Path, capsys: Capture) -> None:
+    """Init, check, commission, arm and move; a drive that takes no offset gets the corrected demand."""
+    config = made(outfit, machine, folder, capsys)
+    drive = config.axis["X"].drive
+    assert (drive.profile, drive.logical_axis) == (outfit.profile, machine.axis["X"].drive.logical_axis)
+    differ = {finding.point for _, finding in check_machine(config) if finding.ok is False}
+    assert differ <= set(outfit.lacks)
+    if outfit.on_line:
+        corrected_on_line(machine, config, folder)
+    elif outfit.led:
+        corrected_by_the_demand(config)

@@ -1,0 +1,87 @@
+"""The fixture for other people's tests: used from a test suite of its own, as a package's user would."""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+
+pytest_plugins = ["pytester"]
+
+MASTER = """
+import canopen
+import pytest
+
+
+def test_a_master_made_with_canopen_moves_a_drive(feed_drive_bench):
+    bench = feed_drive_bench(axes="X")
+    network = canopen.Network()
+    network.connect(**bench.bus_arguments)
+    try:
+        node = network.add_node(bench.drive()["node_id"], bench.drive()["eds"])
+        node.nmt.state = "OPERATIONAL"
+        node.sdo[0x6060].raw = 1  # profile position
+        for word in (0x06, 0x07, 0x0F):
+            node.sdo[0x6040].raw = word
+        goal = round(2.0 * bench.drive()["increments_per_mm"])
+        node.sdo[0x607A].raw = goal
+        node.sdo[0x6040].raw = 0x1F
+        while not node.sdo[0x6041].raw & 0x400 or abs(node.sdo[0x6064].raw - goal) > 50:
+            pass
+        assert bench.position_mm() == pytest.approx(2.0, abs=0.05)
+    finally:
+        network.disconnect()
+
+
+def test_an_emergency_is_heard(feed_drive_bench):
+    bench = feed_drive_bench(axes="X", changes={"axis": {"X": {"drive": {"node_id": 9}}}})
+    bus = bench.join()
+    bench.command("nc", on=True)
+    bench.wait_for("nc")
+    bench.fault("trip", value=0x3210)
+    for message in bus:
+        if message.arbitration_id == 0x89:
+            break
+    assert message.data[:2] == b"\x10\x32"
+
+
+def test_its_own_nc_plays_a_program(feed_drive_bench, tmp_path):
+    bench = feed_drive_bench(pace="lockstep")
+    bench.play("G0 X3 Y1", trace=tmp_path / "trace.csv")
+    assert bench.wait_for("finished")["rows"] > 100
+    assert bench.position_mm("Y") == pytest.approx(1.0, abs=0.01)
+    assert (tmp_path / "trace.csv").stat().st_size > 1000
+
+
+def test_what_it_cannot_do_fails_the_test(feed_drive_bench):
+    bench = feed_drive_bench()
+    bench.fault("trip")
+"""
+
+
+@pytest.mark.parametrize("bus", ["virtual", "hub"])
+def test_a_suite_of_somebody_else_uses_it(bus: str, pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(MASTER)
+    pytester.makeini("[pytest]\nasyncio_default_fixture_loop_scope = function\n")
+    named = () if entry_points(group="pytest11", name="fdhil") else ("-p", "fdhil.pytest_plugin")  # not installed yet
+    result = pytester.runpytest_subprocess("-q", *named, f"--feed-drive-bus={bus}")
+    result.assert_outcomes(passed=3, failed=1)
+    result.stdout.fnmatch_lines(["*the feed drive bench cannot: *trip needs a value*"])
+
+
+def test_its_configuration_is_one_that_commands_take(tmp_path: Path) -> None:
+    from fdhil import config
+    from fdhil.pytest_plugin import FeedDriveBench
+
+    with FeedDriveBench(tmp_path, axes="XZ", modbus=True) as bench:
+        machine = config.load(bench.write_config())
+    assert [*machine.axis] == ["X", "Z"]
+    assert machine.axis["Z"].voltage.port == bench.ready["modbus"]["Z"]["port"]
+
+
+def test_the_package_tells_pytest_of_it() -> None:
+    import tomllib
+
+    document = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text("utf-8"))
+    assert document["project"]["entry-points"]["pytest11"] == {"fdhil": "fdhil.pytest_plugin"}
