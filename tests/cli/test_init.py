@@ -276,6 +276,18 @@ def test_an_axis_without_a_drive_is_refused(fdhil: Said, peer: DrivePeer, bus: d
     assert "axis.X.drive.node_id: is 9, which is not on the bus (node 1 (fdhil twin drive" in err
 
 
+def test_a_drive_that_was_given_to_an_axis_is_not_proposed_to_another(
+    fdhil: Said, peer: DrivePeer, bus: dict[str, Any], tmp_path: Path
+) -> None:
+    with DrivePeer(machine(axes="XY", bus=bus["can0"]), "Y"):
+        sheet = SHEET | RAPID | {"drive": {}}
+        answers = written(tmp_path, axis={"X": sheet, "Y": sheet | {"drive": {"node_id": 1}}}, bus=bus)
+        code, _, err = fdhil("init", tmp_path / "m.toml", "--answers", answers)
+    assert code == 0, err
+    made = machine_config.load(tmp_path / "m.toml")
+    assert {axis: made.node_id(axis) for axis in made.axis} == {"X": 2, "Y": 1}
+
+
 def test_a_pc_without_can_says_what_to_give(fdhil: Said, tmp_path: Path) -> None:
     code, _, err = fdhil("init", tmp_path / "m.toml", "--answers", written(tmp_path, axis={"X": SHEET}))
     assert code == 2
