@@ -40,6 +40,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "replay": ("fdhil.cli.records:replay", "Analyse a recorded window again, bit by bit as the daemon did."),
     "history": ("fdhil.cli.records:history", "Show how the parameters moved."),
     "report": ("fdhil.cli.records:report", "Write an HTML report of the stored history."),
+    "acceptance": ("fdhil.cli.acceptance:acceptance", "Write the acceptance report of a machine, to be signed."),
     "export": ("fdhil.cli.records:export", "Write a recording, or a log of the bus, in another file format."),
 }
 
