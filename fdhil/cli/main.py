@@ -21,7 +21,6 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
         "fdhil.cli.init:init",
         "Make a machine's configuration from nothing: the NC's files, the drives, questions.",
     ),
-    "paper": ("fdhil.cli.paper:paper", "Reproduce the paper that fdhil goes back to, claim by claim."),
     "scan": ("fdhil.cli.commissioning:scan", "List what is on the bus: nodes, identity, state, heartbeat."),
     "check": ("fdhil.cli.commissioning:check", "Check that the machine on the bus is the one in the config."),
     "commission": ("fdhil.cli.commission:commission", "Commission the drives, step by step."),
@@ -44,6 +43,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "history": ("fdhil.cli.records:history", "Show how the parameters moved."),
     "report": ("fdhil.cli.records:report", "Write an HTML report of the stored history."),
     "export": ("fdhil.cli.records:export", "Write a recording, or a log of the bus, in another file format."),
+    "paper": ("fdhil.cli.paper:paper", "Reproduce the paper that fdhil goes back to, claim by claim."),
 }
 
 # the matrices of a window are small: threads of the numeric libraries only spin, and this PC has an NC beside it
