@@ -73,6 +73,7 @@ class Cycle:
     """The thread that runs some buses; a context manager. Nothing is sent before ``produce_sync`` or by the members.
 
     ``path`` gives the members' set-points while it is there, in their order; ``failure`` is what ended the thread.
+    ``guarded`` are the COB-IDs per bus that a guard beside it sends, and no member does.
     ``realtime``: it asks for a real-time priority; ``scheduling`` says what it was given.
     """
 
@@ -80,6 +81,7 @@ class Cycle:
         self.config = config
         self.period_s = config.machine.sync_period_s
         self.buses = {name: TransmitBus(name, config.bus[name]) for name in buses}
+        self.guarded: dict[str, set[int]] = {name: set() for name in self.buses}
         self.members: list[Member] = []
         self.path: SetPoints | None = None
         self.heartbeat: int | None = None

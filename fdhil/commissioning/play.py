@@ -106,7 +106,7 @@ def _require_inside(plan: Plan) -> None:
     while not points.resting and points.stopped is None:
         points.step()
     if points.stopped is not None:
-        row = min(points.cycles, len(rows)) - 1
+        row = min(points.played, len(rows) - 1)
         where = f"{plan.trajectory.time_s[row]:.3f} s, {plan.trajectory.place(row)}"
         advice = "nothing was sent; change the program, or [axis.*.setpoints] where the machine has room for it"
         raise DriveFault("the demand", f"{points.stopped} (row {row + 1}, {where}); {advice}")
@@ -261,26 +261,29 @@ class Bench:
         rows = straight(here, goal.tolist(), slow, gently, APPROACH_CYCLES)
         return self._played(rows, signals).stopped
 
-    def play(self, signals: Signals) -> Played:
-        """Play the demand from where the axes are held."""
+    def play(self, signals: Signals, begin: Callable[[], bool] = lambda: True) -> Played:
+        """Play the demand from where the axes are held, as soon as ``begin`` is true."""
         rows = self.plan.rows([master.target or 0 for master in self.masters])
         self.loop.lateness = Lateness()
-        return self._played(rows, signals)
+        return self._played(rows, signals, begin)
 
-    def _played(self, rows: Float, signals: Signals) -> Played:
+    def _played(self, rows: Float, signals: Signals, begin: Callable[[], bool] = lambda: True) -> Played:
         loop = self.loop
         with following(self.masters, self.plan.bounds) as path, signals(path):
+            while path.stopped is None and not begin():
+                self._watch(path)
             path.play(_in_blocks(rows))
             while not path.resting:
-                loop.check()
-                watch_power(self.masters, path)
-                time.sleep(loop.period_s)
-            lateness = loop.lateness
+                self._watch(path)
             if path.stopped is None:
                 self.masters[0].wait_cycles(round(SETTLE_S / loop.period_s))
                 watch_power(self.masters, path)
-        count = min(path.cycles, len(rows))
-        return Played(count, len(rows), path.stopped, lateness, loop.scheduling)
+        return Played(path.played, len(rows), path.stopped, loop.lateness, loop.scheduling)
+
+    def _watch(self, path: SetPoints) -> None:
+        self.loop.check()
+        watch_power(self.masters, path)
+        time.sleep(self.loop.period_s)
 
 
 def _in_blocks(rows: Float) -> Iterator[list[float]]:

@@ -18,7 +18,7 @@ from fdhil.config.reading import checked
 from fdhil.drivers.cia402.abilities import GENERIC
 from fdhil.drivers.cia402.profile import DriveProfile
 from fdhil.drivers.cia402.profile_file import NO_OFFSET_ADVICE, load_profile, no_offset
-from fdhil.errors import ConfigError, ConfigFault
+from fdhil.errors import ConfigError, ConfigFault, EdsError
 
 UNITS_OF_CURRENT = {
     "drive.rated_current_a": ("permille_of_rated", "share_of_rated"),
@@ -35,8 +35,8 @@ class Found:
     complete: bool
 
 
-def settle_machine(draft: Draft, buses: Sequence[FoundBus], name: str) -> None:
-    """Settle [machine]: its name, and the SYNC period that files, answers or the bus tell."""
+def settle_machine(draft: Draft, buses: Sequence[FoundBus], name: str, nc: Machine | None) -> None:
+    """Settle [machine]: its name, and the SYNC period that files, answers or the bus tell; and how G0 is seen."""
     draft.settle("machine.name", "any name", Told(name, "guessed: the file's name", guessed=True))
     for bus in buses:
         if bus.master is not None:
@@ -51,6 +51,10 @@ def settle_machine(draft: Draft, buses: Sequence[FoundBus], name: str) -> None:
     if len(cycles) == 1:
         usual = Told(cycles.pop(), "guessed: the drives' own cycle, 0x60C2; it must be the NC's", guessed=True)
     draft.settle("machine.sync_period_s", "the NC's cycle: how often it sends SYNC", usual)
+    if nc is not None:
+        where = "linuxcnc where its HAL file loads fdhil's bridge: line and override are then known; else inferred"
+        by_motion = "guessed: by the motion; 'linuxcnc' where its HAL file loads fdhil's bridge"
+        draft.settle("g0.source", where, Told("inferred", by_motion, guessed=True))
 
 
 def _cycle(heard_s: float) -> float:
@@ -160,16 +164,34 @@ def _tell_place(draft: Draft, path: str, drive: FoundDrive) -> None:
 
 
 def _settle_profile(draft: Draft, axis: str, drive: FoundDrive | None, folder: Path) -> DriveProfile | None:
-    """Settle the drive's profile, and its EDS where that is needed; return it, None where it is not known."""
+    """Settle the drive's profile, and its EDS where that is needed; return it, None where it is not known.
+
+    One that cannot be read, or hears too little of the drive, is asked again where somebody can be.
+    """
     path = f"axis.{axis}.drive"
     if drive is not None and drive.profile is not None:
         by = f"by its EDS {drive.eds.name}" if drive.eds else "by its vendor number"
         draft.tell(f"{path}.profile", Told(drive.profile, f"{by}: {drive.label}"))
     draft.settle(f"{path}.profile", "`fdhil eds` suggests one by the drive's EDS; cia402 takes what that offers")
+    while True:
+        _settle_eds(draft, path, drive, folder)
+        try:
+            return _profile(draft, path, folder)
+        except (ConfigError, EdsError) as error:
+            if draft.ask is None:
+                raise
+            draft.ask_again(f"{path}.profile", str(error))
+            draft.values.pop(f"{path}.eds", None)
+
+
+def _settle_eds(draft: Draft, path: str, drive: FoundDrive | None, folder: Path) -> None:
     if draft.get(f"{path}.profile") == GENERIC:
         if drive is not None and drive.eds is not None:
             draft.tell(f"{path}.eds", Told(_from(drive.eds, folder), "fits the drive on the bus"))
         draft.settle(f"{path}.eds", "the drive's maker has it on his pages; put it beside this file, or give --eds")
+
+
+def _profile(draft: Draft, path: str, folder: Path) -> DriveProfile | None:
     keys = ("profile", "eds", "logical_axis")
     given = {key: value for key in keys if (value := draft.get(f"{path}.{key}")) is not None}
     if "profile" not in given or (given["profile"] == GENERIC and "eds" not in given):
