@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import select
 import signal
 import sys
 import time
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 _FILE = click.Path(path_type=Path)
 SWITCH_INTERVAL_S = 0.0002  # the cycle must not wait 5 ms for the thread that only looks on
+NOBODY = "nobody is there to press Enter, and nothing was played; leave --hold out"
 MARKED_S = 1.0  # a daemon beside the guard marks a record that late
 SIGNALS: Mapping[int, str] = {
     signal.SIGINT: "stopped by Ctrl-C",
@@ -37,10 +39,13 @@ SIGNALS: Mapping[int, str] = {
 @click.argument("program", type=_FILE)
 @click.option("--config", "config_path", required=True, type=_FILE, help="The machine (TOML).")
 @click.option("--go-to-start", is_flag=True, help="Go to the first set-point slowly, where the axes are not there.")
+@click.option("--hold", is_flag=True, help="Hold the axes at the start until Enter is pressed: arm a correction there.")
 @click.option("--dry-run", is_flag=True, help="Check the program and say what would move; opens no bus.")
 @click.option("--yes", is_flag=True, help="Do not ask before the axes move.")
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
-def play(program: Path, config_path: Path, go_to_start: bool, dry_run: bool, yes: bool, as_json: bool) -> int:
+def play(
+    program: Path, config_path: Path, go_to_start: bool, hold: bool, dry_run: bool, yes: bool, as_json: bool
+) -> int:
     """Stream PROGRAM (an NC program, or a demand CSV) to the drives of a test bench that has no NC.
 
     The axes move: fdhil produces SYNC, switches the drives on and sends their set-points, so nothing else may run the
@@ -61,7 +66,7 @@ def play(program: Path, config_path: Path, go_to_start: bool, dry_run: bool, yes
         if dry_run:
             _document(as_json, {"would_play": True, "rows": int(plan.trajectory.time_s.size)})
             return 0
-        played = _play(machine, plan, program, go_to_start, yes)
+        played = _play(machine, plan, program, go_to_start, hold, yes)
     except DriveFault as fault:
         click.echo(f"refused: {fault}", err=True)
         _document(as_json, {"refused": str(fault)})
@@ -70,7 +75,7 @@ def play(program: Path, config_path: Path, go_to_start: bool, dry_run: bool, yes
     return int(played.stopped is not None)
 
 
-def _play(machine: MachineConfig, plan: Plan, program: Path, go_to_start: bool, yes: bool) -> Played:
+def _play(machine: MachineConfig, plan: Plan, program: Path, go_to_start: bool, hold: bool, yes: bool) -> Played:
     """Ask, lead the drives and play; DriveFault when it is refused."""
     from fdhil.cli.bus_lock import lock_place
     from fdhil.commissioning.play import on_bench, valid_records
@@ -80,18 +85,32 @@ def _play(machine: MachineConfig, plan: Plan, program: Path, go_to_start: bool, 
     with ExitStack() as held, _raised():
         for name in dict.fromkeys(axis.drive.bus for axis in machine.axis.values()):
             held.enter_context(lock_place(machine.bus[name], "set-points"))
+        _quiet()
         bench = held.enter_context(on_bench(plan, _say))
         bench.compare(records)
         here = bench.here()
         bench.require_start(here, go_to_start)
         if not yes:
             _ask(bench, program, here)
-        _quiet()
         with bench.led(lambda: _tell_guard(machine, records)):
-            stopped = bench.go_to_start(_stopping)
+            stopped = bench.go_to_start(_stopping, go_to_start)
             if stopped is not None:
                 raise DriveFault("the way to the start", f"{stopped}; nothing was played")
-            return bench.play(_stopping)
+            if not hold:
+                return bench.play(_stopping)
+            click.echo("held at the start: press Enter to begin", err=True)
+            return bench.play(_stopping, _entered)
+
+
+def _entered() -> bool:
+    """Whether Enter was pressed; DriveFault where nobody is there to press it."""
+    if sys.stdin is None or sys.stdin.closed:
+        raise DriveFault("the bench", NOBODY)
+    if not select.select([sys.stdin], (), (), 0.0)[0]:
+        return False
+    if not sys.stdin.readline():
+        raise DriveFault("the bench", NOBODY)
+    return True
 
 
 def _tell_guard(machine: MachineConfig, records: Mapping[str, CommissioningRecord]) -> None:
@@ -120,14 +139,15 @@ def _say(text: str) -> None:
 
 
 def _quiet() -> None:
-    """What is there now stays: no collector looks at it between two SYNCs."""
+    """What is there now stays: no collector looks at it between two SYNCs. No other work comes before them."""
     import gc
 
-    from fdhil.commissioning.realtime import lock_memory
+    from fdhil.commissioning.realtime import BESIDE, lock_memory, prioritise
 
     gc.collect()
     gc.freeze()
     lock_memory()
+    prioritise(BESIDE)
 
 
 @contextmanager

@@ -84,8 +84,9 @@ class Master:
         self.target: int | None = None
         self.offset = 0
         self.fed: tuple[int, int] | None = None
-        self._beside_guard = beside_guard
-        self._guarded = frozenset(self._offset_ids()) if beside_guard else frozenset()
+        self._guarded = self.loop.guarded[settings.drive.bus]
+        if beside_guard:
+            self._guarded.update(self._offset_ids())
         self._tpdos = {spec.cob_base + self.node_id: spec for spec in self.profile.tpdos}
         self._plan: deque[int] = deque()
         self._answered = 0

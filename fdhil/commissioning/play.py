@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from fdhil import cia402
-from fdhil.cia402 import NmtCommand
+from fdhil.cia402 import NmtCommand, Object
 from fdhil.commissioning.compare import compare_record
 from fdhil.commissioning.cycle import Cycle, Lateness
 from fdhil.commissioning.finding import read_optional
@@ -106,7 +106,7 @@ def _require_inside(plan: Plan) -> None:
     while not points.resting and points.stopped is None:
         points.step()
     if points.stopped is not None:
-        row = min(points.cycles, len(rows)) - 1
+        row = min(points.played, len(rows) - 1)
         where = f"{plan.trajectory.time_s[row]:.3f} s, {plan.trajectory.place(row)}"
         advice = "nothing was sent; change the program, or [axis.*.setpoints] where the machine has room for it"
         raise DriveFault("the demand", f"{points.stopped} (row {row + 1}, {where}); {advice}")
@@ -136,7 +136,7 @@ class Bench:
 
     # nothing is sent but SDO requests
 
-    def compare(self, records: dict[str, CommissioningRecord]) -> None:
+    def compare(self, records: Mapping[str, CommissioningRecord]) -> None:
         """Listen, and refuse another master; read every drive, and refuse one that is not as it was signed off."""
         self._say("listening: no NC may run the buses")
         for bus in self.loop.buses.values():
@@ -150,6 +150,22 @@ class Bench:
                 text = f"it holds an offset (0x60B0) of {held} increments; run fdhil adopt before anything moves"
                 raise DriveFault(master.device, text)
             require_alone(master)
+        self._require_room(records)
+        self._require_one_counter()
+
+    def _require_room(self, records: Mapping[str, CommissioningRecord]) -> None:
+        for master, of in zip(self.masters, self.plan.bounds, strict=True):
+            travel = records[master.axis].travel
+            if travel is not None and not (travel[0] <= of.low and of.high <= travel[1]):
+                low, high = sorted(self._mm(master, limit) for limit in travel)
+                text = f"its software limits (0x607D) leave it {low:g} to {high:g} mm, less than [axis.{master.axis}"
+                raise DriveFault(master.device, f"{text}.setpoints] travel_mm; correct that")
+
+    def _require_one_counter(self) -> None:
+        counters = {read_optional(master, Object.SYNC_COUNTER_OVERFLOW) or 0 for master in self.masters}
+        if len(counters) > 1:
+            shown = ", ".join(map(str, sorted(counters)))
+            raise DriveFault("the drives", f"they want different SYNC counters (0x1019: {shown}); set all to one value")
 
     def here(self) -> list[int]:
         """Read where the axes stand, in increments."""
@@ -252,35 +268,42 @@ class Bench:
         while time.monotonic() < end and any(m.heard.objects.get(m.profile.offset, 0) for m in self.masters):
             self.masters[0].wait_cycles(OFF_CYCLES)
 
-    def go_to_start(self, signals: Signals) -> str | None:
-        """Go slowly and straight to the first row; why it was stopped on the way, None when it is there."""
+    def go_to_start(self, signals: Signals, asked: bool) -> str | None:
+        """Go slowly and straight to the first row; why it was stopped on the way, None when it is there.
+
+        DriveFault where an axis has moved away from it meanwhile and nobody ``asked`` that it goes there.
+        """
         here = [master.target or 0 for master in self.masters]
+        self.require_start(here, asked)
         goal = self.plan.rows(here)[0]
         slow = [of.speed * APPROACH_SHARE for of in self.plan.bounds]
         gently = [of.acceleration * APPROACH_SHARE for of in self.plan.bounds]
         rows = straight(here, goal.tolist(), slow, gently, APPROACH_CYCLES)
         return self._played(rows, signals).stopped
 
-    def play(self, signals: Signals) -> Played:
-        """Play the demand from where the axes are held."""
+    def play(self, signals: Signals, begin: Callable[[], bool] = lambda: True) -> Played:
+        """Play the demand from where the axes are held, as soon as ``begin`` is true."""
         rows = self.plan.rows([master.target or 0 for master in self.masters])
         self.loop.lateness = Lateness()
-        return self._played(rows, signals)
+        return self._played(rows, signals, begin)
 
-    def _played(self, rows: Float, signals: Signals) -> Played:
+    def _played(self, rows: Float, signals: Signals, begin: Callable[[], bool] = lambda: True) -> Played:
         loop = self.loop
         with following(self.masters, self.plan.bounds) as path, signals(path):
+            while path.stopped is None and not begin():
+                self._watch(path)
             path.play(_in_blocks(rows))
             while not path.resting:
-                loop.check()
-                watch_power(self.masters, path)
-                time.sleep(loop.period_s)
-            lateness = loop.lateness
+                self._watch(path)
             if path.stopped is None:
                 self.masters[0].wait_cycles(round(SETTLE_S / loop.period_s))
                 watch_power(self.masters, path)
-        count = min(path.cycles, len(rows))
-        return Played(count, len(rows), path.stopped, lateness, loop.scheduling)
+        return Played(path.played, len(rows), path.stopped, loop.lateness, loop.scheduling)
+
+    def _watch(self, path: SetPoints) -> None:
+        self.loop.check()
+        watch_power(self.masters, path)
+        time.sleep(self.loop.period_s)
 
 
 def _in_blocks(rows: Float) -> Iterator[list[float]]:

@@ -68,13 +68,14 @@ class SetPoints:
     """The set-points of some axes, resting at ``start`` until they :meth:`play`.
 
     ``stopped`` says why a motion was ended before its last row, None while none was; nothing is played after that.
+    ``cycles`` counts the steps, ``played`` the rows that left.
     One thread takes the steps; :meth:`play` and :meth:`stop` may be called by another.
     """
 
     def __init__(self, bounds: Sequence[Bounds], start: Sequence[int]) -> None:
         self.bounds = tuple(bounds)
         self.stopped: str | None = None
-        self.cycles = 0
+        self.cycles = self.played = 0
         self._last: tuple[float, ...] = tuple(map(float, start))
         self._before = self._last
         self._rows: Iterator[Row] | None = None
@@ -100,6 +101,11 @@ class SetPoints:
         if self.stopped is None:
             self.stopped = why
 
+    def hold(self, why: str) -> None:
+        """Stay at the row that left last: nothing left for so long that the drives stand there already."""
+        self.stop(why)
+        self._rows, self._brake, self._before = None, iter(()), self._last
+
     def step(self, positions: Sequence[int | None] = ()) -> tuple[int, ...]:
         """Return what is sent in this cycle, in whole increments; ``positions`` are the drives' newest."""
         self._watch(positions)
@@ -115,6 +121,7 @@ class SetPoints:
             row = next(self._rows, None)
             fault = self._fault(row) if row is not None else self._ended()
             if fault is None:
+                self.played += row is not None
                 return self._last if row is None else tuple(map(float, row))
             self.stop(fault)
         if self.stopped is not None and self._brake is None:

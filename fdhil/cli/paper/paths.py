@@ -13,11 +13,12 @@ from importlib.resources import as_file, files
 import numpy as np
 
 from fdhil.cli.demo.report import POINTS
+from fdhil.cli.paper import bench
 from fdhil.cli.paper.drawings import Traced
 from fdhil.cli.paper.scenarios import PATHS, machine
 from fdhil.config import MachineConfig
 from fdhil.correction import flatness, linear
-from fdhil.prediction import contour_error_um, predict
+from fdhil.prediction import contour_error_um
 from fdhil.prediction.models import nominal_models
 from fdhil.prediction.predict import predict_corrected
 from fdhil.program import load_trajectory
@@ -68,7 +69,8 @@ def _models(changes: tuple[tuple[str, float], ...], config: MachineConfig) -> di
 def predicted(scenario: str, program: str = SLOW, changes: tuple[tuple[str, float], ...] = ()) -> Prediction:
     """Predict a program without correction; ``changes`` are parameters of X that are not the nominal ones."""
     config = machine(scenario)
-    return predict(reference(scenario, program), _models(changes, config), config)
+    # nothing is added: what is predicted of the corrected path, without the zones that are not asked for here
+    return predict_corrected(reference(scenario, program), _models(changes, config), config, None)
 
 
 @cache
@@ -96,6 +98,15 @@ def offset_um(scenario: str, method: str, program: str = SLOW) -> dict[str, Floa
         axis: -linear.inverse(models[axis], config.axis[axis], before.reference.dt_s, error.size).apply(error)
         for axis, error in before.error_um.items()
     }
+
+
+@cache
+def measured_mm(scenario: str, program: str = SLOW) -> Float:
+    """Return where the table of the simulated machine goes (n, 2), mm: the twin's physics, not the model's."""
+    config, demand = machine(scenario), reference(scenario, program).position_mm
+    models, period_s = nominal_models(config), config.machine.sync_period_s
+    tables = [bench.run(config.axis[axis], period_s, models[axis], np.asarray(demand[axis])).table_mm for axis in AXES]
+    return np.column_stack(tables)
 
 
 def path_mm(answer: Prediction) -> Float:

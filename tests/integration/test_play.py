@@ -1,0 +1,91 @@
+"""fdhil play in the place of the NC, and a guard that corrects what it plays."""
+
+from __future__ import annotations
+
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil.arming.token import read_token
+from tests.bench import bench_document
+from tests.integration.conftest import Bench
+from tests.integration.test_guard import DIGEST, arm, guarded
+
+pytestmark = pytest.mark.socketcan
+QUICK = """
+from fdhil.commissioning import steps, survey
+from fdhil.drivers.can import sdo
+survey.LISTEN_S, steps.SETTLE_CYCLES, sdo.RESPONSE_TIMEOUT_S, sdo.DEADLINE_S = 0.3, 50, 5.0, 30.0
+from fdhil.cli.main import main
+main()
+"""
+
+
+@pytest.fixture
+def transport() -> str:
+    """Three processes of fdhil and the twin: on an interface of the kernel."""
+    return "socketcan"
+
+
+@pytest.fixture
+def sections() -> dict[str, Any]:
+    """All count time in SYNCs, as the twin does, whose computer they share."""
+    limits = {"setpoints": {"travel_mm": [-1.0, 20.0]}}
+    axes = {name: axis | limits for name, axis in bench_document()["axis"].items()}
+    return {
+        "sim": {"pace": "lockstep", "modbus": False},
+        "guard": {"clock": "sync"},
+        "play": {"heartbeat_s": 0.5},
+        "axis": axes,
+    }
+
+
+def test_a_correction_works_beside_it(bench: Bench, tmp_path: Path) -> None:
+    way = np.concatenate([np.zeros(20), 2.5 * (1 - np.cos(np.linspace(0, np.pi, 500))), np.full(100, 5.0)])
+    demand = tmp_path / "demand.csv"
+    rows = [f"{k * 0.001:.3f},{x:.6f},{x:.6f}" for k, x in enumerate(way)]
+    demand.write_text("time_s,X_mm,Y_mm\n" + "\n".join(rows) + "\n", "utf-8")
+    bump = np.round(100 * np.sin(np.linspace(0, np.pi, way.size)) ** 2).astype(int).tolist()
+    increments = np.round(way * 65536 / 20).astype(int).tolist()
+    with guarded(bench, tmp_path) as guard:
+        command = ["play", demand, "--config", tmp_path / "machine.toml", "--yes", "--hold"]
+        with subprocess.Popen(
+            [sys.executable, "-c", QUICK, *map(str, command)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as play:
+            assert play.stderr is not None
+            for line in play.stderr:
+                if "press Enter" in line:
+                    break
+            loaded = guard.load(("X", "Y"), {"X": increments, "Y": increments}, {"X": bump, "Y": bump}, DIGEST)
+            assert loaded["ok"], loaded
+            run = bench.config.store.run_directory
+            assert run is not None
+            assert arm(guard, read_token(run))["state"] == "ARMED"
+            with bench.join() as bus:
+                assert play.stdin is not None
+                play.stdin.write("\n")
+                play.stdin.flush()
+                offsets = []
+                while play.poll() is None:
+                    guard.alive()
+                    time.sleep(0.02)
+                    while (frame := bus.recv(0)) is not None:
+                        if frame.arbitration_id == 0x301:
+                            offsets.append(struct.unpack("<i", frame.data)[0])
+            said, err = play.communicate()
+        assert play.returncode == 0, said + err
+        assert max(offsets) == 100
+        assert offsets[-1] == 0
+        assert guard.status()["state"] == "OFF"
+        # what play wrote to the drives and gave back does not void their records
+        assert not any(axis["record_void"] for axis in guard.status().get("axes", {}).values())
