@@ -25,11 +25,6 @@ class NcListener:
         self._states = self._failures = 0
         self._silent = False
 
-    @property
-    def name(self) -> str:
-        """Which NC it is, for people."""
-        return self._source.name
-
     async def run(self, take: Callable[[NcState | Notice], None]) -> None:
         """Hand states over for ever; an NC that is not heard is UNKNOWN from then on, and told once."""
         pause_s = BACK_OFF_S[0]
