@@ -22,6 +22,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 SCHEMA = "fdhil-linuxcnc-1"
@@ -292,6 +293,8 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run until LinuxCNC ends; what is wrong is said, and never keeps LinuxCNC from starting."""
     options = _options(arguments)
+    here = Path(__file__).resolve().parent
+    sys.path[:] = [folder for folder in sys.path if Path(folder).resolve() != here]  # this file is called as its own
     # LinuxCNC's own; the rest of the file is tried without them
     import hal  # type: ignore[import-not-found]
     import linuxcnc  # type: ignore[import-not-found]
@@ -302,7 +305,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         serve(options, hal, linuxcnc, component)
     except KeyboardInterrupt:
         return 0
-    except (OSError, RuntimeError, ValueError, linuxcnc.error, hal.error) as error:
+    except Exception as error:  # noqa: BLE001 - what went wrong here must not end LinuxCNC
         _say(f"fdhil is told nothing ({error}); LinuxCNC goes on without")
         component.ready()
         time.sleep(SEEN_READY_S)

@@ -92,14 +92,17 @@ def _stopped_like_ctrl_c() -> Iterator[None]:
 
     Only the first of them counts: a second one must not end what brings the axis to a stand.
     """
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    from fdhil.commissioning.moving import ENDING_SIGNALS
+
+    stopping = False
 
     def stop(_number: int, _frame: FrameType | None) -> None:
-        for number in numbers:
-            signal.signal(number, signal.SIG_IGN)
-        raise KeyboardInterrupt
+        nonlocal stopping
+        if not stopping:
+            stopping = True
+            raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, stop) for number in numbers}
+    before = {number: signal.signal(number, stop) for number in ENDING_SIGNALS}
     try:
         yield
     finally:

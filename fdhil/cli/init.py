@@ -151,10 +151,21 @@ def _document(draft: Draft, file: Path, text: str, dry_run: bool) -> dict[str, A
     }
 
 
+def _guesses(draft: Draft) -> list[str]:
+    """Return a line for each guess; one that is the same for several axes is one."""
+    places: dict[tuple[str, str, str], list[str]] = {}
+    for path, told in draft.values.items():
+        if told.guessed:
+            where, axis, key = path.split(".", 2) if path.startswith("axis.") else ("", "", path)
+            places.setdefault((key, str(told.value), told.source), []).append(f"{where}.{axis}" if axis else "")
+    return [
+        f"{key}{' of ' if axes[0] else ''}{', '.join(axes)} = {value}: {source}"
+        for (key, value, source), axes in places.items()
+    ]
+
+
 def _tell(draft: Draft, file: Path, dry_run: bool, quiet: bool) -> None:
     """Say what is guessed, what was noticed, and how it goes on; on stderr where stdout has the file or JSON."""
-    from fdhil.commissioning.init.making import guessed
-
     if quiet:
         return
 
@@ -162,9 +173,9 @@ def _tell(draft: Draft, file: Path, dry_run: bool, quiet: bool) -> None:
         click.echo(line, err=dry_run)
 
     done = "would be written" if dry_run else "is written"
-    say(f"{file} {done}: {len(draft.values)} values, {len(guessed(draft))} of them guessed")
-    for path in guessed(draft):
-        say(f"  check {path} = {draft.get(path)}: {draft.values[path].source}")
+    say(f"{file} {done}: {len(draft.values)} values, {draft.guessed} of them guessed")
+    for line in _guesses(draft):
+        say(f"  check {line}")
     for note in draft.notes:
         say(f"note: {note}")
     for command, why in NEXT:

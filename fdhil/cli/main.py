@@ -17,11 +17,8 @@ __all__ = ["COMMANDS", "cli", "main", "run_safely"]
 # command -> ("module:function", the line of `fdhil --help`); listed here so that --help imports none of them
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "demo": ("fdhil.cli.demo:demo", "Run the whole loop on the simulated machine and write a report."),
-    "init": (
-        "fdhil.cli.init:init",
-        "Make a machine's configuration from nothing: the NC's files, the drives, questions.",
-    ),
     "paper": ("fdhil.cli.paper:paper", "Reproduce the paper that fdhil goes back to, claim by claim."),
+    "init": ("fdhil.cli.init:init", "Make a machine's configuration: the NC's files, the drives, questions."),
     "scan": ("fdhil.cli.commissioning:scan", "List what is on the bus: nodes, identity, state, heartbeat."),
     "check": ("fdhil.cli.commissioning:check", "Check that the machine on the bus is the one in the config."),
     "commission": ("fdhil.cli.commission:commission", "Commission the drives, step by step."),
@@ -43,6 +40,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "replay": ("fdhil.cli.records:replay", "Analyse a recorded window again, bit by bit as the daemon did."),
     "history": ("fdhil.cli.records:history", "Show how the parameters moved."),
     "report": ("fdhil.cli.records:report", "Write an HTML report of the stored history."),
+    "acceptance": ("fdhil.cli.acceptance:acceptance", "Write the acceptance report of a machine, to be signed."),
     "export": ("fdhil.cli.records:export", "Write a recording, or a log of the bus, in another file format."),
 }
 

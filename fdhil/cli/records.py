@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -18,12 +16,7 @@ from fdhil.errors import RecordingError
 from fdhil.store import suffixes
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from fdhil.cli.history_course import AxisHistory
-    from fdhil.cli.history_verdict import Refusals
     from fdhil.records import Outcome, Window
-    from fdhil.store.rows import Revision
 
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
 FILE = click.Path(path_type=Path)
@@ -125,7 +118,9 @@ def _config_of(window: Window) -> machine_config.MachineConfig:
 def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) -> None:
     """Show how the identified parameters of CONFIG's machine moved: revisions, slopes, changes, maintenance dates."""
     machine = machine_config.load(config)
-    rows, told = _history(machine, axis)
+    from fdhil.cli.history_reading import by_axis, read_history
+
+    rows, told = read_history(machine, axis)
     if axis is not None and axis not in machine.axis and not rows:
         raise click.BadParameter(
             f"{axis} is no axis of {config}; it has {', '.join(machine.axis)}", param_hint="--axis"
@@ -133,7 +128,7 @@ def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) ->
     if plot is not None:
         from fdhil.cli.history_plot import write_plot
 
-        write_plot(_by_axis(machine, rows, told, ()), plot)
+        write_plot(by_axis(machine, rows, told), plot)
     if as_json:
         parts = {key: {name: of_axis[key] for name, of_axis in told.items()} for key in HEALTH}
         click.echo(json.dumps({"schema": "fdhil-history-1", "revisions": rows} | parts))
@@ -147,57 +142,6 @@ def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) ->
     if rows:
         show_history(rows)
     show_health(told)
-
-
-def _history(machine: machine_config.MachineConfig, axis: str | None) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Return the published revisions and, by axis, what the windows tell of the drive's health."""
-    from fdhil.cli.history_trends import health
-    from fdhil.store.history import History
-
-    with History.read(machine.store.directory, partial(click.echo, err=True)) as stored:
-        return [_row(revision) for revision in stored.revisions(axis)], health(stored, machine, axis)
-
-
-def _refused(machine: machine_config.MachineConfig) -> dict[str, Refusals]:
-    """Return by axis which of the newest windows were not believed."""
-    from fdhil.cli.history_trends import NEWEST_WINDOWS
-    from fdhil.cli.history_verdict import refusals_of
-    from fdhil.store.history import History
-
-    with History.read(machine.store.directory) as stored:
-        windows = stored.windows(limit=NEWEST_WINDOWS)
-    axes = dict.fromkeys(window.axis for window in windows)
-    return {axis: refusals_of([window for window in windows if window.axis == axis]) for axis in axes}
-
-
-def _by_axis(
-    machine: machine_config.MachineConfig, rows: list[dict[str, Any]], told: dict[str, Any], seen: Iterable[str]
-) -> list[AxisHistory]:
-    """Return the history of each axis that is known of, in the order of the config."""
-    from fdhil.cli.history_course import AxisHistory
-
-    known = {*(row["axis"] for row in rows), *told, *seen}
-    axes = [axis for axis in machine.axis if axis in known] + sorted(known - set(machine.axis))
-    return [
-        AxisHistory(
-            axis,
-            [row for row in rows if row["axis"] == axis],
-            told.get(axis),
-            machine.axis[axis].nominal.model_dump() if axis in machine.axis else {},
-        )
-        for axis in axes
-    ]
-
-
-def _row(revision: Revision) -> dict[str, Any]:
-    from fdhil.daemon.outcome_json import set_document
-
-    return {
-        **set_document(revision.set),
-        "time": datetime.fromtimestamp(revision.stamp.wall_s, UTC).isoformat(timespec="seconds"),
-        "window_ids": list(revision.window_ids),
-        "config_digest": revision.set.config_digest,
-    }
 
 
 @click.command(cls=Writing)
@@ -233,10 +177,11 @@ def export(recording: Path, out: Path, format_name: str | None, columns: Path | 
 def report(config: Path, out: Path, pdf: Path | None, as_json: bool) -> None:
     """Write an HTML report of the stored history of CONFIG's machine."""
     machine = machine_config.load(config)
+    from fdhil.cli.history_reading import by_axis, read_history, read_refusals
     from fdhil.cli.history_report import write_report
 
-    rows, told = _history(machine, None)
-    refused = _refused(machine)
-    write_report(machine, _by_axis(machine, rows, told, refused), refused, out, pdf)
+    rows, told = read_history(machine)
+    refused = read_refusals(machine)
+    write_report(machine, by_axis(machine, rows, told, refused), refused, out, pdf)
     if as_json:
         click.echo(json.dumps({"schema": "fdhil-report-1", "file": str(out), "revisions": len(rows)}))

@@ -8,12 +8,15 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Iterator, Sequence
 
+import numpy as np
+
 from fdhil.commissioning.bus_listener import LISTEN_S, BusListener, Traffic
 from fdhil.commissioning.compare import POINT, compare_record
 from fdhil.commissioning.finding import Finding, read_optional
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import load_record
 from fdhil.commissioning.survey import Survey, survey
+from fdhil.commissioning.timing import judge_sync
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.bus import CanBus
 from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
@@ -69,6 +72,8 @@ def compare_bus(traffic: Traffic, config: MachineConfig) -> Iterator[Finding]:
         found = f"{period_s * 1e3:.3f} ms"
         cause = f"SYNC comes every {found} where the config has {expected}"
         yield Finding("SYNC", expected, found, same, cause, "correct machine.sync_period_s or the NC's cycle")
+    if period_s is not None:
+        yield judge_sync((np.diff(traffic.sync_ns) * 1e-9).tolist(), period_s, config.guard.clock == "sync")
 
 
 def compare_asked(config: MachineConfig, axis: str) -> list[Finding]:

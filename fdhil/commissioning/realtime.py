@@ -44,4 +44,3 @@ def before_other_work() -> Iterator[None]:
             os.sched_setscheduler(0, policy, parameter)
         sys.setswitchinterval(interval_s)
         libc.munlockall()
-        gc.unfreeze()

@@ -81,7 +81,9 @@ class SetPoints:
         self._before = self._last
         self._rows: Iterator[Row] | None = None
         self._brake: Iterator[tuple[float, ...]] | None = None
-        self._sent = [deque([at], maxlen=of.delay_cycles + AGE_CYCLES) for at, of in zip(self._last, bounds, strict=True)]
+        self._sent = [
+            deque([at], maxlen=of.delay_cycles + AGE_CYCLES) for at, of in zip(self._last, bounds, strict=True)
+        ]
 
     @property
     def resting(self) -> bool:

@@ -48,7 +48,7 @@ class CorrectionLimits(Section):
 
 
 class SetPointLimits(Section):
-    """[axis.X.setpoints]: the set-points that fdhil may send in the place of an NC. Without this section: none."""
+    """[axis.X.setpoints]: the set-points that fdhil play may send in the place of an NC. Without this section: none."""
 
     travel_mm: tuple[Finite, Finite] = Field(description="lowest and highest position, braking included")
     max_speed_mm_s: Positive | None = Field(None, description="largest speed; left out: the axis maximum")

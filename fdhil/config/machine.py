@@ -83,6 +83,9 @@ class MachineConfig(Section):
                 yield LineUser(f"axis.{name}.table", table, WORDS[table.type], table.period_s, False)
             if accelerometer is not None:
                 yield LineUser(f"axis.{name}.accelerometer", accelerometer, 0, 1.0, True)
+        bits = self.nc_source.modbus_coil
+        if self.g0.source == "modbus_coil" and bits.device:
+            yield LineUser("nc_source.modbus_coil", bits, bits.registers, bits.period_s, False)
 
     def _listening(self, bus: str) -> str:
         interface = self.bus[bus].interface

@@ -71,6 +71,12 @@ class ModbusNc(ModbusPlace):
             spans.setdefault(function, []).append(address)
         return {function: (min(each), max(each) - min(each) + 1) for function, each in spans.items()}
 
+    @property
+    def registers(self) -> int:
+        """How many registers' worth of data an NC is asked for each time."""
+        asked = self.requests().items()
+        return sum(count if function in NUMBERS_ARE.values() else (count + 15) // 16 for function, (_, count) in asked)
+
     @model_validator(mode="after")
     def _in_reach(self) -> Self:
         faults = "\n".join([*self._place_faults(), *self._span_faults()])

@@ -148,10 +148,9 @@ def _at(document: Mapping[str, Any], path: str) -> Mapping[str, Any] | None:
 
 def _line(key: str, value: Any, source: str) -> list[str]:
     text = f"{key} = {toml(value)}"
-    if not source:
-        return [text]
-    whole = f"{text}  # {source}"
-    return [whole] if len(whole) <= WIDTH else [*_comment(source), text]
+    said = _comment(source)
+    whole = "  ".join([text, *said])
+    return [whole] if len(said) < 2 and len(whole) <= WIDTH else [*said, text]
 
 
 def _heading(table: Table) -> list[str]:
@@ -159,6 +158,7 @@ def _heading(table: Table) -> list[str]:
 
 
 def _comment(words: str) -> list[str]:
+    words = "".join(letter if letter.isprintable() or letter.isspace() else "?" for letter in words)
     return wrap(words, WIDTH, initial_indent="# ", subsequent_indent="# ")
 
 

@@ -194,8 +194,8 @@ class SimService:
     def run(self, play: Path | None = None, trace: Path | None = None) -> None:
         """Say that it is ready and serve until stopped. ``play`` is played at once, recorded to ``trace``.
 
-        ``-`` is the demand that comes by the panel's descriptor, among the commands, until its end; the NC takes the bus
-        with its first rows.
+        ``-`` is the demand that comes by the panel's descriptor, among the commands, until its end; with its first rows
+        the NC takes the bus.
         """
         try:
             if play == _STREAM:

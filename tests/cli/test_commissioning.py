@@ -222,7 +222,7 @@ def test_a_sensor_is_read_and_a_silent_one_is_told(fdhil: Said, bench: Bench) ->
     assert "V at 1000 Hz" in points(found, "ok")["axis X voltage"]["found"]
     code, out, _ = fdhil("check", bench.config("dumb.toml", voltage='source = "modbus"\nport = 1'))
     assert code == 1
-    assert "axis X: the Modbus sensor 127.0.0.1:1 cannot be reached; check its supply, host and port" in out
+    assert "axis X: the Modbus device 127.0.0.1:1 cannot be reached; check its supply, host and port" in out
 
 
 def test_nobody_moves_without_a_yes(fdhil: Said, bench: Bench) -> None:

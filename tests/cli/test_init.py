@@ -21,6 +21,7 @@ from fdhil.config.template import filled
 from tests.commissioning.test_linuxcnc_files import HAL_TEXT, INI
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
+from tests.eds import write_eds
 
 Said = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).parents[2]
@@ -70,7 +71,7 @@ def written(folder: Path, **tables: Any) -> Path:
 
 
 def test_linuxcncs_files_and_few_answers_make_a_machine(fdhil: Said, tmp_path: Path) -> None:
-    (tmp_path / "mill.ini").write_text(INI.replace("X Y Z", "X Y"))
+    (tmp_path / "mill.ini").write_text(INI.replace("X Y Z", "X Y").replace("No 3", "No 3 \x07"))
     (tmp_path / "drives.hal").write_text(HAL_TEXT)
     sheet = SHEET | {"screw_pitch_mm": 10.0}
     answers = written(tmp_path, axis={"X": sheet | {"correction": {"max_offset_um": 40.0}}, "Y": sheet})
@@ -79,15 +80,16 @@ def test_linuxcncs_files_and_few_answers_make_a_machine(fdhil: Said, tmp_path: P
     code, out, err = fdhil(*arguments)
     assert code == 0, err
     assert "next: fdhil doctor" in out
+    assert "  check nominal.Cd of axis.X, axis.Y = 2.0: guessed: 5 % of the continuous torque" in out
     made = machine_config.load(file)
     x, y = made.axis["X"], made.axis["Y"]
-    assert (made.machine.name, made.machine.sync_period_s, made.nc.profile) == ("Mill No 3", 0.002, "linuxcnc")
+    assert (made.machine.name.strip(), made.machine.sync_period_s, made.nc.profile) == ("Mill No 3", 0.002, "linuxcnc")
     assert (x.rapid_speed_mm_s, x.drive.increments_per_rev, x.drive.sign) == (400.0, 10000, 1)
     assert (y.drive.increments_per_rev, y.drive.sign) == (8192, -1)
     assert (x.correction is not None, y.correction is not None) == (True, False)
     text = file.read_text()
     assert "rapid_speed_mm_s = 400.0  # LinuxCNC: [TRAJ] MAX_LINEAR_VELOCITY" in text
-    assert "# travel per motor revolution" in text or "# table travel per motor revolution" in text
+    assert "# table travel per motor revolution" in text
     assert "R = 0.5  # from the answers" in text
     assert "Cd = 2.0  # guessed: 5 % of the continuous torque; the first rapids tell it" in text
     assert "/work" not in text
@@ -165,7 +167,7 @@ def test_the_drive_tells_its_scales_and_the_operator_the_rest(
     made = machine_config.load(file).axis["X"]
     assert (made.drive.profile, made.drive.increments_per_rev, made.nominal.K) == ("fdhil_twin", 65536, 0.8)
     assert (made.nominal.Jt, made.correction is not None) == (0.075, True)
-    assert "check axis.X.nominal.K = 0.8: guessed: the drive's rated torque" in out
+    assert "check nominal.K of axis.X = 0.8: guessed: the drive's rated torque" in out
     assert set(peer.heard) == {*range(0x601, 0x680)}, "only SDO requests, to every node-ID once"
 
 
@@ -184,11 +186,36 @@ def test_numbers_that_cannot_be_of_one_machine_are_asked_again(
     assert machine_config.load(file).axis["X"].nominal.L == 0.005
 
 
+def test_an_eds_that_cannot_be_read_is_asked_again(fdhil: Said, tmp_path: Path) -> None:
+    write_eds("elmo", tmp_path)
+    lines = [
+        "virtual", "one", "", "", "X", "", "cia402", "lost.eds", "cia402", "elmo.eds", "20", "65536", "500", "4000",
+        "50", "0.5", "0.005", "0.8", "0.075", "", "300", *[""] * 8, "yes",
+    ]  # fmt: skip
+    file = tmp_path / "m.toml"
+    code, out, err = fdhil("init", file, "--offline", said="\n".join(lines) + "\n")
+    assert code == 0, (err, out)
+    assert "lost.eds" in err
+    made = machine_config.load(file).axis["X"]
+    assert (made.drive.profile, made.drive.eds) == ("cia402", tmp_path / "elmo.eds")
+
+
 def test_who_goes_away_leaves_nothing(fdhil: Said, tmp_path: Path) -> None:
     code, _, err = fdhil("init", tmp_path / "m.toml", "--offline", said="socketcan\n")
     assert code == 130
     assert "stopped by the operator" in err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_file_says_cannot_break_the_comments(fdhil: Said, tmp_path: Path) -> None:
+    (tmp_path / "mill.ini").write_text(INI.replace("X Y Z", "X").replace("[JOINT_0]", "[JOINT_0]\nN=\x07\x7f\u2028"))
+    (tmp_path / "drives.hal").write_text(HAL_TEXT.replace("cia402.0", "cia402.[JOINT_0]N"))
+    axis = SHEET | {"screw_pitch_mm": 10.0}
+    answers = written(tmp_path, axis={"X": axis})
+    arguments = ("--from-linuxcnc", tmp_path / "mill.ini", "--answers", answers, "--offline")
+    code, _, err = fdhil("init", tmp_path / "m.toml", *arguments)
+    assert code == 0, err
+    assert machine_config.load(tmp_path / "m.toml").axis["X"].drive.increments_per_rev == 10000
 
 
 def test_beside_an_nc_nothing_is_sent(fdhil: Said, peer: DrivePeer, bus: dict[str, Any], tmp_path: Path) -> None:
@@ -224,6 +251,19 @@ def test_an_answer_that_the_drive_contradicts_is_noted(
     assert machine_config.load(tmp_path / "m.toml").axis["X"].drive.increments_per_rev == 4096
 
 
+def test_limits_that_were_left_open_are_such_that_coarse_increments_can_keep(fdhil: Said, tmp_path: Path) -> None:
+    for increments, limits in ((65536, (50.0, 2.0, 250.0)), (16384, (50.0, 5.0, 1000.0))):
+        drive = SHEET["drive"] | {"increments_per_rev": increments}
+        answers = tmp_path / "answers.toml"
+        answers.write_text(to_toml({"axis": {"X": SHEET | RAPID | {"drive": drive}}}) + "[axis.X.correction]\n")
+        file = tmp_path / f"{increments}.toml"
+        code, _, err = fdhil("init", file, "--answers", answers, "--offline")
+        assert code == 0, err
+        found = machine_config.load(file).axis["X"].correction
+        assert found is not None
+        assert (found.max_offset_um, found.max_speed_mm_s, found.max_acceleration_mm_s2) == limits
+
+
 def test_an_axis_without_a_drive_is_refused(fdhil: Said, peer: DrivePeer, bus: dict[str, Any], tmp_path: Path) -> None:
     sheet = SHEET | RAPID
     answers = written(tmp_path, axis={"X": sheet, "Y": sheet}, bus=bus)
@@ -234,6 +274,18 @@ def test_an_axis_without_a_drive_is_refused(fdhil: Said, peer: DrivePeer, bus: d
     code, _, err = fdhil("init", tmp_path / "m.toml", "--answers", answers)
     assert code == 2
     assert "axis.X.drive.node_id: is 9, which is not on the bus (node 1 (fdhil twin drive" in err
+
+
+def test_a_drive_that_was_given_to_an_axis_is_not_proposed_to_another(
+    fdhil: Said, peer: DrivePeer, bus: dict[str, Any], tmp_path: Path
+) -> None:
+    with DrivePeer(machine(axes="XY", bus=bus["can0"]), "Y"):
+        sheet = SHEET | RAPID | {"drive": {}}
+        answers = written(tmp_path, axis={"X": sheet, "Y": sheet | {"drive": {"node_id": 1}}}, bus=bus)
+        code, _, err = fdhil("init", tmp_path / "m.toml", "--answers", answers)
+    assert code == 0, err
+    made = machine_config.load(tmp_path / "m.toml")
+    assert {axis: made.node_id(axis) for axis in made.axis} == {"X": 2, "Y": 1}
 
 
 def test_a_pc_without_can_says_what_to_give(fdhil: Said, tmp_path: Path) -> None:

@@ -69,7 +69,8 @@ def test_errors_are_sentences_with_their_exit_code(capsys: pytest.CaptureFixture
 
 
 def test_the_list_is_in_the_order_of_the_workflow() -> None:
-    assert cli.list_commands(click.Context(cli))[:6] == ["demo", "init", "scan", "check", "commission", "run"]
+    listed = cli.list_commands(click.Context(cli))
+    assert listed[:7] == ["demo", "paper", "init", "scan", "check", "commission", "run"]
 
 
 def test_the_entry_point_shows_no_advice_of_libraries(

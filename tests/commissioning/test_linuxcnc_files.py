@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from fdhil.commissioning.init.linuxcnc import Machine, read_linuxcnc
+from fdhil.commissioning.init.linuxcnc import Machine, machine_of, read_linuxcnc
 from fdhil.commissioning.init.linuxcnc_text import Hal, parse_hal, parse_ini
 from fdhil.errors import ConfigError
 
@@ -100,6 +104,11 @@ def test_inches_become_millimetres(tmp_path: Path) -> None:
         ("FERROR = 5", "FERROR = 5\nBACKLASH = 0.02", "leave that on: fdhil sees it in the demand"),
         ("FERROR = 5", "FERROR = 5\nMIN_FERROR = 0.1", "an offset is a following error to LinuxCNC"),
         ("[AXIS_X]", "[AXIS_X]\nOFFSET_AV_RATIO = 0.2", "keep them off while a correction is armed"),
+        (
+            "[JOINT_1]",
+            "MIN_LIMIT=-9\nMAX_LIMIT=300\n[AXIS_X]\nMAX_LIMIT=250\n[JOINT_1]",
+            "lets go X -9 to 250 mm: give",
+        ),
         ("HALFILE = drives.hal", "HALFILE = drives.tcl", "HALFILE drives.tcl was not read"),
         ("HALFILE = drives.hal", "HALFILE = lost.hal", "HALFILE lost.hal was not read (No such file or directory)"),
     ],
@@ -139,6 +148,21 @@ def test_hal_joins_pins_through_every_way_of_writing() -> None:
     parse_hal(text, ini, {"more.hal": more}.__getitem__, hal)
     assert hal.joined("a.out") == ["b.in", "d.out", "here.in"]
     assert hal.given == {"b.scale": "5", "x.scale": "[J]T"}
+
+
+@given(st.lists(st.tuples(st.integers(0, len(INI)), st.text(max_size=12)), max_size=6), st.integers(1, 9))
+@settings(max_examples=150, deadline=None)
+def test_spoilt_files_are_read_or_refused(spoilt: list[tuple[int, str]], step: int) -> None:
+    text = INI
+    for place, put in spoilt:
+        text = text[:place] + put + text[place + step :]
+    hal = Hal()
+    ini = parse_ini(text, lambda _name: "")
+    parse_hal(text + HAL_TEXT, ini, lambda _name: "", hal)
+    with contextlib.suppress(ConfigError):
+        found = machine_of(ini, hal, Path("mill.ini"))
+        assert found.axes
+        assert all(math.isfinite(scale.increments_per_mm) for scale in found.scales.values())
 
 
 @pytest.mark.debian

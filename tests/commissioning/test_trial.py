@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 
-from fdhil.commissioning import moving
-from fdhil.commissioning.master import Master
 from fdhil.commissioning.progress import Progress
 from fdhil.commissioning.record import CommissioningRecord, load_record
-from fdhil.commissioning.set_points import SetPoints
 from fdhil.commissioning.strokes import Room
 from fdhil.commissioning.trial import STEPS, Operator, Trial, try_axis
 from fdhil.config import MachineConfig
@@ -71,7 +68,9 @@ def quick_trial(quick_commissioning: None, monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.fixture
 def bench(quick_trial: None, tmp_path: Path) -> Iterator[Bench]:
-    config = machine(tmp_path, bus={"interface": "virtual", "channel": uuid.uuid4().hex}, guard={"clock": "sync"})
+    bus: dict[str, object] = {"interface": "virtual", "channel": uuid.uuid4().hex}
+    period = {"name": "bench", "sync_period_s": 0.002}
+    config = machine(tmp_path, bus=bus, guard={"clock": "sync"}, machine=period)
     with DrivePeer(config) as peer:
         sign_off(config)
         record = load_record(config.store.directory, "X")
@@ -95,6 +94,10 @@ def test_an_axis_is_tried_and_what_is_done_is_not_done_again(bench: Bench) -> No
     assert any(isinstance(outcome, ParameterSet) for outcome in tried.outcomes)
     assert bench.stands_mm == pytest.approx(0.0, abs=0.05)
 
+    beats = bench.peer.heard.count(0x700 + bench.config.play.node_id)
+    assert beats > 20  # the drive stops by itself when this process is gone
+    assert [bench.peer.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
+
     heard, bench.steps = len(bench.peer.heard), []
     again = bench.tried()
     assert bench.steps == []
@@ -102,37 +105,18 @@ def test_an_axis_is_tried_and_what_is_done_is_not_done_again(bench: Bench) -> No
     assert not {0x000, 0x080, 0x201} & set(bench.peer.heard[heard:])
 
 
-def test_what_the_operator_did_not_see_ends_it(bench: Bench) -> None:
-    bench.saw = False
+def test_a_wrong_sign_and_what_nobody_saw_end_it_before_a_rapid(bench: Bench) -> None:
+    bench.peer.drive.faults.signal("voltage").gain = -1.0
+    with pytest.raises(DriveFault, match="SignOrScale: voltage times current, and times speed is negative"):
+        bench.tried()
+    bench.peer.drive.faults.signal("voltage").gain, bench.saw = 1.0, False
     with pytest.raises(DriveFault, match=r"the table did not move as the drive says; another direction: drive.sign"):
         bench.tried()
     assert "test rapids" not in bench.steps
     assert bench.stands_mm == pytest.approx(0.0, abs=0.05)
-
-
-def test_a_wrong_sign_ends_it_before_a_rapid(bench: Bench) -> None:
-    bench.peer.drive.faults.signal("voltage").gain = -1.0
-    with pytest.raises(DriveFault, match="SignOrScale: voltage times current, and times speed is negative"):
-        bench.tried()
-    assert "test rapids" not in bench.steps
-
-
-def test_an_operator_who_stops_it_finds_the_axis_braked(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ctrl-C in the middle of a rapid; the next trial goes on with the rapids."""
-
-    watch_power = moving.watch_power
-
-    def watch(masters: Sequence[Master], path: SetPoints) -> None:
-        if abs(path.position[0]) > 30.0 * 3276.8:
-            raise KeyboardInterrupt
-        watch_power(masters, path)
-
-    with monkeypatch.context() as impatient:
-        impatient.setattr(moving, "watch_power", watch)
-        with pytest.raises(KeyboardInterrupt):
-            bench.tried()
-    assert 30.0 < bench.stands_mm < 130.0
-    assert Progress(bench.config.store.directory, "X").done().keys() == {"jog"}
+    assert Progress(bench.config.store.directory, "X").done().keys() == {"room"}
+    with pytest.raises(DriveFault, match=r"may go from -2.05 to 130.05 mm by the room that the trial began"):
+        bench.tried(Room(-5.0, 130.0))
 
 
 def test_no_room_sends_nothing(bench: Bench) -> None:

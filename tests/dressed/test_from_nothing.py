@@ -95,6 +95,13 @@ def made(outfit: Outfit, machine: MachineConfig, folder: Path, capsys: Capture) 
     return machine_config.load(file)
 
 
+@pytest.fixture(autouse=True)
+def sooner(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scan waits no longer than a drive in this process needs."""
+    monkeypatch.setattr("fdhil.commissioning.scan.PACE_S", 1e-4)
+    monkeypatch.setattr("fdhil.commissioning.scan.ANSWER_S", 0.1)
+
+
 class Guarded:
     """The machine with the guard's core beside it, as its process runs it: one decision after each SYNC."""
 
@@ -131,7 +138,7 @@ class Guarded:
 
 def to_and_fro() -> Trajectory:
     """A feed move out and back, at rest at both ends."""
-    way = np.concatenate([np.linspace(0, 15, 200), np.linspace(15, 0, 200)])
+    way = np.concatenate([np.linspace(0, 9, 120), np.linspace(9, 0, 120)])
     rest = np.zeros(70)
     return trajectory(smooth(np.concatenate([rest, way, rest])[:, None]), axes="X")
 
@@ -162,8 +169,8 @@ def corrected_on_line(machine: MachineConfig, config: MachineConfig, folder: Pat
     per_mm = config.axis["X"].scaling.increments_per_mm
     rows = tuple(tuple(round(x) for x in column * per_mm) for column in (demand.position_mm["X"], offset_um * 1e-3))
     path = CorrectedPath(0, rows[:1], rows[1:], True, PROGRAM)
-    before = off_path_um(started(machine), demand)
     twin = started(machine)
+    before = off_path_um(twin, demand)
     guard = Guarded(twin, config, folder, path)
     twin.run(200)
     guard.request = Request("arm", True, PROGRAM, FACTS_GIVEN)

@@ -18,7 +18,7 @@ from typing import Any
 
 import linuxcnc  # type: ignore[import-not-found]  # the package's own module, for the system's Python alone
 
-JOINTS = 3
+JOINTS = int(os.environ["JOINTS"])
 PATIENCE_S = 300.0
 
 
@@ -67,7 +67,7 @@ class Operator:
     def run(self, program: str) -> None:
         """Start a program from its first line."""
         self.order(self.command.program_open, program)
-        self.order(self.command.auto, linuxcnc.AUTO_RUN, 0)
+        self.command.auto(linuxcnc.AUTO_RUN, 0)  # whose completion is the program's
         self.wait(lambda status: status.interp_state != linuxcnc.INTERP_IDLE)
 
     def rest(self) -> None:

@@ -29,7 +29,7 @@ def paper(out: Path, runs: int, as_json: bool) -> int:
     """Reproduce the paper that fdhil goes back to, claim by claim.
 
     Each claim is put to trials in simulated scenarios, which are configs/paper.toml with a few keys changed: it holds,
-    holds with a condition, or is not reproduced. Nothing is sent anywhere. It takes less than a minute or so.
+    holds with a condition, or is not reproduced. Nothing is sent anywhere. It takes about half a minute.
     """
     from importlib.metadata import version
 

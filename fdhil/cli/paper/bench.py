@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
 from fdhil.cli.paper.scenarios import machine
-from fdhil.config import Axis, MachineConfig
+from fdhil.config import Axis
 from fdhil.identification.windows import find_windows
 from fdhil.records import Float, Parameters, Recording, Window, frozen
 from fdhil.sim.drive.physics import Physics, true_parameters
@@ -96,13 +96,6 @@ def run(
     return Signals(*rows)
 
 
-def cut(config: MachineConfig, models: Mapping[str, Parameters], demand_mm: Mapping[str, Float]) -> Float:
-    """Return where the table goes (n, axes), mm, when the machine follows a demand."""
-    period_s = config.machine.sync_period_s
-    axes = [run(config.axis[name], period_s, models[name], path).table_mm for name, path in demand_mm.items()]
-    return np.column_stack(axes)
-
-
 def stroke(move: Move, period_s: float, strokes: int = 1) -> Float:
     """Return the demand (n,) mm of rapids to and fro: trapezoids of speed, rounded over 20 ms."""
     ramp_s = move.speed_mm_s / move.acceleration_mm_s2
@@ -115,6 +108,7 @@ def stroke(move: Move, period_s: float, strokes: int = 1) -> Float:
     return np.concatenate([[0.0], np.cumsum(smooth) * period_s])
 
 
+@cache
 def rapid(
     parameters: Parameters,
     celsius: float = COLD_C,

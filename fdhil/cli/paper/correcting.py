@@ -168,7 +168,7 @@ def _oscillates() -> Claim:
             pictures.append(Picture(
                 f"Path in area A without and with the mirror correction, 10 m/min, {PATHS[name].title}. The axes are "
                 "stretched, as the paper's; below, the contour errors.",
-                _three(name, View((0.0, 25.0), PLACES["A"], 25.0)),
+                _three(name, View((0.0, 25.0), 55.0, 4.0)),
             ))  # fmt: skip
     return Claim(
         key="figure-17", kind="figure", source="Figure 17, section 6",
@@ -205,7 +205,7 @@ def _straight(place: str, key: str, source: str) -> Claim:
         if name in DRAWN and place == "B":
             pictures.append(Picture(
                 f"Path in area B without and with the mirror correction, 10 m/min, {PATHS[name].title}.",
-                _three(name, View((30.0, 75.0), (52.5, 55.0), 22.5)),
+                _three(name, View((30.0, 75.0), 55.0, 1.0, fine=True)),
             ))  # fmt: skip
     return Claim(
         key=key, kind="figure" if place == "B" else "claim", source=source,
@@ -283,7 +283,7 @@ def _rounded(oscillation: bool) -> Claim:
             pictures.append(Picture(
                 f"Path of the cutter's centre at the end of the arc at A without and with the mirror, 10 m/min, "
                 f"{PATHS[name].title}.",
-                _three(name, View((5.0, 45.0), (25.0, 75.0), 20.0), "rounded"),
+                _three(name, View((5.0, 45.0), 75.0, 4.0), "rounded"),
             ))  # fmt: skip
     return Claim(
         key="figure-20-oscillation" if oscillation else "figure-20", kind="figure", source="Figure 20, section 6",

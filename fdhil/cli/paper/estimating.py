@@ -99,7 +99,7 @@ def _operator() -> Claim:
     order = float(np.log2(errors[0] / errors[1]))
     return Claim(
         key="equation-4", kind="equation", source="Equation [4], section 2.2",
-        says="Dx(t) = (0.2047 x(t+h) + 0.886 x(t) - 1.386 x(t-h) + 0.2953 x(t-2h)) / h, zero forcing #1.",
+        says="Dx(t) = (0.2047·x(t+h) + 0.886·x(t) - 1.386·x(t-h) + 0.2953·x(t-2h)) / h, zero forcing #1.",
         paper="0.2047, 0.886, -1.386, 0.2953",
         rule="its weights to the printed digits; its error falls with the square of h or faster",
         trials=[

@@ -283,7 +283,7 @@ def _drift_picture(symbol: str, printed: tuple[float, float], drifts: Mapping[st
         celsius, values, std = drift.series(symbol)
         series[name] = celsius, factor * values, factor * std
     shown = factor * printed[0], factor * printed[1]
-    return drawings.drift(symbol, unit.replace(".", "·"), series, shown)
+    return drawings.drift(symbol, unit, series, shown)
 
 
 def _behaviour() -> Claim:
@@ -302,9 +302,8 @@ def _behaviour() -> Claim:
                 "Above, the speed of the drive and the model's answer to the same voltage, noise of 0.5 %; below, what "
                 "is between them.",
                 drawings.overlay(
-                    np.arange(float(window.n)) * window.dt_s,
-                    window.direction * window.speed_rad_s,
-                    window.direction * simulated,
+                    np.arange(float(window.n)) * window.dt_s, "time (s)", "speed (rad/s)",
+                    [("drive", window.direction * window.speed_rad_s), ("model", window.direction * simulated)],
                 ),
             ))  # fmt: skip
     return Claim(

@@ -67,7 +67,7 @@ def _section(claim: Claim) -> Section:
         claim.note,
     ]
     return Section(
-        f"{claim.source}: {claim.verdict.value}",
+        f"{claim.source} ({claim.key}): {claim.verdict.value}",
         " ".join(part for part in parts if part),
         tables=[_trials(claim), *claim.tables],
         figures=[(picture.caption, picture.svg) for picture in claim.pictures],

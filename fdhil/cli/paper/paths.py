@@ -13,6 +13,7 @@ from importlib.resources import as_file, files
 import numpy as np
 
 from fdhil.cli.demo.report import POINTS
+from fdhil.cli.paper import bench
 from fdhil.cli.paper.drawings import Traced
 from fdhil.cli.paper.scenarios import PATHS, machine
 from fdhil.config import MachineConfig
@@ -96,6 +97,15 @@ def offset_um(scenario: str, method: str, program: str = SLOW) -> dict[str, Floa
         axis: -linear.inverse(models[axis], config.axis[axis], before.reference.dt_s, error.size).apply(error)
         for axis, error in before.error_um.items()
     }
+
+
+@cache
+def measured_mm(scenario: str, program: str = SLOW) -> Float:
+    """Return where the table of the simulated machine goes (n, 2), mm: the twin's physics, not the model's."""
+    config, demand = machine(scenario), reference(scenario, program).position_mm
+    models, period_s = nominal_models(config), config.machine.sync_period_s
+    tables = [bench.run(config.axis[axis], period_s, models[axis], np.asarray(demand[axis])).table_mm for axis in AXES]
+    return np.column_stack(tables)
 
 
 def path_mm(answer: Prediction) -> Float:

@@ -51,9 +51,7 @@ def _structure() -> Claim:
     """Put the model's closed loop beside the twin's physics: two programs for the same equations."""
     trials = []
     for name in CASCADES:
-        config, demand = machine(name), paths.reference(name).position_mm
-        table = bench.cut(config, nominal_models(config), demand)
-        missed = np.abs(table - paths.path_mm(paths.predicted(name))).max()
+        missed = np.abs(paths.measured_mm(name) - paths.path_mm(paths.predicted(name))).max()
         trials.append(Trial(name, "largest difference of the two", 1e3 * float(missed), "um", most=5.0))
     return Claim(
         key="equation-1-2", kind="equation", source="Equations [1] and [2], Figure 1, section 1",
@@ -115,8 +113,7 @@ def _prediction() -> Claim:
     trials, pictures = [], []
     for name in CASCADES:
         config, reference = machine(name), paths.reference(name)
-        table = bench.cut(config, nominal_models(config), reference.position_mm)
-        measured = contour_error_um(reference.path_mm, table, reference.dt_s)
+        measured = contour_error_um(reference.path_mm, paths.measured_mm(name), reference.dt_s)
         told = predict(reference, {"X": model, "Y": model}, config).contour_um
         missed = 100.0 * rms(told - measured) / rms(measured)
         trials.append(Trial(name, "RMS between predicted and measured, of the measured", missed, "%", most=10.0))
@@ -124,7 +121,8 @@ def _prediction() -> Claim:
             pictures.append(Picture(
                 f"Contour error along the path at 10 m/min, {PATHS[name].title}: predicted from identified parameters "
                 "and as the simulated machine has it; below, what is between them.",
-                drawings.prediction(reference.time_s, measured, told),
+                drawings.overlay(reference.time_s, "time (s)", "contour error (um)",
+                                 [("machine", measured), ("predicted", told)]),
             ))  # fmt: skip
     return Claim(
         key="figure-9", kind="figure", source="Figure 9 and equation [10], section 5.2",
@@ -195,7 +193,7 @@ def _feeds(place: str, number: int, little: bool) -> Claim:
         pictures.append(Picture(
             f"Predicted path at {place} for two feeds, {PATHS[name].title}. The axes are stretched, as the paper's; "
             "below, the distance of each from its own desired path.",
-            drawings.place(traced, view(place, 10.0)),
+            drawings.place(traced, view(place, 10.0, 8.0)),
         ))  # fmt: skip
     ratios = [trial.value for trial in trials]
     return Claim(
@@ -208,11 +206,10 @@ def _feeds(place: str, number: int, little: bool) -> Claim:
     )  # fmt: skip
 
 
-def view(place: str, half_mm: float) -> View:
-    """Return what is drawn of a place: the axes' limits in X, those in Y by the curves."""
+def view(place: str, half_mm: float, band_mm: float) -> View:
+    """Return what is drawn of a place: as much before it as behind, at A all behind."""
     x, y = PLACES[place]
-    beside = (x, x + 2 * half_mm) if place == "A" else (x - half_mm, x + half_mm)
-    return View(beside, (x, y), 2 * half_mm)
+    return View((x, x + 2 * half_mm) if place == "A" else (x - half_mm, x + half_mm), y, band_mm)
 
 
 def _size() -> Claim:
@@ -255,12 +252,12 @@ def _drifted(number: int, changes: Sequence[tuple[str, float]], label: str) -> C
         traced = [
             Traced("desired", paths.desired_mm(name)),
             Traced("nominal", paths.path_mm(paths.predicted(name))),
-            Traced(label, drifted, apart_um(name, changes)),
+            Traced("with an added mass" if mass else "with less friction", drifted, apart_um(name, changes)),
         ]
         pictures.append(Picture(
             f"Predicted path at E, 10 m/min, {PATHS[name].title}: nominal, and with {label}. Below, the distance of "
             "the two along X.",
-            drawings.place(traced, view("E", 5.0), "distance (µm)"),
+            drawings.place(traced, view("E", 5.0, 4.0), "distance (um)"),
         ))  # fmt: skip
     return Claim(
         key=f"figure-{number}", kind="figure", source=f"Figure {number}, section 5.3",

@@ -103,7 +103,6 @@ RECORDINGS: Mapping[str, Scenario] = {
     "backlash-5": Scenario("5 um of backlash, noise of 0.1 %"),
     "backlash-20": Scenario("20 um of backlash, noise of 0.1 %"),
     "backlash-100": Scenario("100 um of backlash, noise of 0.1 %"),
-    "ripple-1": Scenario("a ripple of 1 N.m with each turn of the screw, which the six parameters do not have"),
     "residuals": Scenario("whiteness of what least squares leaves of [5] and [6]"),
     "innovations": Scenario("whiteness of the innovations of maximum likelihood"),
     "operation-10-s": Scenario("a cut of 10 s while the slide-ways warm by 2 K with 600 s"),

@@ -93,6 +93,16 @@ class Draft:
         else:
             self.values[path] = proposal
 
+    def ask_again(self, path: str, why: str) -> None:
+        """Ask for a value that cannot be, and why it cannot; the old one is proposed, for another may be at fault."""
+        self.values[path] = Told(self.get(path), "as it was", guessed=True)
+        self.settle(path, f"it cannot be: {why}")
+
+    @property
+    def guessed(self) -> int:
+        """How many values nobody told."""
+        return sum(told.guessed for told in self.values.values())
+
     @property
     def document(self) -> dict[str, Any]:
         """The values as nested tables."""

@@ -100,7 +100,21 @@ def machine_of(ini: Ini, hal: Hal, path: Path) -> Machine:
     _common(ini, machine)
     for letter, joint in joints.items():
         _axis(ini, hal, letter, joint, unit_mm, machine)
+    machine.notes += _travel(ini, joints, unit_mm)
     return machine
+
+
+def _travel(ini: Ini, joints: Mapping[str, int], unit_mm: float) -> Iterator[str]:
+    """Say how far the axes may go: commissioning asks for room, and no key of the configuration holds it."""
+    ways = []
+    for letter, joint in joints.items():
+        places = (f"AXIS_{letter}", f"JOINT_{joint}")
+        low = [value for place in places if (value := ini.number(place, "MIN_LIMIT")) is not None]
+        high = [value for place in places if (value := ini.number(place, "MAX_LIMIT")) is not None]
+        if low and high:
+            ways.append(f"{letter} {max(low) * unit_mm:g} to {min(high) * unit_mm:g} mm")
+    if ways:
+        yield f"LinuxCNC lets go {', '.join(ways)}: give `fdhil commission --room` no more than that"
 
 
 def _unit_mm(ini: Ini, path: Path) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -54,7 +54,7 @@ def make(
     draft.notes += nc.notes if nc else []
     ways = list(_buses(draft, interface, offline=look is None))
     buses = [look(name, settings) for name, settings in ways] if look else []
-    settle_machine(draft, buses, file.stem)
+    settle_machine(draft, buses, file.stem, nc)
     drives = [drive for bus in buses for drive in bus.drives]
     complete = bool(buses) and all(bus.master is None for bus in buses)
     names = axis_names(draft, nc, drives)
@@ -118,9 +118,7 @@ def conclude(draft: Draft, file: Path) -> str:
             if draft.ask is None or not wrong:
                 raise
             for fault in wrong:
-                kept = draft.values[fault.path]
-                draft.values[fault.path] = Told(kept.value, "as it was", guessed=True)
-                draft.settle(fault.path, f"it cannot be: {fault.what}")
+                draft.ask_again(fault.path, fault.what)
         else:
             draft.notes += unlikely(config)
             return text
@@ -128,14 +126,8 @@ def conclude(draft: Draft, file: Path) -> str:
 
 def text_of(draft: Draft, file: Path) -> str:
     """Return the commented file."""
-    guessed = sum(told.guessed for told in draft.values.values())
     head = (
-        f"{file.name}, made by fdhil init. Behind each value stands who said so; {guessed} are guessed: check these. "
-        "A line that begins with # and no space is a setting at its default; the comment above a line says what it is."
+        f"{file.name}, made by fdhil init. Behind each value stands who said so; {draft.guessed} are guessed: check "
+        "them. A line that begins with # and no space is a setting at its default."
     )
     return filled(draft.document, {path: told.source for path, told in draft.values.items()}, head)
-
-
-def guessed(draft: Draft) -> Sequence[str]:
-    """Return the paths of the values that nobody told."""
-    return [path for path, told in draft.values.items() if told.guessed]

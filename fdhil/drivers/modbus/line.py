@@ -70,7 +70,7 @@ class Answer:
 
 def no_answer(request: Request) -> DeviceTimeout:
     """Return the error of a unit that said nothing."""
-    text = f"register {request.address} was not answered within {request.timeout_s:g} s; check the sensor and its line"
+    text = f"register {request.address} was not answered within {request.timeout_s:g} s; check the device and its line"
     return DeviceTimeout(request.name, text)
 
 

@@ -61,7 +61,7 @@ class TcpLine:
             except TimeoutError:
                 pass
             if not connected:
-                text = f"the Modbus sensor {self._where} cannot be reached; check its supply, host and port"
+                text = f"the Modbus device {self._where} cannot be reached; check its supply, host and port"
                 raise ConnectError(name, text)
 
     async def ask(self, request: Request) -> Answer:
@@ -113,7 +113,7 @@ class TcpLine:
         return answer
 
     def _gone(self, request: Request) -> ConnectError:
-        text = f"the connection to the Modbus sensor {self._where} is gone; check its supply and cable"
+        text = f"the connection to the Modbus device {self._where} is gone; check its supply and cable"
         return ConnectError(request.name, text)
 
     def _silent(self, request: Request) -> DeviceError:

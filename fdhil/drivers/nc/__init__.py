@@ -13,6 +13,7 @@ from typing import Protocol, Self
 
 from fdhil import tables
 from fdhil.config import MachineConfig
+from fdhil.errors import ConfigError, ConfigFault
 from fdhil.records import NcState
 
 
@@ -41,6 +42,10 @@ class NcSource(Protocol):
 
 
 def load_nc_source(name: str) -> Callable[[MachineConfig], NcSource]:
-    """Return the source that ``tables.NC_SOURCES`` lists under ``name``."""
-    source: Callable[[MachineConfig], NcSource] = tables.load(tables.NC_SOURCES, name)
+    """Return the source that ``tables.NC_SOURCES`` lists under ``name``; ConfigError where its library lacks."""
+    try:
+        source: Callable[[MachineConfig], NcSource] = tables.load(tables.NC_SOURCES, name)
+    except ImportError as error:
+        what = f"{name} needs the library {error.name}, which is not installed"
+        raise ConfigError("config", [ConfigFault("g0.source", what, f"pip install 'fdhil[{name}]'")]) from None
     return source

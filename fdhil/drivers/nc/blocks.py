@@ -33,17 +33,21 @@ class IsoBlocks:
 
     def __init__(self) -> None:
         self._held: MoveKind | None = None
-        self._line: int | None = None
+        self._line: int | None = None  # up to which no block was left out
+        self._text = ""
 
     def kind(self, text: str, line: int | None) -> MoveKind | None:
         """Return what the block moves as; None without a word of its own where blocks may have been left out."""
         numbers = [int(word[1]) for word in _G.finditer(_COMMENT.sub(" ", text)) if not word[2]]
         words = {G_WORDS.get(number) for number in numbers if number in G_WORDS or number in _CYCLES}
+        follows = line is not None and self._line is not None and 0 <= line - self._line <= 1
         if words:
             self._held = words.pop() if len(words) == 1 else None
-        elif line is None or self._line is None or not 0 <= line - self._line <= 1:
+        elif not follows:
             self._held = None
-        self._line = line
+        # a line may be told before its block: far from the last one, with the text as before
+        self._line = line if follows or text != self._text else None
+        self._text = text
         return self._held
 
 

@@ -25,6 +25,7 @@ from fdhil.records import NcState
 
 ANSWER_S = 5.0
 MOST_OBSERVATIONS = 10_000  # of one document
+TOGETHER_S = 0.01
 
 
 class MtConnect:
@@ -102,7 +103,7 @@ class MtConnect:
         ]
         if lacking:
             text = f"tells no {', no '.join(lacking)}; compare the profile with its /current"
-            raise ProtocolError(self.name, f"{text}, and see docs/how-to/g0-from-the-nc.md")
+            raise ProtocolError(self.name, f"{text}, and see docs/how-to/g0-over-the-network.md")
         self._signals = {item: name for name, item in found.items() if item is not None}
         self._instance = streams.instance
         for each in (each for component in components for each in component.observed):
@@ -153,11 +154,15 @@ class MtConnect:
             yield self._state(stamp_ns, error_ns)
 
 
+def _is_soon(one_s: float | None, other_s: float | None) -> bool:
+    return one_s is not None and other_s is not None and abs(other_s - one_s) <= TOGETHER_S
+
+
 def _by_time(observed: Iterable[Observation]) -> Iterator[tuple[float | None, list[Observation]]]:
-    """Yield the observations of one instant together, in order."""
+    """Yield the observations of one instant together, in order: an agent stamps line and block one after the other."""
     together: list[Observation] = []
     for each in observed:
-        if together and each.time_s != together[0].time_s:
+        if together and not _is_soon(together[0].time_s, each.time_s):
             yield together[0].time_s, together
             together = []
         together.append(each)

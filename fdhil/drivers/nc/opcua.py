@@ -19,7 +19,7 @@ from asyncua import Client, ua
 from asyncua.ua.uaerrors import UaError
 
 from fdhil.config import MachineConfig
-from fdhil.drivers.nc.opcua_nodes import find_nodes
+from fdhil.drivers.nc.opcua_nodes import check_places, find_nodes
 from fdhil.drivers.nc.opcua_security import secure
 from fdhil.drivers.nc.profile import Shown, Translator
 from fdhil.drivers.nc.profile_file import read_nc_profile
@@ -41,6 +41,7 @@ class OpcUa:
         self._settings = config.nc_source.opcua
         self.name = f"OPC UA server at {self._settings.url.removeprefix('opc.tcp://')}"
         self._profile = read_nc_profile(self._settings.profile, "opcua")
+        check_places({name: signal.at for name, signal in self._profile.signals.items()}, self._settings.profile)
         self._translator = Translator(self._profile, self.name)
         self._client: Client | None = None
         self._nodes: Mapping[str, ua.NodeId] = {}

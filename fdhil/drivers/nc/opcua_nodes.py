@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from asyncua import Client, ua
+from asyncua.ua.uaerrors import UaError
+
+from fdhil.errors import ConfigError, ConfigFault
 
 MOST_BROWSED = 500  # nodes that are looked into before a path is given up
 NAMED = "nsu="
@@ -44,9 +47,23 @@ def _named(references: Iterable[ua.ReferenceDescription]) -> Iterable[tuple[str,
             yield reference.BrowseName.Name, reference.NodeId
 
 
+def check_places(places: Mapping[str, str], source: str) -> None:
+    """ConfigError with every place that is neither a node id nor a path."""
+    faults = []
+    for name, at in places.items():
+        try:
+            if not at.startswith(PATH):
+                ua.NodeId.from_string(at.partition(";")[2] if at.startswith(NAMED) else at)
+        except (UaError, ValueError):
+            advice = "'ns=2;s=NAME', 'nsu=URI;s=NAME' or 'Objects/NAME/NAME'"
+            faults.append(ConfigFault(f"signals.{name}.at", f"{at[:60]!r} is no place of OPC UA", advice))
+    if faults:
+        raise ConfigError(f"NC profile {source}", faults)
+
+
 async def find_nodes(client: Client, places: Mapping[str, str]) -> dict[str, ua.NodeId]:
     """Return the node of each place that there is: a node id, one with ``nsu=URI;`` in front, or a path of browse
-    names from ``Objects/`` on. ValueError for a place that is none of these."""
+    names from ``Objects/`` on."""
     browser, found = _Browser(client), {}
     spaces = await client.get_namespace_array() if any(at.startswith(NAMED) for at in places.values()) else []
     for name, at in places.items():

@@ -39,7 +39,8 @@ class MtConnectPeer:
     knows = frozenset({*BLOCKS, MoveKind.REST, MoveKind.HOLD})
 
     def __init__(self) -> None:
-        self.instance, self.chunked, self.devices = 1, True, ("Mill",)
+        self.instance, self.chunked = 1, True
+        self.devices: tuple[str, ...] = ("Mill",)
         self.sequence = 1
         self.changes: list[tuple[int, str, str, float]] = []  # sequence, item, text, time
         self.requests: list[str] = []
@@ -48,9 +49,9 @@ class MtConnectPeer:
         for item in ITEMS:
             self.show(item, "UNAVAILABLE")
 
-    def show(self, item: str, text: str) -> None:
-        """Let an item show a text from now on."""
-        self.changes.append((self.sequence, item, text, time.time()))
+    def show(self, item: str, text: str, later_s: float = 0.0) -> None:
+        """Let an item show a text from now on; the agent stamps it ``later_s`` later."""
+        self.changes.append((self.sequence, item, text, time.time() + later_s))
         self.sequence += 1
 
     @property

@@ -23,27 +23,35 @@ SHOWN = {  # of the profile siemens
 FIELDS = ("line", "feed_override", "rapid_override", "tool", "program", "feed_mm_min", "programmed_feed_mm_min")
 
 
-class _QuickServer(InternalServer):
-    """The nodes that every server has are made once, not for each: that takes seconds."""
+class _Nodes(dict[ua.NodeId, NodeData]):
+    """Nodes that are copied from those of ``made`` when they are first looked at."""
 
     made: ClassVar[dict[ua.NodeId, NodeData]] = {}
 
-    async def load_standard_address_space(self, shelf_file: Path | None = None) -> None:
-        if not self.made:
-            await super().load_standard_address_space()
-            self.made.update(_copied(self.aspace._nodes))
-        self.aspace._nodes = _copied(self.made)
+    def __contains__(self, key: object) -> bool:
+        return super().__contains__(key) or key in self.made
 
-
-def _copied(nodes: Mapping[ua.NodeId, NodeData]) -> dict[ua.NodeId, NodeData]:
-    copies = {}
-    for node_id, node in nodes.items():
-        copies[node_id] = copy = NodeData(node_id)
-        for key, attribute in node.attributes.items():
-            copy.attributes[key] = mine = AttributeValue(attribute.value)  # type: ignore[arg-type]
+    def __missing__(self, key: ua.NodeId) -> NodeData:
+        node = self.made[key]
+        self[key] = copy = NodeData(key)
+        for name, attribute in node.attributes.items():
+            copy.attributes[name] = mine = AttributeValue(attribute.value)  # type: ignore[arg-type]
             mine.value_callback, mine.value_setter = attribute.value_callback, attribute.value_setter
         copy.references, copy.call = list(node.references), node.call
-    return copies
+        return copy
+
+    def get(self, key: ua.NodeId, default: Any = None) -> Any:
+        return self[key] if key in self else default  # noqa: SIM401 (it is this that get is made of)
+
+
+class _QuickServer(InternalServer):
+    """The nodes that every server has are made once, not for each: that takes seconds."""
+
+    async def load_standard_address_space(self, shelf_file: Path | None = None) -> None:
+        if not _Nodes.made:
+            await super().load_standard_address_space()
+            _Nodes.made.update(self.aspace._nodes)
+        self.aspace._nodes = _Nodes()
 
 
 class OpcUaPeer:
@@ -52,7 +60,8 @@ class OpcUaPeer:
     tells = frozenset(FIELDS)
     knows = frozenset(SHOWN)
 
-    def __init__(self) -> None:
+    def __init__(self, secure: tuple[Path, Path] | None = None, users: Any = None) -> None:
+        self._secure, self._users = secure, users  # certificate and key
         self.nodes: dict[str, Node] = {}
         self._signals = read_nc_profile("siemens", "opcua").signals
 
@@ -61,10 +70,14 @@ class OpcUaPeer:
         return {"url": f"opc.tcp://127.0.0.1:{self.port}", "profile": "siemens", "period_s": 0.02, "timeout_s": 0.5}
 
     async def __aenter__(self) -> Self:
-        self.server = Server(iserver=_QuickServer())
+        self.server = Server(iserver=_QuickServer(self._users))
         await self.server.init()
         self.server.set_endpoint("opc.tcp://127.0.0.1:0")
         self.server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+        if self._secure is not None:
+            self.server.set_security_policy([ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt])
+            await self.server.load_certificate(self._secure[0])
+            await self.server.load_private_key(self._secure[1])
         await self.server.register_namespace("SinumerikVarProvider")
         first = {"program": "", "g_group_1": "G00"}
         for name, signal in self._signals.items():

@@ -175,6 +175,17 @@ def test_blocks_hold_their_word_as_far_as_none_is_left_out() -> None:
     assert [reader.kind(text, line) for text, line, _ in BLOCKS] == [kind for *_, kind in BLOCKS]
 
 
+def test_a_line_and_its_block_may_be_told_one_after_the_other() -> None:
+    line_first = [("G0 X1", 5), ("G0 X1", 6), ("X2", 6), ("X2", 8), ("X3", 8), ("G1 X4", 9), ("G1 X4", 11), ("X5", 11)]
+    reader = IsoBlocks()
+    kinds = [reader.kind(text, line) for text, line in line_first]
+    assert kinds[:3] == [MoveKind.RAPID] * 3
+    assert kinds[3:5] == [None, None]  # the block of line 7 was not shown
+    assert kinds[-1] is None
+    reader = IsoBlocks()
+    assert [reader.kind(*each) for each in (("G0 X1", 5), ("X2", 5), ("X2", 8))] == [MoveKind.RAPID] * 2 + [None]
+
+
 def test_without_lines_only_a_word_of_its_own_counts() -> None:
     reader = IsoBlocks()
     assert [reader.kind(text, None) for text in ("G0 X1", "X2", "G1 X3")] == [MoveKind.RAPID, None, MoveKind.FEED]

@@ -1,0 +1,242 @@
+"""Gathers what an acceptance report says, and which points are open, each by a rule."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fdhil import correction
+from fdhil.cli.history_course import AxisHistory
+from fdhil.cli.history_reading import by_axis, read_history
+from fdhil.cli.prediction import inputs
+from fdhil.commissioning.progress import Progress
+from fdhil.commissioning.record import CommissioningRecord, holds, load_record
+from fdhil.commissioning.void import is_void
+from fdhil.config import MachineConfig
+from fdhil.errors import RecordingError, StoreError
+from fdhil.prediction.circular import Circular, circle_program, evaluate
+from fdhil.program import program_digest
+from fdhil.records import PARAMETERS, UNITS, Correction, Float, Prediction
+
+SCHEMA = "fdhil-acceptance-1"
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What was asked for: see ``fdhil acceptance --help``."""
+
+    by: str
+    program: Path | None
+    radius_mm: float
+    feed_mm_min: float
+    measured_circle: Path | None
+    contour_um: float | None
+    circle_um: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class AxisProof:
+    """What was proven of one drive: its record and when each step was done; what speaks against it, or nothing."""
+
+    record: CommissioningRecord | None
+    steps: Mapping[str, str]
+    against: str
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """All that the report says. ``circles`` are by how they were found; ``plane`` is empty where no two axes move."""
+
+    machine: MachineConfig
+    asked: Asked
+    made_utc: str
+    proofs: Mapping[str, AxisProof]
+    histories: Sequence[AxisHistory]
+    identified: bool
+    plane: tuple[str, str] | None
+    circles: Mapping[str, Circular]
+    path: Correction | None
+    open_points: Sequence[str]
+
+
+def find(machine: MachineConfig, config: Path, asked: Asked) -> Findings:
+    """Gather everything; ConfigError, StoreError, ProgramError, RecordingError where something cannot be read."""
+    proofs = {axis: _proof(machine, axis) for axis in machine.axis}
+    try:
+        histories = by_axis(machine, *read_history(machine))
+    except StoreError as error:
+        if error.code != "NoHistory":
+            raise
+        histories = []
+    known = {history.axis for history in histories if history.rows}
+    identified = known >= set(machine.axis)
+    linear = [axis for axis in ("X", "Y", "Z") if axis in machine.axis]
+    plane = (linear[0], linear[1]) if len(linear) > 1 else None
+    circles = _circles(config, asked, plane, identified) if plane else {}
+    path = _planned(asked.program, config, identified) if asked.program else None
+    points = [f"{axis}: {proof.against}" for axis, proof in proofs.items() if proof.against]
+    points += [
+        f"{axis}: no parameters were published, the nominal ones stand in; let the daemon see some rapids"
+        for axis in machine.axis
+        if axis not in known
+    ]
+    points += _beyond(asked, circles, path)
+    made = datetime.now(UTC).isoformat(timespec="seconds")
+    return Findings(machine, asked, made, proofs, histories, identified, plane, circles, path, points)
+
+
+def _proof(machine: MachineConfig, axis: str) -> AxisProof:
+    directory, key = machine.store.directory, machine.store.directory / "commissioning.key"
+    try:
+        record = load_record(directory, axis, key, may_lack_key=True)
+    except StoreError as error:
+        return AxisProof(None, {}, str(error))
+    if record is None:
+        return AxisProof(None, {}, "not commissioned; run fdhil commission")
+    against = ""
+    if is_void(directory, axis):
+        against = "its record is void; run fdhil check with the NC off"
+    elif not holds(record, machine, axis):
+        against = "its record was made with another configuration; commission it again"
+    return AxisProof(record, Progress(directory, axis).done(), against)
+
+
+def _planned(program: Path, config: Path, from_history: bool) -> Correction:
+    reference, models, machine = inputs(program, config, None, from_history)
+    return correction.plan(reference, models, machine)
+
+
+def _circles(config: Path, asked: Asked, plane: tuple[str, str], from_history: bool) -> dict[str, Circular]:
+    with tempfile.TemporaryDirectory(prefix="fdhil-circle-") as folder:
+        program = Path(folder) / "circle.ngc"
+        program.write_text(circle_program(plane, asked.radius_mm, asked.feed_mm_min), "ascii")
+        planned = _planned(program, config, from_history)
+    cases = {"predicted, uncorrected": planned.before}
+    if not planned.refused:
+        cases["predicted, corrected"] = planned.after
+    found = {
+        label: evaluate(_table_mm(predicted, plane), asked.radius_mm, (0.0, 0.0)) for label, predicted in cases.items()
+    }
+    if asked.measured_circle is not None:
+        found["measured"] = evaluate(read_path(asked.measured_circle, plane), asked.radius_mm)
+    return found
+
+
+def _table_mm(predicted: Prediction, plane: tuple[str, str]) -> Float:
+    return np.column_stack([predicted.predicted_mm[axis] for axis in plane])
+
+
+def read_path(path: Path, plane: tuple[str, str]) -> Float:
+    """Return the columns of a measured path (n, 2), mm. RecordingError where the file has none."""
+    names = [f"{axis}_mm" for axis in plane]
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = [[float(row[name]) for name in names] for row in csv.DictReader(file)]
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read ({error.strerror}); check the path") from None
+    except (KeyError, TypeError, ValueError, csv.Error):
+        text = (
+            f"{path} is no measured path: a CSV with the columns {', '.join(names)} and a number in each row is needed"
+        )
+        raise RecordingError(text) from None
+    if not rows or not np.isfinite(rows).all():
+        raise RecordingError(f"{path} holds no path, or a place that is no number; export it again")
+    return np.array(rows)
+
+
+def _beyond(asked: Asked, circles: Mapping[str, Circular], path: Correction | None) -> list[str]:
+    """Return the limits that are not kept; a limit without anything to compare it with is open too."""
+    points = []
+    if asked.circle_um is not None:
+        told = circles.get("measured") or circles.get("predicted, corrected") or circles.get("predicted, uncorrected")
+        if told is None or told.both_um > asked.circle_um:
+            found = "no circle could be run" if told is None else f"it is {told.both_um:.1f} um"
+            points.append(f"circular deviation: {asked.circle_um:g} um are allowed, {found}")
+    if asked.contour_um is not None:
+        if path is None:
+            points.append(f"contour error: {asked.contour_um:g} um are allowed, and no --program was given to tell it")
+        elif (largest := float((path.before if path.refused else path.after).contour_um.max())) > asked.contour_um:
+            points.append(f"contour error: {asked.contour_um:g} um are allowed, it is {largest:.1f} um")
+    return points
+
+
+def document_of(found: Findings) -> dict[str, Any]:
+    """Return what the report says as JSON has it; ``sha256`` is over all the rest, keys sorted, no spaces."""
+    machine, asked = found.machine, found.asked
+    document: dict[str, Any] = {
+        "schema": SCHEMA,
+        "made_utc": found.made_utc,
+        "made_by": f"fdhil {version('fdhil')}",
+        "by": asked.by,
+        "machine": {
+            "name": machine.machine.name,
+            "config_digest": machine.digest,
+            "sync_period_s": machine.machine.sync_period_s,
+        },
+        "axes": {axis: _axis_document(found, axis) for axis in machine.axis},
+        "circle": {
+            "plane": "".join(found.plane or ()),
+            "radius_mm": asked.radius_mm,
+            "feed_mm_min": asked.feed_mm_min,
+            "limit_um": asked.circle_um,
+            "found": {label: _circle_document(circle) for label, circle in found.circles.items()},
+        },
+        "program": _program_document(found),
+        "open": list(found.open_points),
+        "accepted": not found.open_points,
+    }
+    text = json.dumps(document, sort_keys=True, separators=(",", ":"))
+    return document | {"sha256": hashlib.sha256(text.encode()).hexdigest()}
+
+
+def _axis_document(found: Findings, axis: str) -> dict[str, Any]:
+    proof = found.proofs[axis]
+    rows = next((history.rows for history in found.histories if history.axis == axis), ())
+    newest = rows[-1]["parameters"] if rows else None
+    return {
+        "commissioning": proof.record and {**asdict(proof.record), "digest": proof.record.digest},
+        "steps": dict(proof.steps),
+        "against": proof.against or None,
+        "parameters": newest and {
+            name: {key: newest[name].get(key) for key in ("value", "low", "high")} | {"unit": UNITS[name]}
+            for name in PARAMETERS if name in newest
+        },
+    }  # fmt: skip
+
+
+def _circle_document(circle: Circular) -> dict[str, Any]:
+    counter, clockwise = circle.deviations_um
+    largest, least = circle.radial_um
+    return {
+        "deviation_counter_clockwise_um": counter,
+        "deviation_clockwise_um": clockwise,
+        "deviation_both_um": circle.both_um,
+        "hysteresis_um": circle.hysteresis_um,
+        "radial_largest_um": largest,
+        "radial_least_um": least,
+    }
+
+
+def _program_document(found: Findings) -> dict[str, Any] | None:
+    if found.path is None or found.asked.program is None:
+        return None
+    path = found.path
+    cases = {"uncorrected": path.before} | ({} if path.refused else {"corrected": path.after})
+    return {
+        "name": found.asked.program.name,
+        "sha256": program_digest(found.asked.program),
+        "limit_um": found.asked.contour_um,
+        "method": path.method,
+        "refused": [str(reason) for reason in path.refused],
+        **{label: {"rms_um": p.rms_um, "max_um": float(p.contour_um.max())} for label, p in cases.items()},
+    }

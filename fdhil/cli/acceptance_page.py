@@ -1,0 +1,128 @@
+"""Lays the acceptance report out: the verdict, what was proven, parameters, circular test, path, signatures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from fdhil.cli.acceptance_findings import AxisProof, Findings
+from fdhil.cli.history_verdict import LATEST_HEAD, latest_rows
+from fdhil.cli.parameter_view import MEANING
+from fdhil.prediction.circular import Circular
+from fdhil.report import Page, Section, Table
+from fdhil.report.circular import polar
+from fdhil.report.path import correction_page
+
+CIRCLE_ROWS = (
+    "G, counter-clockwise (um)", "G, clockwise (um)", "G(b), both runs (um)", "H, between the runs (um)",
+    "F, farthest outside (um)", "F, farthest inside (um)",
+)  # fmt: skip
+PROOF_ROWS = (
+    "vendor, product, revision", "serial number", "offset read back", "offset of 10 um moved it by",
+    "following-error window", "stops when fdhil is silent", "commissioned (UTC)", "record, digest", "open",
+)  # fmt: skip
+SIGNATURES = ("proved by", "received by")
+LINE = "_" * 28
+
+
+def page_of(found: Findings, document: Mapping[str, Any]) -> Page:
+    """Return the page; ``document`` is what JSON says of it, for its hash."""
+    state = "accepted" if not found.open_points else f"{len(found.open_points)} points open"
+    sections = [_verdict(found), _proven(found), _parameters(found)]
+    if found.plane is not None:
+        sections.append(_circular(found))
+    if found.path is not None and found.asked.program is not None:
+        page = correction_page(found.asked.program.name, "", found.path)
+        sections += [Section(f"Program {found.asked.program.name}: {s.title}", s.text, s.tables, s.figures)
+                     for s in page.sections]  # fmt: skip
+    commissioned = sum(not proof.against for proof in found.proofs.values())
+    tiles = [("verdict", state), ("drives commissioned", f"{commissioned} of {len(found.proofs)}")]
+    tiles += [(f"circle, {label}, G(b)", f"{circle.both_um:.1f} um") for label, circle in found.circles.items()]
+    return Page(
+        f"Acceptance of {found.machine.machine.name}",
+        "What was proven of its drives, what they are, and how well they run. Nothing was sent for this report.",
+        tiles,
+        [*sections, _signatures(found, document)],
+    )
+
+
+def _verdict(found: Findings) -> Section:
+    machine = found.machine
+    rows = [
+        ["machine", machine.machine.name],
+        ["configuration, digest", machine.digest],
+        ["cycle", f"{machine.machine.sync_period_s * 1e3:g} ms"],
+    ]
+    for axis, section in machine.axis.items():
+        reach = f"{section.screw_pitch_mm:g} mm a turn, rapid {section.rapid_speed_mm_s * 0.06:g} m/min"
+        rows.append([f"axis {axis}", f"{reach}, at most {section.max_acceleration_mm_s2 / 1e3:g} m/s²"])
+    points = [[str(number), point] for number, point in enumerate(found.open_points, 1)]
+    tables = [Table(("", "open point"), points)] if points else []
+    text = "" if points else "No point is open: every drive is commissioned and identified, and every limit is kept."
+    return Section("The machine", text, [*tables, Table(("", "value"), rows)])
+
+
+def _proven(found: Findings) -> Section:
+    columns = [_proof_column(proof) for proof in found.proofs.values()]
+    rows = [[what, *cells] for what, *cells in zip(PROOF_ROWS, *columns, strict=True)]
+    steps = [[axis, name, time.replace("T", " ")[:16]] for axis, proof in found.proofs.items()
+             for name, time in proof.steps.items()]  # fmt: skip
+    head = ("", *(f"axis {axis}" for axis in found.proofs))
+    tables = [Table(head, rows, "Each on the drive itself, by fdhil commission")]
+    if steps:
+        tables.append(Table(("axis", "step", "done (UTC)"), steps, "Steps that were done"))
+    return Section("What was proven", "", tables)
+
+
+def _proof_column(proof: AxisProof) -> list[str]:
+    record = proof.record
+    if record is None:
+        return [*["-"] * (len(PROOF_ROWS) - 1), proof.against]
+    return [
+        f"{record.vendor_id:#x}, {record.product_code:#x}, {record.revision:#x}", str(record.serial),
+        "yes" if record.readback_ok else "no", f"{record.sign_test_um:+.1f} um",
+        f"{record.following_error_window_um:g} um", record.watchdog, record.created_utc[:16].replace("T", " "),
+        record.digest[:16], proof.against or "-",
+    ]  # fmt: skip
+
+
+def _parameters(found: Findings) -> Section:
+    shares = found.machine.maintenance.model_dump()
+    tables = [Table(LATEST_HEAD, latest_rows(history, shares), f"Axis {history.axis}")
+              for history in found.histories if history.rows]  # fmt: skip
+    text = (
+        f"The newest published ones, identified from rapid moves; {MEANING}." if tables else "None was published yet."
+    )
+    return Section("Parameters", text, tables)
+
+
+def _circular(found: Findings) -> Section:
+    asked = found.asked
+    columns = [_circle_cells(circle) for circle in found.circles.values()]
+    rows = [[what, *cells] for what, *cells in zip(CIRCLE_ROWS, *columns, strict=True)]
+    whose = "identified" if found.identified else "nominal"
+    pictures = [
+        (f"Circular test, {label}: radius {asked.radius_mm:g} mm", polar(circle, found.plane or ("X", "Y")))
+        for label, circle in found.circles.items()
+    ]
+    return Section(
+        f"Circular test after ISO 230-4, plane {''.join(found.plane or ())}",
+        f"Radius {asked.radius_mm:g} mm, feed {asked.feed_mm_min:g} mm/min, both directions, the middle 360 degrees of "
+        f"each run; predictions with the {whose} parameters. G is what lies between two concentric circles around a "
+        "run, H how far the runs are apart at one angle, F how far they are outside (+) or inside (-) of the "
+        "programmed circle; deviations are about the least-squares centre. F holds what the NC's smoothing takes away.",
+        [Table(("", *found.circles), rows)],
+        pictures,
+    )
+
+
+def _circle_cells(circle: Circular) -> list[str]:
+    values = (*circle.deviations_um, circle.both_um, circle.hysteresis_um, *circle.radial_um)
+    return [f"{value:.2f}" for value in values]
+
+
+def _signatures(found: Findings, document: Mapping[str, Any]) -> Section:
+    names = (found.asked.by or LINE, LINE)
+    rows = [[who, name, LINE, LINE] for who, name in zip(SIGNATURES, names, strict=True)]
+    text = f"SHA-256 of what this report says, as fdhil acceptance --json prints it: {document['sha256']}"
+    return Section("Signatures", text, [Table(("", "name", "date, place", "signature"), rows)])

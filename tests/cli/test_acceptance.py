@@ -1,0 +1,109 @@
+"""acceptance: what was proven, what is open, the circle and the path, under one hash."""
+
+from __future__ import annotations
+
+import hashlib
+import html
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil.commissioning.record import axis_digest, save_record
+from fdhil.commissioning.void import void_record
+from fdhil.config import MachineConfig
+from fdhil.store.history import History
+from tests.commissioning.test_record import RECORD
+from tests.daemon.machine import config_of
+from tests.daemon.shop import BENCH, fdhil
+from tests.store.made import STAMP, outcome, published, window
+
+CIRCLE = ("--radius-mm", "10", "--feed", "3000")
+
+
+def machine_of(folder: Path) -> MachineConfig:
+    (folder / "machine.toml").write_text(BENCH)
+    return config_of(folder, ("X", "Y"))
+
+
+@pytest.fixture(name="proven")
+def _proven(tmp_path: Path) -> MachineConfig:
+    """A machine whose drives were commissioned and identified."""
+    machine = machine_of(tmp_path)
+    with History.open(machine.store.directory) as history:
+        for axis in ("X", "Y"):
+            number = history.add_window(outcome(of=window(axis=axis)), "", STAMP)
+            history.add_revision(published(axis=axis), [number], STAMP)
+            made = replace(RECORD, axis=axis, config_digest=axis_digest(machine, axis))
+            save_record(made, machine.store.directory)
+    return machine
+
+
+def test_a_machine_that_is_proven_is_accepted(proven: MachineConfig, tmp_path: Path, capsys: Any) -> None:
+    """The page and JSON say the same, under a hash that anybody can form again."""
+    page = tmp_path / "acceptance.html"
+    options = ("--out", page, "--by", "A. Fitter", "--circle-um", "12", *CIRCLE, "--json")
+    code, out, _ = fdhil("acceptance", tmp_path / "machine.toml", *options, capsys=capsys)
+    document = json.loads(out)
+    assert (code, document["accepted"], document["open"]) == (0, True, [])
+    told = {key: value for key, value in document.items() if key != "sha256"}
+    text = json.dumps(told, sort_keys=True, separators=(",", ":"))
+    assert hashlib.sha256(text.encode()).hexdigest() == document["sha256"]
+    shown = html.unescape(page.read_text("utf-8"))
+    assert document["sha256"] in shown
+    for words in ("A. Fitter", "Circular test after ISO 230-4", "No point is open", "1 division"):
+        assert words in shown
+    before, after = (document["circle"]["found"][f"predicted, {which}"] for which in ("uncorrected", "corrected"))
+    assert after["deviation_both_um"] < 0.3 * before["deviation_both_um"]
+    assert f"{before['hysteresis_um']:.2f}" in shown
+
+
+def test_what_is_open_is_named(proven: MachineConfig, tmp_path: Path, capsys: Any) -> None:
+    """A void record, another configuration, a limit that is not kept: each with what to do, and exit 1."""
+    void_record(proven.store.directory, "X", "booted")
+    save_record(replace(RECORD, axis="Y", config_digest="other"), proven.store.directory)
+    options = ("--out", tmp_path / "a.html", "--circle-um", "0.001", "--contour-um", "5", *CIRCLE)
+    code, out, _ = fdhil("acceptance", tmp_path / "machine.toml", *options, capsys=capsys)
+    assert code == 1
+    for point in (
+        "X: its record is void; run fdhil check with the NC off",
+        "Y: its record was made with another configuration; commission it again",
+        "circular deviation: 0.001 um are allowed, it is",
+        "contour error: 5 um are allowed, and no --program was given to tell it",
+    ):
+        assert f"open: {point}" in out
+    assert "4 points are open" in out
+
+
+def test_a_machine_of_which_nothing_is_known_has_a_report_too(tmp_path: Path, capsys: Any) -> None:
+    machine_of(tmp_path)
+    code, out, _ = fdhil("acceptance", tmp_path / "machine.toml", "--out", tmp_path / "a.html", *CIRCLE, capsys=capsys)
+    assert code == 1
+    for axis in ("X", "Y"):
+        assert f"open: {axis}: not commissioned; run fdhil commission" in out
+        assert f"open: {axis}: no parameters were published, the nominal ones stand in" in out
+    assert "with the nominal parameters" in (tmp_path / "a.html").read_text("utf-8")
+
+
+def test_a_measured_circle_stands_beside_the_predicted_ones(proven: MachineConfig, tmp_path: Path, capsys: Any) -> None:
+    """5 um outside one way and 3 um inside the other; it decides, as it was measured."""
+    angle = np.linspace(0.0, 2.5 * np.pi, 4000)
+    ways = [
+        (10.0 + um * 1e-3) * np.column_stack([np.cos(at), np.sin(at)]) for at, um in ((angle, 5), (angle[::-1], -3))
+    ]
+    measured = tmp_path / "ball-bar.csv"
+    np.savetxt(measured, np.concatenate(ways), fmt="%.6f", delimiter=",", header="X_mm,Y_mm", comments="")
+    options = ("--measured-circle", measured, "--circle-um", "7.5", *CIRCLE)
+    page = tmp_path / "a.html"
+    code, out, _ = fdhil("acceptance", tmp_path / "machine.toml", "--out", page, *options, capsys=capsys)
+    assert code == 1
+    assert "circular deviation: 7.5 um are allowed, it is 8.0 um" in out
+    assert len(re.findall("<figcaption>Circular test, ", page.read_text("utf-8"))) == 3
+    measured.write_text("time,x\n0,1\n")
+    code, _, err = fdhil("acceptance", tmp_path / "machine.toml", "--out", page, *options, capsys=capsys)
+    assert code == 3
+    assert "a CSV with the columns X_mm, Y_mm" in err

@@ -1,0 +1,98 @@
+"""A trial that is stopped in the middle of a rapid: the axis is braked, then switched off."""
+
+from __future__ import annotations
+
+import signal
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+from tests.sim.twin_process import TwinProcess, write_config
+
+# a trial with shorter waits than on a real machine, as a process of its own
+QUICK = """
+import importlib
+for module, name, value in (
+    ("survey", "LISTEN_S", 0.3), ("steps", "SETTLE_CYCLES", 120), ("steps", "AVERAGE_CYCLES", 60),
+    ("trial", "TIMING_CYCLES", 100), ("trial", "LAST_REST_S", 0.4), ("strokes", "JOG_MM", 1.0),
+):
+    setattr(importlib.import_module("fdhil.commissioning." + module), name, value)
+from fdhil.cli.main import main
+main()
+"""
+PER_MM = 65536 / 20.0
+ACCELERATION = 4000.0 * 1e-6 * PER_MM  # increments per cycle squared
+PATIENCE_S = 300.0
+
+
+@pytest.fixture(scope="module")
+def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[TwinProcess, Path]]:
+    folder = tmp_path_factory.mktemp("twin")
+    with TwinProcess(write_config(folder, axes="X")) as running:
+        joined = folder / "joined"
+        joined.mkdir()
+        file = write_config(joined, bus=f'interface = "socketcand"\nport = {running.bus_settings["port"]}', axes="X")
+        file.write_text('[guard]\nclock = "sync"\n' + file.read_text())
+        yield running, file
+
+
+@contextmanager
+def rapid(twin: tuple[TwinProcess, Path]) -> Iterator[tuple[subprocess.Popen[str], Callable[[], can.Message]]]:
+    """A trial in the middle of its first rapid, and the frames of the bus from there on."""
+    running, file = twin
+    command = [sys.executable, "-c", QUICK, "commission", str(file), "--yes", "--room", "-2", "150"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    with running.join() as bus, process:
+        deadline = time.monotonic() + PATIENCE_S
+
+        def heard() -> can.Message:
+            while time.monotonic() < deadline:
+                if (frame := bus.recv(5.0)) is not None:
+                    return frame
+            raise AssertionError("it is not heard")
+
+        begun = None
+        while True:
+            target = target_of(heard())
+            begun = target if begun is None else begun
+            if target is not None and begun is not None and abs(target - begun) > 40.0 * PER_MM:
+                break
+            assert process.poll() is None, process.communicate()
+        yield process, heard
+
+
+def target_of(frame: can.Message) -> int | None:
+    """The set-point of a frame, None of another."""
+    return struct.unpack("<Hi", frame.data)[1] if frame.arbitration_id == 0x201 else None
+
+
+def test_a_stopped_trial_brakes_and_switches_off(twin: tuple[TwinProcess, Path]) -> None:
+    with rapid(twin) as (process, heard):
+        process.send_signal(signal.SIGTERM)
+        targets: list[int] = []
+        words = [0x0F]
+        while True:
+            frame = heard()
+            if (target := target_of(frame)) is not None:
+                targets.append(target)
+                words.append(struct.unpack_from("<H", frame.data)[0])
+                if len(targets) == 60:  # an impatient operator does not end the braking
+                    process.send_signal(signal.SIGINT)
+            if frame.arbitration_id == 0x000:
+                break
+        _, err = process.communicate()
+    assert (process.returncode, "Traceback" in err) == (130, False), err
+    assert err.strip().endswith("stopped by the operator")
+    assert np.abs(np.diff(targets, 2)).max() <= ACCELERATION + 2.0
+    assert targets[-1] == targets[-60]
+    still = next(k for k in range(len(targets)) if targets[k] == targets[-1])
+    assert set(words[1 : still + 1]) == {0x0F}  # it is braked before it is switched off
+    assert words[-1] == 0

@@ -1,0 +1,215 @@
+"""An OPC UA server of an NC: nodes by id and by name, users and certificates, and what is not there."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ssl
+import struct
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from asyncua import ua
+from asyncua.crypto import cert_gen
+from asyncua.crypto.permission_rules import User, UserRole
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fdhil import tables
+from fdhil.config import MachineConfig
+from fdhil.drivers.nc import load_nc_source
+from fdhil.drivers.nc.opcua import OpcUa
+from fdhil.errors import ConfigError, ConnectError, DeviceError, ProtocolError
+from fdhil.records import MoveKind, NcState
+from tests.drivers.nc.opcua_peer import OpcUaPeer
+from tests.drivers.wire import machine
+
+OWN_URI = "urn:fdhil:test"
+
+
+def config_of(**keys: Any) -> MachineConfig:
+    return machine(g0={"source": "opcua"}, nc_source={"opcua": {"timeout_s": 2.0, "period_s": 0.02, **keys}})
+
+
+async def once(config: MachineConfig) -> NcState:
+    async with OpcUa(config) as source:
+        return (await source.read())[-1]
+
+
+async def test_a_value_that_is_not_good_is_none_and_decides_nothing() -> None:
+    async with OpcUaPeer() as peer:
+        await peer.say(MoveKind.RAPID, line=12)
+        async with OpcUa(config_of(**peer.settings)) as source:
+            assert (await source.read())[0].motion is MoveKind.RAPID
+            bad = ua.DataValue(StatusCode=ua.StatusCode(ua.UInt32(ua.StatusCodes.BadWaitingForInitialData)))
+            await peer.nodes["g_group_1"].write_attribute(ua.AttributeIds.Value, bad)
+            assert (await source.read())[0].motion is MoveKind.UNKNOWN
+            for node in peer.nodes.values():
+                await node.write_attribute(ua.AttributeIds.Value, bad)
+            with pytest.raises(ProtocolError, match="shows no value"):
+                await source.read()
+
+
+async def test_a_node_that_lacks_is_named_and_an_optional_one_is_not_missed(tmp_path: Path) -> None:
+    async with OpcUaPeer() as peer:
+        await peer.server.delete_nodes([peer.nodes["tool"]])
+        state = await once(config_of(**peer.settings))
+        assert (state.motion, state.tool) == (MoveKind.UNKNOWN, None)
+        await peer.server.delete_nodes([peer.nodes["g_group_1"]])
+        with pytest.raises(ProtocolError, match=r"ncFktAct\[u1,1\]; compare the profile"):
+            await once(config_of(**peer.settings))
+
+
+async def test_nodes_are_found_by_their_names_in_whichever_namespace() -> None:
+    """The profile of the companion specification, and its channel below two others that lack what is asked for."""
+    async with OpcUaPeer() as peer:
+        space = await peer.server.register_namespace("http://opcfoundation.org/UA/CNC/")
+        interface = await peer.server.nodes.objects.add_object(space, "CncInterface")
+        channels = await interface.add_object(space, "CncChannelList")
+        await channels.add_object(space, "NodeVersion")
+        channel = await channels.add_object(space, "Channel_1")
+        for name, value in (("ActProgramStatus", 1), ("ActOverride", 80.0), ("ActProgramLine", "N40")):
+            await channel.add_variable(space, name, value)
+        await channel.add_variable(space, "ActGFunctions", [54, 0, 90], ua.VariantType.UInt32)
+        state = await once(config_of(url=peer.settings["url"], profile="opc40502"))
+        assert (state.motion, state.line, state.program) == (MoveKind.RAPID, 40, None)
+        assert state.feed_override == pytest.approx(0.8)
+        with pytest.raises(ProtocolError, match="has no Objects/Machines"):
+            await once(config_of(url=peer.settings["url"], profile="heidenhain"))
+
+
+async def test_a_namespace_may_be_given_by_its_name(tmp_path: Path) -> None:
+    own = tmp_path / "own.toml"
+    own.write_text(
+        'title = "own"\ninterface = "opcua"\n'
+        '[signals]\nstatus = { at = "nsu=SinumerikVarProvider;s=/Channel/State/progStatus[u1]" }\n'
+        '[[motion]]\nkind = "rapid"\nwhen = { status = { at_least = 3, at_most = 3 } }\n'
+    )
+    async with OpcUaPeer() as peer:
+        await peer.say(MoveKind.RAPID)
+        assert (await once(config_of(**{**peer.settings, "profile": str(own)}))).motion is MoveKind.RAPID
+        own.write_text(own.read_text().replace("nsu=SinumerikVarProvider", "nsu=nobody"))
+        with pytest.raises(ProtocolError, match="has no nsu=nobody"):
+            await once(config_of(**{**peer.settings, "profile": str(own)}))
+    own.write_text(own.read_text().replace("nsu=nobody;s=", ""))
+    with pytest.raises(ConfigError, match=r"signals\.status\.at: '/Channel.*' is no place of OPC UA"):
+        OpcUa(config_of(profile=str(own)))
+
+
+class _Users:
+    def get_user(
+        self, iserver: Any, username: Any = None, password: Any = None, certificate: Any = None
+    ) -> User | None:
+        return User(role=UserRole.User) if (username, password) == ("fdhil", "right") else None
+
+
+async def certificates(folder: Path, name: str, uri: str) -> tuple[Path, Path]:
+    """Make a key and a certificate that is for this URI."""
+    key, certificate = folder / f"{name}.pem", folder / f"{name}.der"
+    await cert_gen.setup_self_signed_certificate(key, certificate, uri, "localhost", [], {"commonName": name})
+    return certificate, key
+
+
+def as_pem(certificate: Path) -> Path:
+    """Write a certificate as text, under a name that does not tell so."""
+    text = certificate.with_suffix(".crt")
+    text.write_text(ssl.DER_cert_to_PEM_cert(certificate.read_bytes()))
+    return text
+
+
+async def test_a_user_a_certificate_and_encryption(tmp_path: Path) -> None:
+    ours = await certificates(tmp_path, "fdhil", OWN_URI)
+    theirs = await certificates(tmp_path, "nc", "urn:nc")
+    password = tmp_path / "password"
+    async with OpcUaPeer(secure=theirs, users=_Users()) as peer:
+        keys = {**peer.settings, "timeout_s": 2.0, "user": "fdhil", "password_file": str(password)}
+        keys |= {"certificate": str(as_pem(ours[0])), "private_key": str(ours[1])}
+        with pytest.raises(ConnectError, match=r"password_file.*cannot be read"):
+            await once(config_of(**keys))
+        password.write_text("wrong\n")
+        with pytest.raises(ConnectError, match="cannot be entered"):
+            await once(config_of(**keys))
+        password.write_text("right\n")
+        await peer.say(MoveKind.ARC)
+        assert (await once(config_of(**keys, server_certificate=str(theirs[0])))).motion is MoveKind.ARC
+        (tmp_path / "fdhil.pem").write_text("no key")
+        with pytest.raises(ConnectError, match="cannot be used with its key"):
+            await once(config_of(**keys))
+
+
+@asynccontextmanager
+async def server_of(answer: bytes | None) -> AsyncIterator[str]:
+    """Serve what answers these bytes, or nothing, and yield its place."""
+    ended: list[asyncio.StreamWriter] = []
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        ended.append(writer)
+        with contextlib.suppress(OSError):
+            await reader.read(100)
+            writer.write(answer or b"")
+            if answer is not None:
+                writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    try:
+        yield f"opc.tcp://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+    finally:
+        server.close()
+        for writer in ended:
+            writer.close()
+        await server.wait_closed()
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        None, b"", b"HTTP/1.1 400 Bad Request\r\n\r\n", b"ACKF\x1c\x00\x00\x00" + bytes(20),
+        b"ERRF\x14\x00\x00\x00\x00\x00\x7d\x80\x00\x00\x00\x00", b"ACKF\xff\xff\xff\x7f", b"MSGF\x08\x00\x00\x00",
+    ],
+)  # fmt: skip
+async def test_what_is_no_server_is_told_in_one_sentence(answer: bytes | None) -> None:
+    async with server_of(answer) as url:
+        with pytest.raises(DeviceError) as caught:
+            await once(config_of(url=url, timeout_s=0.1))
+    assert "compare url" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+ACKNOWLEDGE = b"ACKF\x1c\x00\x00\x00" + struct.pack("<5I", 0, 65536, 65536, 0, 0)
+
+
+@settings(max_examples=25)
+@given(st.binary(max_size=60), st.sampled_from([b"", b"OPNF", b"MSGF", b"ERRF", b"CLOF"]), st.booleans())
+def test_whatever_a_server_answers_is_a_device_error(body: bytes, kind: bytes, sized: bool) -> None:
+    head = kind + struct.pack("<I", len(body) + 8) if sized else kind
+
+    async def ask() -> None:
+        async with server_of(ACKNOWLEDGE + head + body) as url:
+            with pytest.raises(DeviceError):
+                await once(config_of(url=url, timeout_s=0.05))
+
+    asyncio.run(ask())
+
+
+@pytest.mark.parametrize(
+    ("keys", "text"),
+    [
+        ({"url": "http://localhost"}, "url"),
+        ({"profile": "siemenz"}, "did you mean 'siemens'"),
+        ({"user": "me"}, "password_file"),
+        ({"certificate": "a.der"}, "private_key"),
+        ({"server_certificate": "a.der"}, "certificate"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(keys: dict[str, Any], text: str) -> None:
+    with pytest.raises(ConfigError, match=text):
+        config_of(**keys)
+
+
+def test_without_its_library_the_source_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tables, "NC_SOURCES", {"opcua": "no_such_library.anywhere:Source"})
+    with pytest.raises(ConfigError, match=r"no_such_library.*pip install 'fdhil\[opcua\]'"):
+        load_nc_source("opcua")

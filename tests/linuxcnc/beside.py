@@ -1,0 +1,87 @@
+"""fdhil beside LinuxCNC as its user has it: commands in a shell, and what the simulated machine saw at its table."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fdhil.prediction import contour_error_um
+from fdhil.records import Trajectory
+
+PATIENCE_S = 300.0
+SHUTTLE = "G21 G90\n" + "G0 X400 Y400\nG4 P0.3\nG0 X0 Y0\nG4 P0.3\n" * 3 + "M2\n"
+PART = """G21 G90 G17 G64 P0.01
+F9000
+G1 X0 Y55
+G1 X60
+G3 X100 I20
+G1 X120
+G1 X0 Y0
+M2
+"""
+
+
+def fdhil(*arguments: object, code: int = 0) -> dict[str, Any]:
+    """Run a command as a user does and return its JSON document."""
+    done = subprocess.run(
+        [sys.executable, "-m", "fdhil", *map(str, arguments), "--json"],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert done.returncode == code, (arguments, done.returncode, done.stdout, done.stderr)
+    return dict(json.loads(done.stdout))
+
+
+def free_port() -> int:
+    """Return a TCP port that nobody has."""
+    with socket.create_server(("127.0.0.1", 0)) as door:
+        return int(door.getsockname()[1])
+
+
+def until(ready: Callable[[], bool]) -> None:
+    """Wait for a state; it may take long on a busy computer."""
+    end = time.monotonic() + PATIENCE_S
+    while not ready():
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+def record(config: Path, out: Path, cut: Callable[[], None]) -> None:
+    """Record a demand from the bus while something is cut."""
+    command = [sys.executable, "-m", "fdhil", "record", str(config), "--out", str(out), "--rest", "0.6", "--json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as recording:
+        assert recording.stderr is not None
+        assert "waiting for a motion" in recording.stderr.readline()
+        cut()
+        told, _ = recording.communicate(timeout=PATIENCE_S)
+    assert json.loads(told)["complete"], told
+
+
+def contour_of_each_cut(trace: Path, part: Trajectory) -> list[float]:
+    """The contour error (um RMS), at the simulated table, of each time that the part was cut."""
+    table = np.genfromtxt(trace, delimiter=",", names=True)
+    reference, place = (
+        np.column_stack([table[f"{axis}_{what}_mm"] for axis in part.axes]) for what in ("reference", "table")
+    )
+    per_mm, rows = 65536 / 20, part.path_mm
+    found, first = [], 0
+    while first + len(rows) <= len(reference):
+        apart = np.abs(reference[first : first + len(rows)] - rows).max()
+        if apart <= 1 / per_mm:
+            there = slice(first, first + len(rows))
+            error = contour_error_um(reference[there], place[there], part.dt_s)
+            found.append(float(np.sqrt(np.mean(error**2))))
+            first += len(rows)
+        else:
+            first += 1
+    return found

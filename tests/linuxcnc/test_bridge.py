@@ -1,0 +1,208 @@
+"""fdhil beside a real LinuxCNC: its moves are told by the bridge, exact to a cycle, whatever the bus lags behind."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from contextlib import asynccontextmanager, contextmanager
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdhil import config as machine_config
+from fdhil.bridges import linuxcnc as bridge
+from fdhil.config import MachineConfig
+from fdhil.drivers import Record, open_machine
+from fdhil.pipeline import AxisPipeline
+from fdhil.records import AxisSamples, Float, Int, MoveEvent, MoveKind, NcState, Notice, WindowOutcome
+from tests.linuxcnc.beside import free_port
+from tests.linuxcnc.machine import LinuxCnc
+from tests.sim.twin_process import TwinProcess, write_config
+
+pytestmark = pytest.mark.debian
+
+PATIENCE_S = 300.0
+KINDS = {0: MoveKind.REST, 1: MoveKind.RAPID, 2: MoveKind.FEED, 3: MoveKind.ARC}
+PART = """G21 G90 G17 G64 P0.02
+G0 X200 Y50
+G1 X230 Y80 F6000
+G2 X270 Y120 I40
+G0 X0 Y0
+G4 P0.4
+G0 X250
+G0 X0
+G1 X5 F2000
+G1 X0
+M2
+"""
+RAPIDS = """G21 G90
+G0 X250
+G4 P0.6
+G0 X0
+G4 P0.6
+M2
+"""
+TRUTH = """
+net x sampler.2.pin.0
+net y sampler.2.pin.1
+net z sampler.2.pin.2
+net kind motion.motion-type => sampler.2.pin.3
+addf sampler.2 servo-thread
+"""
+
+
+@dataclass
+class Heard:
+    """What the machine's source handed over."""
+
+    records: list[Record] = field(default_factory=list)
+    came: asyncio.Event = field(default_factory=asyncio.Event)
+
+    def take(self, record: Record) -> None:
+        self.records.append(record)
+        self.came.set()
+
+    def of(self, axis: str, newest: int | None = None) -> tuple[Int, Float]:
+        """Return ticks and demand (n,) of an axis, from the bus; ``newest`` blocks of it only."""
+        mine = (r for r in reversed(self.records) if isinstance(r, AxisSamples) and r.axis == axis)
+        blocks = list(islice(mine, newest))[::-1]
+        return np.concatenate([b.tick for b in blocks]), np.concatenate([b.demand_mm for b in blocks])
+
+    def events(self, axis: str) -> list[MoveEvent]:
+        return [r for r in self.records if isinstance(r, MoveEvent) and r.axis == axis]
+
+    @property
+    def state(self) -> NcState:
+        """What the NC said last."""
+        return next(r for r in reversed(self.records) if isinstance(r, NcState))
+
+    def place(self, axis: str) -> float:
+        """Where the NC said that an axis was, mm."""
+        return (self.state.demand_mm or {})[axis]
+
+    async def until(self, holds: Callable[[], bool]) -> None:
+        async with asyncio.timeout(PATIENCE_S):
+            while not holds():
+                self.came.clear()
+                await self.came.wait()
+
+    async def rest(self) -> None:
+        """Wait until the bus has caught up with what the NC did: it stands where the NC stands, and long enough."""
+
+        def stands() -> bool:
+            if self.state.motion is not MoveKind.REST:
+                return False
+            demand = {axis: self.of(axis, 100)[1][-1500:] for axis in "XY"}
+            return all(np.ptp(demand[axis]) == 0 and abs(demand[axis][-1] - self.place(axis)) < 0.001 for axis in "XY")
+
+        await self.until(stands)
+
+
+@asynccontextmanager
+async def listening(config: MachineConfig) -> AsyncIterator[Heard]:
+    heard = Heard()
+    async with open_machine(config) as source:
+        running = asyncio.create_task(source.run(heard.take))
+        await heard.until(lambda: any(isinstance(r, NcState) for r in heard.records))
+        yield heard
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+
+def beside(path: Path, twin: TwinProcess, port: int) -> MachineConfig:
+    """The twin's machine as fdhil listens to it, with LinuxCNC's bridge as its source of rapids."""
+    bus = twin.ready["buses"]["can0"]
+    text = path.read_text().replace("[bus.can0]\n", f"[bus.can0]\nport = {bus['port']}\n")
+    listener = path.with_name("listener.toml")
+    listener.write_text(f'{text}[g0]\nsource = "linuxcnc"\n[nc_source.linuxcnc]\nport = {port}\n')
+    return machine_config.load(listener)
+
+
+def hal_of(port: int) -> str:
+    return f"{TRUTH}loadusr -Wn {bridge.NAME} /usr/bin/python3 {bridge.__file__} --port {port} --channel 1\n"
+
+
+def windows_of(heard: Heard, config: MachineConfig) -> list[WindowOutcome]:
+    pipeline = AxisPipeline("X", config)
+    records = [r for r in heard.records if not isinstance(r, NcState | Notice)]
+    return [o for r in records for o in pipeline.feed(r) if isinstance(o, WindowOutcome)]
+
+
+def first_motion(demand: Float) -> int:
+    return int(np.flatnonzero(np.abs(np.diff(demand)) > 1e-3)[0])
+
+
+@contextmanager
+def sampled(nc: LinuxCnc, path: Path) -> Iterator[None]:
+    """Write what the sampler sees, a row for each servo cycle, to a file."""
+    with (nc.folder / "log").open("ab") as log, path.open("wb") as rows:
+        command = ("stdbuf", "-oL", "halsampler", "-c", "2")
+        sampler = nc._as_nobody(*command, environment=os.environ, log=log, out=rows.fileno())
+        try:
+            yield
+        finally:
+            sampler.terminate()
+            sampler.wait()
+
+
+async def test_linuxcncs_own_sequence_is_recovered(tmp_path: Path) -> None:
+    port, path = free_port(), write_config(tmp_path, "modbus = false")
+    with TwinProcess(path, "--demand", "-") as twin, LinuxCnc(hal=hal_of(port)) as nc:
+        config = beside(path, twin, port)
+        with sampled(nc, tmp_path / "truth"):
+            async with listening(config) as heard:
+                with nc.driving(twin):
+                    await asyncio.to_thread(nc.run, PART)
+                    await heard.rest()
+    truth = np.loadtxt(tmp_path / "truth")
+    for axis, column in (("X", 0), ("Y", 1)):
+        check_sequence(heard, axis, truth[:, column], truth[:, 3].astype(int).tolist())
+    rapids = [w for w in windows_of(heard, config) if w.window.nc is not None]
+    assert [w.window.nc and w.window.nc.line for w in rapids] == [2, 5, 7, 8]
+
+
+def check_sequence(heard: Heard, axis: str, demand: Float, types: Sequence[int]) -> None:
+    """Compare with what the sampler saw, row by row: both begin with the first motion."""
+    ticks, bus = heard.of(axis)
+    offset = int(ticks[first_motion(bus)]) - first_motion(demand)
+    n = min(demand.size, int(ticks[-1]) - offset)
+    told = np.full(n, MoveKind.REST, object)
+    for event in heard.events(axis):
+        told[max(0, event.tick - offset + 1) :] = event.kind
+    true = np.array([KINDS[k] for k in types[:n]], object)
+    moves = np.abs(np.diff(demand[:n], prepend=demand[0])) > 2e-3
+    edges = np.flatnonzero(np.diff(np.array(types[:n])) != 0)
+    wrong = [k for k in np.flatnonzero(moves & (told != true)).tolist() if np.abs(edges - k).min() > 5]
+    assert wrong == [], [(k, told[k], true[k]) for k in wrong[:5]]
+    assert set(told[moves]) == {MoveKind.RAPID, MoveKind.FEED, MoveKind.ARC}
+
+
+async def test_overrides_and_holds_are_told_and_their_rapids_refused(tmp_path: Path) -> None:
+    port, path = free_port(), write_config(tmp_path, "modbus = false")
+    with TwinProcess(path, "--demand", "-") as twin, LinuxCnc(hal=hal_of(port)) as nc:
+        config = beside(path, twin, port)
+        async with listening(config) as heard:
+            with nc.driving(twin):
+                for order, value in (("rapid_override", 1.0), ("rapid_override", 0.9), ("rapid_override", 1.0)):
+                    await asyncio.to_thread(nc.order, order, value=value)
+                    await heard.until(lambda value=value: heard.state.rapid_override == value)  # type: ignore[misc]
+                    await asyncio.to_thread(nc.run, RAPIDS)
+                    await heard.rest()
+                await asyncio.to_thread(nc.start, RAPIDS)
+                await heard.until(lambda: heard.state.motion is MoveKind.RAPID and heard.place("X") > 20.0)
+                await asyncio.to_thread(nc.order, "pause")
+                await heard.until(lambda: heard.state.motion is MoveKind.HOLD)
+                await asyncio.to_thread(nc.order, "resume")
+                await asyncio.to_thread(nc.order, "rest")
+                await heard.rest()
+    outcomes = windows_of(heard, config)
+    texts = [str(o.verdict.reasons[0]) for o in outcomes if not o.verdict.accepted]
+    accepted = [o.window.nc for o in outcomes if o.verdict.accepted]
+    assert {nc and (nc.override, nc.held) for nc in accepted} == {((1.0, 1.0), False)}, texts
+    assert len(accepted) >= 4
+    assert [t for t in texts if "override was 90 % in line" in t and t.startswith("EpisodeAborted")], texts
+    assert [t for t in texts if "feed was held in line 2" in t], texts

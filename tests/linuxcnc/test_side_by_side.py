@@ -1,0 +1,83 @@
+"""LinuxCNC, the simulated drives, fdhil's daemon and guard, each a process: identify, cut, record, correct, cut."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fdhil import config as machine_config
+from fdhil.bridges import linuxcnc as bridge
+from fdhil.cli.demo.machines import machine_document
+from fdhil.cli.demo.processes import Process
+from fdhil.cli.demo.toml import to_toml
+from fdhil.daemon.control import SOCKET_NAME
+from fdhil.program import load_trajectory
+from tests.linuxcnc.beside import PART, SHUTTLE, contour_of_each_cut, fdhil, free_port, record, until
+from tests.linuxcnc.machine import LinuxCnc
+from tests.sim.twin_process import TwinProcess
+
+pytestmark = pytest.mark.debian
+
+
+@dataclass
+class Shop:
+    """The simulated machine with its trace, and fdhil beside it, commissioned and listening."""
+
+    file: Path
+    twin: TwinProcess
+    bridge_port: int
+
+    @property
+    def trace(self) -> Path:
+        return self.file.with_name("trace.csv")
+
+    def status(self) -> dict[str, Any]:
+        return fdhil("status", self.file)
+
+
+@pytest.fixture
+def shop(tmp_path: Path) -> Iterator[Shop]:
+    document = machine_document()
+    document["sim"]["pace"] = "lockstep"
+    document["nc"] = {"profile": "linuxcnc"}
+    document["g0"] = {"source": "linuxcnc"}
+    document["nc_source"] = {"linuxcnc": {"port": free_port()}}
+    for axis in document["axis"].values():
+        axis["max_acceleration_mm_s2"] = 2000.0
+    (tmp_path / "twin.toml").write_text(to_toml(document))
+    file = tmp_path / "machine.toml"
+    with ExitStack() as stack:
+        twin = stack.enter_context(
+            TwinProcess(tmp_path / "twin.toml", "--demand", "-", "--trace", tmp_path / "trace.csv")
+        )
+        document["bus"] = twin.ready["buses"]
+        file.write_text(to_toml(document))
+        fdhil("commission", file, "--yes")
+        for name, command in (("guard", ["fdhil.cli.guard"]), ("daemon", ["fdhil", "run"])):
+            stack.enter_context(Process(name, [*command, str(file)], tmp_path / f"{name}.log"))
+        run_directory = machine_config.load(file).store.run_directory
+        assert run_directory is not None
+        until((run_directory / SOCKET_NAME).exists)
+        yield Shop(file, twin, document["nc_source"]["linuxcnc"]["port"])
+
+
+def test_the_second_cut_of_a_program_is_corrected(shop: Shop) -> None:
+    part = shop.file.with_name("part.csv")
+    loads = f"loadusr -Wn {bridge.NAME} /usr/bin/python3 {bridge.__file__} --port {shop.bridge_port} --channel 1\n"
+    with LinuxCnc(hal=loads, axes="XY") as nc, nc.driving(shop.twin):
+        nc.run(SHUTTLE)
+        until(lambda: all(axis["accepted"] == 6 for axis in shop.status()["axes"].values()))
+        record(shop.file, part, lambda: nc.run(PART))
+        promised = fdhil("correct", part, "--config", shop.file, "--from-history")
+        fdhil("arm", shop.file, part)
+        nc.run(PART)
+        until(lambda: bool(shop.status()["passes"]))
+    shop.twin.event("finished")
+    before, after = contour_of_each_cut(shop.trace, load_trajectory(part, machine_config.load(shop.file)))
+    assert promised["contour"]["rms_um"] == pytest.approx(before, rel=0.05)
+    assert after < before / 50

@@ -1,0 +1,99 @@
+"""The circular test: what ISO 230-4 calls G, H and F, of circles whose errors are known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdhil.errors import RecordingError
+from fdhil.prediction.circular import circle_program, evaluate
+from fdhil.program import load_trajectory
+from fdhil.records import Float
+from tests.bench import bench_config
+
+RADIUS = 50.0
+
+
+Error = Callable[[Float], Float]
+
+
+def always(error_um: float) -> Error:
+    """The same radial error everywhere."""
+    return lambda at: np.full(at.shape, error_um)
+
+
+def runs(counter_um: Error, clockwise_um: Error, turns: float = 1.3, points: int = 9000) -> Float:
+    """A path from the centre to the circle, around it in both directions, with radial errors by angle."""
+    angle = np.linspace(0.0, turns * 2 * np.pi, points)
+    way = [np.column_stack([np.linspace(0.0, RADIUS, 200), np.zeros(200)])]
+    for at, error_um in ((angle, counter_um), (angle[::-1], clockwise_um)):
+        radius = RADIUS + 1e-3 * error_um(at)
+        way.append(radius[:, None] * np.column_stack([np.cos(at), np.sin(at)]))
+    return np.concatenate(way)
+
+
+def test_a_true_circle_has_no_deviation() -> None:
+    found = evaluate(runs(always(0.0), always(0.0)), RADIUS, (0.0, 0.0))
+    assert found.both_um < 0.01
+    assert found.hysteresis_um < 0.01
+
+
+def test_runs_of_different_size_are_hysteresis() -> None:
+    """Each run by itself is round."""
+    found = evaluate(runs(always(4.0), always(-2.0)), RADIUS, (0.0, 0.0))
+    assert found.hysteresis_um == pytest.approx(6.0, abs=0.01)
+    assert found.both_um == pytest.approx(6.0, abs=0.01)
+    assert max(found.deviations_um) < 0.01
+    assert found.radial_um == pytest.approx((4.0, -2.0), abs=0.01)
+
+
+def test_an_ellipse_is_told_by_its_axes() -> None:
+    """One axis longer than the other by a scale: twice its amplitude, and no hysteresis."""
+    found = evaluate(runs(lambda at: 5.0 * np.cos(2 * at), lambda at: 5.0 * np.cos(2 * at)), RADIUS, (0.0, 0.0))
+    assert found.deviations_um == pytest.approx((10.0, 10.0), abs=0.02)
+    assert found.hysteresis_um < 0.02
+    assert found.counter_um[0] == pytest.approx(5.0, abs=0.02)
+
+
+def test_where_the_circle_lies_does_not_matter() -> None:
+    """A ball bar does not know the programmed centre: 20 um beside it are no deviation."""
+    moved = runs(always(3.0), always(3.0)) + np.array([120.02, -79.98])
+    for centre in ((120.0, -80.0), None):
+        found = evaluate(moved, RADIUS, centre)
+        assert found.both_um < 0.05
+        assert found.radial_um[0] == pytest.approx(3.0, abs=0.05)
+
+
+def test_starting_and_stopping_do_not_count() -> None:
+    """Of a run of more than a turn the middle 360 degrees are evaluated."""
+    path = runs(always(0.0), always(0.0), turns=1.5)
+    path[200:1200] *= 1.001  # 50 um at the start of the first run
+    assert evaluate(path, RADIUS, (0.0, 0.0)).both_um < 0.01
+
+
+@pytest.mark.parametrize("turns", [0.4, 0.9])
+def test_less_than_a_turn_is_refused(turns: float) -> None:
+    with pytest.raises(RecordingError, match="360 degrees in both directions"):
+        evaluate(runs(always(0.0), always(0.0), turns=turns), RADIUS, (0.0, 0.0))
+
+
+def test_another_radius_is_refused() -> None:
+    with pytest.raises(RecordingError, match="check the radius"):
+        evaluate(runs(always(0.0), always(0.0)), 20.0)
+
+
+@pytest.mark.parametrize("plane", [("X", "Y"), ("X", "Z"), ("Y", "Z")])
+def test_the_program_runs_the_circle_first_counter_clockwise(plane: tuple[str, str], tmp_path: Path) -> None:
+    """As the plane's axes count, in each plane, twice around in both directions."""
+    program = tmp_path / "circle.ngc"
+    program.write_text(circle_program(plane, 10.0, 3000.0))
+    reference = load_trajectory(program, bench_config(axes="XYZ"))
+    path = np.column_stack([reference.position_mm[axis] for axis in plane])
+    on = np.hypot(*path.T) > 9.0
+    angle = np.unwrap(np.arctan2(path[on, 1], path[on, 0]))
+    assert angle.max() == pytest.approx(4 * np.pi, abs=0.01)
+    assert angle[-1] == pytest.approx(0.0, abs=0.01)
+    assert evaluate(path, 10.0, (0.0, 0.0)).hysteresis_um < 1.0
