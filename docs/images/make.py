@@ -25,13 +25,15 @@ CUTS = (("uncorrected", "cut-1.csv", 0), ("mirror of the paper", "cut-2.csv", 1)
 HALF_WIDTH_MM = 7.0
 WIDTHS = {"wide": 1200, "narrow": 480}
 TALLEST = 14_000  # px, of what the browser draws
-COLOURS = 160  # of a screenshot: enough for its scales of colour
+COLOURS = 200  # of a screenshot: enough for its scales of colour
+RARE = Image.Quantize.MAXCOVERAGE  # a colour of a scale is seldom, and counts
 CONFIG = str(OUT / "machine.toml")
 PROGRAM = str(ROOT / "fdhil" / "cli" / "demo" / "bench_10m.ngc")
 PAGES = {
     "report": ["report", CONFIG, "--out"],
     "predict": ["predict", PROGRAM, "--config", CONFIG, "--from-history", "--report"],
     "correct": ["correct", PROGRAM, "--config", CONFIG, "--from-history", "--report"],
+    "acceptance": ["acceptance", CONFIG, "--by", "A. Fitter", "--circle-um", "3", "--out"],
 }
 
 
@@ -79,7 +81,7 @@ def screenshot(browser: str, folder: Path, page: Path, picture: Path, width: int
     empty = Image.new("RGB", image.size, image.getpixel((0, TALLEST - 1)))
     used = ImageChops.difference(image, empty).getbbox()
     assert used is not None
-    image.crop((0, 0, width, min(TALLEST, used[3] + 20))).quantize(COLOURS).save(picture, optimize=True)
+    image.crop((0, 0, width, min(TALLEST, used[3] + 20))).quantize(COLOURS, RARE).save(picture, optimize=True)
 
 
 if __name__ == "__main__":
