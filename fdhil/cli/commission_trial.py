@@ -26,6 +26,7 @@ def try_commissioned(
     machine: MachineConfig, record: CommissioningRecord, asked: Asked, progress: Progress
 ) -> dict[str, Any] | None:
     """Try a commissioned axis by moving it; None where nobody allowed that. DriveFault when it is refused."""
+    from fdhil.cli.compiling import forewarn
     from fdhil.commissioning.trial import Operator, try_axis
 
     axis = record.axis
@@ -45,6 +46,7 @@ def try_commissioned(
     def saw(question: str) -> bool | None:
         return None if asked.yes else agreed(question)
 
+    forewarn("identify")
     with _history(machine, axis) as (known, keep):
         tried = try_axis(machine, record, room, Operator(report, saw), progress, known)
         keep(tried.outcomes)
@@ -118,4 +120,6 @@ def _told(found: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
 
 
 def _figure(value: Mapping[str, Any]) -> str:
+    if value["std"] is None:
+        return f"{value['value']:.4g} {value['unit']} (the data sheet's)"
     return f"{value['value']:.4g} ± {value['std']:.2g} {value['unit']}"

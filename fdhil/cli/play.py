@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 _FILE = click.Path(path_type=Path)
 SWITCH_INTERVAL_S = 0.0002  # the cycle must not wait 5 ms for the thread that only looks on
+NOBODY = "nobody is there to press Enter, and nothing was played; leave --hold out"
 MARKED_S = 1.0  # a daemon beside the guard marks a record that late
 SIGNALS: Mapping[int, str] = {
     signal.SIGINT: "stopped by Ctrl-C",
@@ -84,15 +85,15 @@ def _play(machine: MachineConfig, plan: Plan, program: Path, go_to_start: bool, 
     with ExitStack() as held, _raised():
         for name in dict.fromkeys(axis.drive.bus for axis in machine.axis.values()):
             held.enter_context(lock_place(machine.bus[name], "set-points"))
+        _quiet()
         bench = held.enter_context(on_bench(plan, _say))
         bench.compare(records)
         here = bench.here()
         bench.require_start(here, go_to_start)
         if not yes:
             _ask(bench, program, here)
-        _quiet()
         with bench.led(lambda: _tell_guard(machine, records)):
-            stopped = bench.go_to_start(_stopping)
+            stopped = bench.go_to_start(_stopping, go_to_start)
             if stopped is not None:
                 raise DriveFault("the way to the start", f"{stopped}; nothing was played")
             if not hold:
@@ -103,10 +104,12 @@ def _play(machine: MachineConfig, plan: Plan, program: Path, go_to_start: bool, 
 
 def _entered() -> bool:
     """Whether Enter was pressed; DriveFault where nobody is there to press it."""
+    if sys.stdin is None or sys.stdin.closed:
+        raise DriveFault("the bench", NOBODY)
     if not select.select([sys.stdin], (), (), 0.0)[0]:
         return False
     if not sys.stdin.readline():
-        raise DriveFault("the bench", "nobody is there to press Enter, and nothing was played; leave --hold out")
+        raise DriveFault("the bench", NOBODY)
     return True
 
 
@@ -136,14 +139,15 @@ def _say(text: str) -> None:
 
 
 def _quiet() -> None:
-    """What is there now stays: no collector looks at it between two SYNCs."""
+    """What is there now stays: no collector looks at it between two SYNCs. No other work comes before them."""
     import gc
 
-    from fdhil.commissioning.realtime import lock_memory
+    from fdhil.commissioning.realtime import BESIDE, lock_memory, prioritise
 
     gc.collect()
     gc.freeze()
     lock_memory()
+    prioritise(BESIDE)
 
 
 @contextmanager

@@ -35,10 +35,10 @@ class Rapids:
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Value, standard deviation and unit of each parameter."""
-        values, deviations = self.published.parameters.as_dict(), self.published.covariance.diagonal()
+        """Value, standard deviation (None: the data sheet's, it was not identified) and unit of each parameter."""
+        values, deviations = self.published.parameters.as_dict(), self.published.covariance.diagonal().tolist()
         return {
-            name: {"value": values[name], "std": math.sqrt(variance), "unit": unit_of(name)}
+            name: {"value": values[name], "std": math.sqrt(variance) if variance > 0.0 else None, "unit": unit_of(name)}
             for name, variance in zip(PARAMETERS, deviations, strict=False)
         }
 

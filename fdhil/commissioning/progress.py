@@ -55,12 +55,16 @@ class Progress:
         self._steps = self._read()
 
     def kept(self, name: str, holds_for: str) -> Found | None:
-        """Return what a step found, where it was done with this drive and configuration; else None."""
+        """Return what a step found, where it was done with this drive and configuration, and tell so; else None."""
+        found = self.found(name, holds_for)
+        if found is not None:
+            self.on_kept(name, self._steps[name])
+        return found
+
+    def found(self, name: str, holds_for: str) -> Found | None:
+        """Return what was kept under a name for this drive and configuration; else None."""
         step = self._steps.get(name)
-        if step is None or step.holds_for != holds_for:
-            return None
-        self.on_kept(name, step)
-        return step.found
+        return None if step is None or step.holds_for != holds_for else step.found
 
     def done(self) -> dict[str, str]:
         """Return when each step was done, whatever it was done with."""

@@ -6,15 +6,16 @@ import contextlib
 import ctypes
 import os
 
-PRIORITY = 50  # below the kernel's own interrupt threads of a real-time kernel, above all ordinary work
+CYCLE = 50  # as the interrupt threads of a real-time kernel have it, above all ordinary work
+BESIDE = 45  # the other threads of its process: the cycle waits for one that holds the interpreter and may not run
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 
 
-def prioritise() -> str:
-    """Give the calling thread a real-time priority and return how it is scheduled now."""
+def prioritise(priority: int) -> str:
+    """Give the calling thread, and those that it starts, a real-time priority; return how it is scheduled now."""
     with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-        return f"SCHED_FIFO {PRIORITY}"
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        return f"SCHED_FIFO {priority}"
     return "SCHED_OTHER"
 
 

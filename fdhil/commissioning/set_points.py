@@ -101,6 +101,11 @@ class SetPoints:
         if self.stopped is None:
             self.stopped = why
 
+    def hold(self, why: str) -> None:
+        """Stay at the row that left last: nothing left for so long that the drives stand there already."""
+        self.stop(why)
+        self._rows, self._brake, self._before = None, iter(()), self._last
+
     def step(self, positions: Sequence[int | None] = ()) -> tuple[int, ...]:
         """Return what is sent in this cycle, in whole increments; ``positions`` are the drives' newest."""
         self._watch(positions)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.moving import move
 from fdhil.commissioning.record import CommissioningRecord
@@ -9,25 +11,37 @@ from fdhil.commissioning.set_points import Bounds, straight
 from fdhil.commissioning.strokes import Room, Stroke
 from fdhil.errors import DriveFault
 
-Travel = tuple[float, float]
-"""From where to where an axis may go, mm."""
+SLACK_MM = 0.05  # by which an axis that came back may stand beside where it began
 
 
-def travel_of(master: Master, record: CommissioningRecord, room: Room) -> Travel:
-    """Return where the axis may go from where it stands; DriveFault where other limits of its travel are nearer."""
-    scaling = master.config.axis[master.axis].scaling
+class Travel(NamedTuple):
+    """From where to where an axis may go."""
+
+    low_mm: float
+    high_mm: float
+
+
+def travel_of(master: Master, record: CommissioningRecord, room: Room, given: Travel | None = None) -> Travel:
+    """Return where the axis may go from where it stands; DriveFault where another limit of its travel is nearer.
+
+    ``given`` is the travel of the trial that was stopped: the same words from another place mean another one.
+    """
+    scaling, said = master.config.axis[master.axis].scaling, master.config.axis[master.axis].setpoints
     here = scaling.to_mm(master.heard.objects[master.profile.position])
     low, high = here + room.back_mm, here + room.forward_mm
-    limits = {}
+    limits: dict[str, Travel] = {}
     if record.travel is not None:
-        limits["its software limits (0x607D)"] = sorted(scaling.to_mm(limit) for limit in record.travel)
-    if (said := master.config.axis[master.axis].setpoints) is not None:
-        limits["[axis.*.setpoints]"] = sorted(said.travel_mm)
+        limits["its software limits (0x607D)"] = Travel(*sorted(scaling.to_mm(limit) for limit in record.travel))
+    if said is not None:
+        limits["[axis.*.setpoints]"] = Travel(*said.travel_mm)
+    if given is not None:
+        limits["the room that the trial began with"] = Travel(given.low_mm - SLACK_MM, given.high_mm + SLACK_MM)
     for by, (least, most) in limits.items():
         if low < least or high > most:
             text = f"it stands at {here:.3f} mm and may go from {least:g} to {most:g} mm by {by}, not {room} from here"
-            raise DriveFault(master.device, f"{text}; give it less with --room, or move it away from its end")
-    return low, high
+            advice = "give it another --room, or move it away from its end; --again begins a new trial"
+            raise DriveFault(master.device, f"{text}; {advice}")
+    return Travel(low, high)
 
 
 def stroke(master: Master, travel_mm: Travel, moved: Stroke, rest_s: float) -> None:

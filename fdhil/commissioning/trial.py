@@ -6,7 +6,7 @@ leave by ``set_points`` alone; whatever happens, also Ctrl-C, the axis is braked
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 
@@ -27,7 +27,7 @@ from fdhil.config import MachineConfig
 from fdhil.drivers.can.bus import CanBus
 from fdhil.errors import DeviceError, DriveFault
 from fdhil.pipeline import Known
-from fdhil.records import Outcome
+from fdhil.records import Outcome, Recording
 
 RAPIDS = 6
 TIMING_CYCLES = 1000
@@ -37,6 +37,7 @@ LAST_REST_S = 1.8  # a separate sensor may deliver a second later
 HEARD_TIMEOUT_S = 10.0
 STEPS = ("timing", "jog", "test rapids", "identification", "acceptance")
 FROM_RAPIDS = STEPS[2:]
+GIVEN = "room"  # kept beside the steps: where a trial that was stopped may go
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +86,7 @@ def try_axis(
             operator.report("timing")
             prepare(master)
             trial.found["timing"] = time_bus(master)
-            travel_mm = travel_of(master, record, room)
+            travel_mm = allowed(master, record, room, progress, now)
             with guarded(master):
                 if "jog" not in trial.found:
                     operator.report("jog")
@@ -96,19 +97,38 @@ def try_axis(
                 enable(master)
                 heard = rapids_to_and_fro(master, travel_mm, rapid)
                 operator.report("restore")
-    balance = judge_acceleration(heard.recording())
-    require(master, [balance])
-    trial.found["test rapids"] = {"rapid": str(rapid), "moves": RAPIDS, balance.point: balance.found}
-    operator.report("identification")
     trial.outcomes = tuple(identify(config, axis, heard.records, known))
-    rapids = judge(axis, trial.outcomes)
-    trial.found["identification"] = rapids.parameters
-    trial.found["test rapids"] = {**trial.found["test rapids"], **voltage_late(config, rapids)}
-    operator.report("acceptance")
-    trial.found["acceptance"] = accept(config, rapids)
+    trial.found |= judged(config, axis, trial.outcomes, heard.recording(), operator)
+    trial.found["test rapids"] = {"rapid": str(rapid), "moves": RAPIDS, **trial.found["test rapids"]}
     for step in FROM_RAPIDS:
         progress.keep(step, now, trial.found[step])
     return trial
+
+
+def allowed(master: Master, record: CommissioningRecord, room: Room, progress: Progress, now: str) -> Travel:
+    """Return where the axis may go; a trial that was stopped elsewhere keeps to the room that it began with."""
+    given = progress.found(GIVEN, now)
+    travel_mm = travel_of(master, record, room, Travel(**given) if given else None)
+    if given is None:
+        progress.keep(GIVEN, now, travel_mm._asdict())
+    return travel_mm
+
+
+def judged(
+    config: MachineConfig, axis: str, outcomes: Sequence[Outcome], heard: Recording, operator: Operator
+) -> dict[str, Found]:
+    """Return what the rapids tell, step by step; DriveFault for the first that is not as it must be."""
+    balance = judge_acceleration(heard)
+    if balance.ok is False:
+        raise DriveFault(f"drive {axis}", f"{balance.cause}; {balance.advice}")
+    operator.report("identification")
+    rapids = judge(axis, outcomes)
+    operator.report("acceptance")
+    return {
+        "test rapids": {balance.point: balance.found, **voltage_late(config, rapids)},
+        "identification": rapids.parameters,
+        "acceptance": accept(config, rapids),
+    }
 
 
 @contextmanager

@@ -114,7 +114,9 @@ def test_a_wrong_sign_and_what_nobody_saw_end_it_before_a_rapid(bench: Bench) ->
         bench.tried()
     assert "test rapids" not in bench.steps
     assert bench.stands_mm == pytest.approx(0.0, abs=0.05)
-    assert Progress(bench.config.store.directory, "X").done() == {}
+    assert Progress(bench.config.store.directory, "X").done().keys() == {"room"}
+    with pytest.raises(DriveFault, match=r"may go from -2.05 to 130.05 mm by the room that the trial began"):
+        bench.tried(Room(-5.0, 130.0))
 
 
 def test_no_room_sends_nothing(bench: Bench) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from fdhil.prediction import contour_error_um
 from fdhil.records import Trajectory
 
-PATIENCE_S = 300.0
+PATIENCE_S = 40.0
 SHUTTLE = "G21 G90\n" + "G0 X400 Y400\nG4 P0.3\nG0 X0 Y0\nG4 P0.3\n" * 3 + "M2\n"
 PART = """G21 G90 G17 G64 P0.01
 F9000

@@ -116,7 +116,7 @@ class ToldG0:
         said = self._about(stretch)
         pieces = list(self._pieces(stretch, said))
         for (begin, kind), (end, _) in pairwise([*pieces, (stretch.end, MoveKind.REST)]):
-            told = _move(_of_a_piece(said, begin, end), kind)
+            told = _move(_of_a_piece(said, begin, end), begin, kind)
             if kind is not self._kind:
                 yield MoveEvent(self._axis, kind, begin, self._source, told)
             self._kind = kind
@@ -155,10 +155,10 @@ def _of_a_piece(said: Sequence[Said], begin: int, end: int) -> list[Said]:
     return [*before[-1:], *(each for each in said if each.high >= begin and each.low <= end)]
 
 
-def _move(said: Sequence[Said], kind: MoveKind) -> NcMove:
-    """Return what was said of a move, all of it together."""
+def _move(said: Sequence[Said], begin: int, kind: MoveKind) -> NcMove:
+    """Return what was said of a move, all of it together; its line is the first that was said while it ran."""
     states = [each.state for each in said]
-    own = [state for state in states if state.motion is kind]
+    own = [each.state for each in said if each.low > begin and each.state.motion is kind]
     overrides = [override for state in states if (override := _override(state, kind)) is not None]
     holds = [state.held for state in states if state.feed_hold is not None or state.motion is MoveKind.HOLD]
     return NcMove(

@@ -151,6 +151,12 @@ def test_a_source_that_is_asked_now_and_then_gives_the_edges_of_the_demand(perio
     np.testing.assert_allclose([tick for _, tick in found], [tick for _, tick in truth(told, 0)], atol=2)
 
 
+def test_a_move_back_at_once_is_a_move_of_its_own_line() -> None:
+    told = course([rest(300), rapid(200, 7), rapid(-200, 8), rest(400)])
+    events = hear(told, exact(told, 0), 3)
+    assert [(e.kind, e.nc and e.nc.line) for e in events] == [(RAPID, 7), (REST, None), (RAPID, 8), (REST, None)]
+
+
 def test_a_hold_and_an_override_within_the_move_are_told() -> None:
     told = course([rest(300), rapid(400), rest(400)])
     states = exact(told, 0)
