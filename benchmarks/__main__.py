@@ -28,6 +28,7 @@ BENCHMARKS = {
     "acquisition": "A full 1 Mbit/s bus through receive and decode, alone and beside a fit",
     "adapters": "A serial CAN adapter through python-can, and the same through the kernel where it has vcan0",
     "guard_latency": "From SYNC to the offset frames",
+    "play_jitter": "How late the SYNC of `fdhil play` leaves, a minute at 1 kHz, beside a loop in C that only sleeps",
     "whole_machine": "The daemon beside the twin in real time: 60 s of two drives at 1 kHz",
 }
 

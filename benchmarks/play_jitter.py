@@ -47,11 +47,12 @@ def prefer() -> None:
 
 
 @contextlib.contextmanager
-def machine(folder: Path, period_ms: float, interface: str | None) -> Iterator[Path]:
+def machine(folder: Path, period_ms: float, interface: str | None, lockstep: bool) -> Iterator[Path]:
     """Run the simulated machine; yields the path of the config with which others join it."""
     bus = f'interface = "socketcan"\nchannel = "{interface}"' if interface else 'interface = "socketcand"\nport = 0'
     path = write_config(folder, bus=bus, sim="modbus = false")
     text = path.read_text() + SETPOINTS.format("X") + SETPOINTS.format("Y") + HEARTBEAT
+    text += '[guard]\nclock = "sync"\n' if lockstep else ""
     text = text.replace("sync_period_s = 0.001", f"sync_period_s = {period_ms / 1e3:g}")
     path.write_text(text)
     command = [sys.executable, "-m", "fdhil", "sim", str(path), "--json"]
@@ -89,6 +90,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--period-ms", type=float, default=1.0)
     parser.add_argument("--interface")
+    parser.add_argument("--lockstep", action="store_true", help="wait for drives that sleep: periods missed")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -97,7 +99,7 @@ def main() -> None:
         print(f"sleep and wake in C: {floor(given.period_ms, min(given.seconds, 30.0), folder)} (p50 p99 max, us)")
         program = folder / "circle.csv"
         demand(program, given.seconds, given.period_ms)
-        with machine(folder, given.period_ms, given.interface) as path:
+        with machine(folder, given.period_ms, given.interface, given.lockstep) as path:
             said = play(path, program)
         if "refused" in said:
             sys.exit(said["refused"])

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from fdhil.config import MachineConfig
 
 _FILE = click.Path(path_type=Path)
-SWITCH_INTERVAL_S = 0.0002  # the cycle must not wait 5 ms for the thread that only looks on
+NOBODY = "nobody is there to press Enter, and nothing was played; leave --hold out"
 MARKED_S = 1.0  # a daemon beside the guard marks a record that late
 SIGNALS: Mapping[int, str] = {
     signal.SIGINT: "stopped by Ctrl-C",
@@ -78,21 +78,21 @@ def _play(machine: MachineConfig, plan: Plan, program: Path, go_to_start: bool, 
     """Ask, lead the drives and play; DriveFault when it is refused."""
     from fdhil.cli.bus_lock import lock_place
     from fdhil.commissioning.play import on_bench, valid_records
+    from fdhil.commissioning.realtime import before_other_work
 
     records = valid_records(machine)
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
     with ExitStack() as held, _raised():
         for name in dict.fromkeys(axis.drive.bus for axis in machine.axis.values()):
             held.enter_context(lock_place(machine.bus[name], "set-points"))
+        held.enter_context(before_other_work())
         bench = held.enter_context(on_bench(plan, _say))
         bench.compare(records)
         here = bench.here()
         bench.require_start(here, go_to_start)
         if not yes:
             _ask(bench, program, here)
-        _quiet()
         with bench.led(lambda: _tell_guard(machine, records)):
-            stopped = bench.go_to_start(_stopping)
+            stopped = bench.go_to_start(_stopping, go_to_start)
             if stopped is not None:
                 raise DriveFault("the way to the start", f"{stopped}; nothing was played")
             if not hold:
@@ -103,10 +103,12 @@ def _play(machine: MachineConfig, plan: Plan, program: Path, go_to_start: bool, 
 
 def _entered() -> bool:
     """Whether Enter was pressed; DriveFault where nobody is there to press it."""
+    if sys.stdin is None or sys.stdin.closed:
+        raise DriveFault("the bench", NOBODY)
     if not select.select([sys.stdin], (), (), 0.0)[0]:
         return False
     if not sys.stdin.readline():
-        raise DriveFault("the bench", "nobody is there to press Enter, and nothing was played; leave --hold out")
+        raise DriveFault("the bench", NOBODY)
     return True
 
 
@@ -133,17 +135,6 @@ def _tell_guard(machine: MachineConfig, records: Mapping[str, CommissioningRecor
 def _say(text: str) -> None:
     if sys.stderr.isatty():
         click.echo(text, err=True)
-
-
-def _quiet() -> None:
-    """What is there now stays: no collector looks at it between two SYNCs."""
-    import gc
-
-    from fdhil.commissioning.realtime import lock_memory
-
-    gc.collect()
-    gc.freeze()
-    lock_memory()
 
 
 @contextmanager

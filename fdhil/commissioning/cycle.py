@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from typing import Protocol, Self
 
 from fdhil import cia402
-from fdhil.commissioning.realtime import prioritise
+from fdhil.commissioning.realtime import CYCLE, prioritise
 from fdhil.commissioning.set_points import SetPoints
 from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import MachineConfig
@@ -20,6 +20,7 @@ from fdhil.errors import DeviceError
 
 LOCKSTEP_WAIT_S = 8.0
 MOST_CYCLE_US = 20_000
+STALL_CYCLES = 20
 
 
 class Member(Protocol):
@@ -105,7 +106,7 @@ class Cycle:
 
     def _run(self) -> None:
         if self._realtime:
-            self.scheduling = prioritise()
+            self.scheduling = prioritise(CYCLE)
         due = time.monotonic()
         try:
             while not self._stopping.is_set():
@@ -118,7 +119,9 @@ class Cycle:
         if self.lockstep:
             self._receive()
         self._send_heartbeat()
-        if self._sync_overflow is not None and not self._awaits_drive():
+        if self._sync_overflow is not None and self._awaits_drive():
+            self.lateness.skipped += 1
+        elif self._sync_overflow is not None:
             self._send_sync()
             self.lateness.add(time.monotonic() - due)
             self._send_set_points()
@@ -127,10 +130,16 @@ class Cycle:
         due += self.period_s
         now = time.monotonic()
         if now > due + self.period_s:  # no SYNC is sent twice as fast to catch up
-            self.lateness.skipped += int((now - due) / self.period_s)
+            self._missed(int((now - due) / self.period_s))
             due = now
         time.sleep(max(0.0, due - now))
         return due
+
+    def _missed(self, periods: int) -> None:
+        """This computer slept; drives that stand at their last set-point by now are not jerked on."""
+        self.lateness.skipped += periods
+        if periods > STALL_CYCLES and self.path is not None and not self.lockstep:
+            self.path.hold(f"this computer was late by {periods} SYNC; take load off it")
 
     def _awaits_drive(self) -> bool:
         """Whether a simulated drive has yet to answer the last SYNC: its process may sleep, and time is the SYNC count.

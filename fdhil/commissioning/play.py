@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from fdhil import cia402
-from fdhil.cia402 import NmtCommand
+from fdhil.cia402 import NmtCommand, Object
 from fdhil.commissioning.compare import compare_record
 from fdhil.commissioning.cycle import Cycle, Lateness
 from fdhil.commissioning.finding import read_optional
@@ -136,7 +136,7 @@ class Bench:
 
     # nothing is sent but SDO requests
 
-    def compare(self, records: dict[str, CommissioningRecord]) -> None:
+    def compare(self, records: Mapping[str, CommissioningRecord]) -> None:
         """Listen, and refuse another master; read every drive, and refuse one that is not as it was signed off."""
         self._say("listening: no NC may run the buses")
         for bus in self.loop.buses.values():
@@ -150,6 +150,22 @@ class Bench:
                 text = f"it holds an offset (0x60B0) of {held} increments; run fdhil adopt before anything moves"
                 raise DriveFault(master.device, text)
             require_alone(master)
+        self._require_room(records)
+        self._require_one_counter()
+
+    def _require_room(self, records: Mapping[str, CommissioningRecord]) -> None:
+        for master, of in zip(self.masters, self.plan.bounds, strict=True):
+            travel = records[master.axis].travel
+            if travel is not None and not (travel[0] <= of.low and of.high <= travel[1]):
+                low, high = sorted(self._mm(master, limit) for limit in travel)
+                text = f"its software limits (0x607D) leave it {low:g} to {high:g} mm, less than [axis.{master.axis}"
+                raise DriveFault(master.device, f"{text}.setpoints] travel_mm; correct that")
+
+    def _require_one_counter(self) -> None:
+        counters = {read_optional(master, Object.SYNC_COUNTER_OVERFLOW) or 0 for master in self.masters}
+        if len(counters) > 1:
+            shown = ", ".join(map(str, sorted(counters)))
+            raise DriveFault("the drives", f"they want different SYNC counters (0x1019: {shown}); set all to one value")
 
     def here(self) -> list[int]:
         """Read where the axes stand, in increments."""
@@ -252,9 +268,13 @@ class Bench:
         while time.monotonic() < end and any(m.heard.objects.get(m.profile.offset, 0) for m in self.masters):
             self.masters[0].wait_cycles(OFF_CYCLES)
 
-    def go_to_start(self, signals: Signals) -> str | None:
-        """Go slowly and straight to the first row; why it was stopped on the way, None when it is there."""
+    def go_to_start(self, signals: Signals, asked: bool) -> str | None:
+        """Go slowly and straight to the first row; why it was stopped on the way, None when it is there.
+
+        DriveFault where an axis has moved away from it meanwhile and nobody ``asked`` that it goes there.
+        """
         here = [master.target or 0 for master in self.masters]
+        self.require_start(here, asked)
         goal = self.plan.rows(here)[0]
         slow = [of.speed * APPROACH_SHARE for of in self.plan.bounds]
         gently = [of.acceleration * APPROACH_SHARE for of in self.plan.bounds]

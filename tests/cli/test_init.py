@@ -251,6 +251,19 @@ def test_an_answer_that_the_drive_contradicts_is_noted(
     assert machine_config.load(tmp_path / "m.toml").axis["X"].drive.increments_per_rev == 4096
 
 
+def test_limits_that_were_left_open_are_such_that_coarse_increments_can_keep(fdhil: Said, tmp_path: Path) -> None:
+    for increments, limits in ((65536, (50.0, 2.0, 250.0)), (16384, (50.0, 5.0, 1000.0))):
+        drive = SHEET["drive"] | {"increments_per_rev": increments}
+        answers = tmp_path / "answers.toml"
+        answers.write_text(to_toml({"axis": {"X": SHEET | RAPID | {"drive": drive}}}) + "[axis.X.correction]\n")
+        file = tmp_path / f"{increments}.toml"
+        code, _, err = fdhil("init", file, "--answers", answers, "--offline")
+        assert code == 0, err
+        found = machine_config.load(file).axis["X"].correction
+        assert found is not None
+        assert (found.max_offset_um, found.max_speed_mm_s, found.max_acceleration_mm_s2) == limits
+
+
 def test_an_axis_without_a_drive_is_refused(fdhil: Said, peer: DrivePeer, bus: dict[str, Any], tmp_path: Path) -> None:
     sheet = SHEET | RAPID
     answers = written(tmp_path, axis={"X": sheet, "Y": sheet}, bus=bus)
@@ -261,6 +274,18 @@ def test_an_axis_without_a_drive_is_refused(fdhil: Said, peer: DrivePeer, bus: d
     code, _, err = fdhil("init", tmp_path / "m.toml", "--answers", answers)
     assert code == 2
     assert "axis.X.drive.node_id: is 9, which is not on the bus (node 1 (fdhil twin drive" in err
+
+
+def test_a_drive_that_was_given_to_an_axis_is_not_proposed_to_another(
+    fdhil: Said, peer: DrivePeer, bus: dict[str, Any], tmp_path: Path
+) -> None:
+    with DrivePeer(machine(axes="XY", bus=bus["can0"]), "Y"):
+        sheet = SHEET | RAPID | {"drive": {}}
+        answers = written(tmp_path, axis={"X": sheet, "Y": sheet | {"drive": {"node_id": 1}}}, bus=bus)
+        code, _, err = fdhil("init", tmp_path / "m.toml", "--answers", answers)
+    assert code == 0, err
+    made = machine_config.load(tmp_path / "m.toml")
+    assert {axis: made.node_id(axis) for axis in made.axis} == {"X": 2, "Y": 1}
 
 
 def test_a_pc_without_can_says_what_to_give(fdhil: Said, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fdhil.commissioning.set_points import ROUNDING, Bounds, SetPoints, straight
@@ -56,6 +56,7 @@ def test_a_straight_way_uses_what_it_may() -> None:
     assert straight((7,), (7,), (400.0,), (10.0,)).tolist() == [[7.0]]
 
 
+@settings(max_examples=25)
 @given(st.integers(0, 400))
 def test_a_stop_brakes_at_once_and_straight_ahead(after: int) -> None:
     points = SetPoints((X, Y), (0, 0))
@@ -122,6 +123,15 @@ def test_an_axis_that_does_not_follow_is_stopped() -> None:
     assert points.stopped == "axis X: it does not follow its set-points"
     assert points.position[0] < 2 * X.following_error
     sent(points)
+
+
+def test_after_a_long_stall_the_axes_stay_where_the_drives_stand() -> None:
+    points = SetPoints((X,), (0,))
+    points.play(straight((0,), (50_000,), (SPEED,), (ACCELERATION,)))
+    out = [points.step() for _ in range(100)]
+    points.hold("late")
+    assert sent(points) == [out[-1]]
+    assert points.stopped == "late"
 
 
 def test_a_drive_that_counts_against_the_axis_has_its_travel_turned() -> None:

@@ -15,9 +15,9 @@ import pytest
 from fdhil.arming.token import read_token
 from tests.bench import bench_document
 from tests.integration.conftest import Bench
-from tests.integration.test_guard import DIGEST, arm, guarded, transport
+from tests.integration.test_guard import DIGEST, arm, guarded
 
-__all__ = ["transport"]
+pytestmark = pytest.mark.socketcan
 QUICK = """
 from fdhil.commissioning import steps, survey
 from fdhil.drivers.can import sdo
@@ -25,6 +25,12 @@ survey.LISTEN_S, steps.SETTLE_CYCLES, sdo.RESPONSE_TIMEOUT_S, sdo.DEADLINE_S = 0
 from fdhil.cli.main import main
 main()
 """
+
+
+@pytest.fixture
+def transport() -> str:
+    """Three processes of fdhil and the twin: on an interface of the kernel."""
+    return "socketcan"
 
 
 @pytest.fixture

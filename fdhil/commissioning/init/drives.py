@@ -81,7 +81,7 @@ def _asked(bus: BusScanner, node_id: int, said: Answers, descriptions: Sequence[
         read = partial(_number, bus, node_id, axis)
         if read(Object.STATUSWORD, 0) is None:
             return
-        told = dict(told_by(read, None if profile is None else read_profile(profile, _needed(profile, eds))))
+        told = dict(told_by(read, None if profile is None else read_profile(profile, eds)))
         window = read(Object.FOLLOWING_ERROR_WINDOW, 0)
         yield FoundDrive(bus.name, node_id, label, axis, profile, eds, told, window, _cycle_s(read))
 
@@ -99,10 +99,6 @@ def _cycle_s(read: Read) -> float | None:
         return None
     period_s = float(count * 10.0 ** ((exponent ^ 0x80) - 0x80))
     return rounded(period_s) if 1e-4 <= period_s <= 0.02 else None
-
-
-def _needed(profile: str, eds: Path | None) -> Path | None:
-    return eds if profile == GENERIC else None
 
 
 def suggested(said: Answers, eds: Path | None, read: Read) -> str | None:

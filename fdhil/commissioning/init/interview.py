@@ -11,7 +11,7 @@ from typing import Any
 from fdhil.commissioning.init.draft import OPERATOR, Draft
 from fdhil.commissioning.init.drives import FoundBus, FoundDrive, needs_dc_link
 from fdhil.commissioning.init.linuxcnc import Machine, Scale
-from fdhil.commissioning.init.questions import QUESTIONS, Question
+from fdhil.commissioning.init.questions import PITCH, QUESTIONS, Question
 from fdhil.commissioning.init.told import Told, rounded
 from fdhil.config import Drive
 from fdhil.config.reading import checked
@@ -101,12 +101,12 @@ def settle_axis(
     folder: Path,
 ) -> None:
     """Settle [axis.X]; ``others`` are the axes before it, ``found`` what is on the buses."""
-    drive = _settle_drive(draft, axis, others, found)
+    drive = _settle_drive(draft, axis, found)
     profile = _settle_profile(draft, axis, drive, folder)
     for key, told in (drive.told if drive is not None else {}).items():
         draft.tell(f"axis.{axis}.{key}", told)
     _settle_scale(draft, axis, nc.scales.get(axis) if nc else None, others)
-    for question in QUESTIONS[1:]:
+    for question in QUESTIONS:
         if _applies(question.key, profile):
             _settle(draft, axis, question, others)
     if drive is not None:
@@ -119,36 +119,45 @@ def settle_axis(
         )
 
 
-def _settle_drive(draft: Draft, axis: str, others: Sequence[str], found: Found) -> FoundDrive | None:
+def _settle_drive(draft: Draft, axis: str, found: Found) -> FoundDrive | None:
     """Settle which drive moves the axis; return it where it was found on a bus."""
     path = f"axis.{axis}.drive"
-    taken = [_place(draft, other) for other in others]
+    taken = _taken(draft, axis)
     free = [drive for drive in found.drives if (drive.bus, drive.node_id, drive.logical_axis) not in taken]
-    if f"{path}.node_id" not in draft.values:
-        next_id = Told(max((place[1] for place in taken), default=0) + 1, "guessed: in the order of the axes", True)
-        if found.complete and not free:
-            what = f"has no drive: {len(found.drives)} found, {len(others)} given to other axes"
-            advice = "check its supply and wiring, or leave the axis out; --offline looks at no bus"
-            draft.missing.append(ConfigFault(path, what, advice))
-            return None
-        only = found.complete and len(found.drives) == 1
-        first = (
-            Told(free[0].node_id, "the drive on the bus" if only else "guessed: in the order on the bus", not only)
-            if free
-            else next_id
-        )
-        where = "found: " + "; ".join(drive.name for drive in free) if free else "the drive's switches or tool"
-        draft.settle(f"{path}.node_id", where, first)
-    chosen = _place(draft, axis)
-    alike = [drive for drive in free if drive.node_id == chosen[1]]
-    exact = [drive for drive in alike if drive.logical_axis == chosen[2]]
-    drive = next(iter(exact or ([] if f"{path}.logical_axis" in draft.values else alike)), None)
-    if drive is None and found.complete:
-        what = f"is {chosen[1]}, which is not on the bus"
-        draft.missing.append(ConfigFault(f"{path}.node_id", what, "; ".join(d.name for d in free) or "none is left"))
+    if found.complete and not free:
+        what = f"has no drive: {len(found.drives)} found, {len(taken)} given to other axes"
+        advice = "check its supply and wiring, or leave the axis out; --offline looks at no bus"
+        draft.missing.append(ConfigFault(path, what, advice))
+        return None
+    only = found.complete and len(found.drives) == 1
+    first = Told(1 + max((place[1] for place in taken), default=0), "guessed: in the order of the axes", guessed=True)
+    if free:
+        source = "the drive on the bus" if only else "guessed: in the order on the bus"
+        first = Told(free[0].node_id, source, guessed=not only)
+    names = "; ".join(drive.name for drive in free)
+    draft.settle(f"{path}.node_id", f"found: {names}" if free else "the drive's switches or tool", first)
+    drive = _chosen(draft, axis, free)
     if drive is not None:
         _tell_place(draft, path, drive)
+    elif found.complete:
+        what = f"is {draft.get(f'{path}.node_id')}, which is not on the bus"
+        draft.missing.append(ConfigFault(f"{path}.node_id", what, names))
     return drive
+
+
+def _taken(draft: Draft, axis: str) -> set[tuple[str, int, int]]:
+    """Return the drives that the other axes have, or are answered to have."""
+    named = {path.split(".")[1] for path in draft.values if path.startswith("axis.") and path.endswith(".node_id")}
+    return {_place(draft, other) for other in named - {axis}}
+
+
+def _chosen(draft: Draft, axis: str, free: Sequence[FoundDrive]) -> FoundDrive | None:
+    """Return the found drive that the axis' node-ID names; of several axes behind it the first that is free."""
+    _, node_id, number = _place(draft, axis)
+    alike = [drive for drive in free if drive.node_id == node_id]
+    exact = [drive for drive in alike if drive.logical_axis == number]
+    given = f"axis.{axis}.drive.logical_axis" in draft.values
+    return next(iter(exact if exact or given else alike), None)
 
 
 def _place(draft: Draft, axis: str) -> tuple[str, int, int]:
@@ -185,9 +194,10 @@ def _settle_profile(draft: Draft, axis: str, drive: FoundDrive | None, folder: P
 
 
 def _settle_eds(draft: Draft, path: str, drive: FoundDrive | None, folder: Path) -> None:
+    """With its EDS a profile maps what this drive has, and no more; the generic one is made of nothing else."""
+    if drive is not None and drive.eds is not None:
+        draft.tell(f"{path}.eds", Told(_from(drive.eds, folder), "fits the drive on the bus"))
     if draft.get(f"{path}.profile") == GENERIC:
-        if drive is not None and drive.eds is not None:
-            draft.tell(f"{path}.eds", Told(_from(drive.eds, folder), "fits the drive on the bus"))
         draft.settle(f"{path}.eds", "the drive's maker has it on his pages; put it beside this file, or give --eds")
 
 
@@ -214,7 +224,7 @@ def _settle_scale(draft: Draft, axis: str, scale: Scale | None, others: Sequence
             draft.tell(pitch, Told(rounded(draft.get(turn) / per_mm), f"{scale.source}, and the drive's increments"))
         if scale.increments_per_mm < 0:
             draft.tell(f"axis.{axis}.drive.sign", Told(-1, f"{scale.source} is negative"))
-    _settle(draft, axis, QUESTIONS[0], others)
+    _settle(draft, axis, PITCH, others)
     if scale is None or draft.get(pitch) is None:
         return
     if turn not in draft.values:

@@ -47,11 +47,11 @@ def _rapid_rad_s(known: Known) -> float:
 
 DRIVE_TOOL = "the drive's own tool shows it; where it is unknown take the proposal: fdhil tells later whether it fits"
 SHEET = "the motor's data sheet"
+PITCH = Question(
+    "screw_pitch_mm",
+    "the screw's label, or its drawing; behind a gear: what the table travels in one turn of the motor",
+)
 QUESTIONS = (
-    Question(
-        "screw_pitch_mm",
-        "the screw's label, or its drawing; behind a gear: what the table travels in one turn of the motor",
-    ),
     Question("drive.increments_per_rev", "the drive's tool: what its position counts in one turn of the motor"),
     Question("rapid_speed_mm_s", "the NC's parameter for rapids; 1 m/min is 16.67 mm/s"),
     Question("max_acceleration_mm_s2", "the NC's parameter for the axis; 1 m/s2 is 1000 mm/s2"),

@@ -151,6 +151,12 @@ def test_a_source_that_is_asked_now_and_then_gives_the_edges_of_the_demand(perio
     np.testing.assert_allclose([tick for _, tick in found], [tick for _, tick in truth(told, 0)], atol=2)
 
 
+def test_a_move_back_at_once_is_a_move_of_its_own_line() -> None:
+    told = course([rest(300), rapid(200, 7), rapid(-200, 8), rest(400)])
+    events = hear(told, exact(told, 0), 3)
+    assert [(e.kind, e.nc and e.nc.line) for e in events] == [(RAPID, 7), (REST, None), (RAPID, 8), (REST, None)]
+
+
 def test_a_hold_and_an_override_within_the_move_are_told() -> None:
     told = course([rest(300), rapid(400), rest(400)])
     states = exact(told, 0)
@@ -160,6 +166,14 @@ def test_a_hold_and_an_override_within_the_move_are_told() -> None:
         (move, _) = hear(told, said, 3)
         assert move.nc is not None
         assert (move.nc.override, move.nc.held) == (override, hold)
+
+
+def test_what_goes_on_after_a_hold_is_no_whole_rapid() -> None:
+    told = course(
+        [rest(300), rapid(200), Part(HOLD, 1, np.zeros(30)), rapid(200), rest(300), rapid(-400, 2), rest(400)]
+    )
+    rapids = [e.nc and e.nc.held for e in hear(told, exact(told, 0), 3) if e.kind is RAPID]
+    assert rapids == [False, True, False]
 
 
 def test_an_override_that_was_set_before_the_move_counts() -> None:

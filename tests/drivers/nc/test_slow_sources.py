@@ -1,0 +1,49 @@
+"""A source that is asked every 100 ms, of an NC that renews what it shows as often: kinds are right, edges exact."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fdhil.drivers.nc.timing import between
+from fdhil.records import MoveKind, NcState
+from tests.drivers.nc.test_told import MS, PROGRAM, Course, course, feed, hear, rapid, rest
+
+RENEWED_S = 0.1
+
+
+def asked(told: Course, phase_ms: int, age_ms: int, answer_ms: int, period_ms: int = 100) -> Iterator[NcState]:
+    """As a polled source: what is shown was so ``age_ms`` before it was asked for; no SYNC goes ahead of cycle 0."""
+    for at in range(phase_ms + age_ms, len(told.kind), period_ms):
+        stamp_ns, error_ns = between(at * MS, (at + answer_ms) * MS, RENEWED_S)
+        yield NcState(stamp_ns, error_ns, told.kind[at - age_ms], told.line[at - age_ms] or None)
+
+
+@settings(max_examples=12)
+@given(st.integers(0, 99), st.integers(0, 99), st.integers(1, 20), st.integers(0, 4))
+def test_kinds_come_right_and_edges_exact_whenever_it_is_asked(phase: int, age: int, answer: int, lag: int) -> None:
+    """Rapids of 0.3 s: longer than the period, the renewal and the answer together."""
+    told = course((rest(300), rapid(90), rest(50), feed(30), rest(50), rapid(-90, 3), rest(400)))
+    events = hear(told, list(asked(told, phase, age, answer)), lag)
+    moves = [(event.kind, event.tick) for event in events]
+    wanted = [(kind, cycle + lag) for cycle, kind in told.edges if cycle]
+    assert [kind for kind, _ in moves] == [kind for kind, _ in wanted]
+    assert [tick for _, tick in moves] == pytest.approx([tick for _, tick in wanted], abs=2)
+
+
+@settings(max_examples=12)
+@given(st.integers(0, 99), st.integers(0, 99), st.integers(1, 60))
+def test_no_feed_is_ever_a_rapid(phase: int, age: int, answer: int) -> None:
+    """The program has moves without a rest between them, and shorter ones than it can tell."""
+    told = course(PROGRAM)
+    events = hear(told, list(asked(told, phase, age, answer)), 0)
+    rapids = [False] * len(told.kind)
+    for event, after in zip(events, [*events[1:], None], strict=True):
+        if event.kind is MoveKind.RAPID:
+            end = after.tick if after else len(told.kind)
+            rapids[event.tick + 10 : end - 10] = [True] * max(0, end - event.tick - 20)
+    wrong = [k for k, kind in enumerate(told.kind) if rapids[k] and kind in (MoveKind.FEED, MoveKind.ARC)]
+    assert not wrong
