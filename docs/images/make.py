@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from matplotlib import style
+from matplotlib import colormaps, style
 from matplotlib.figure import Figure
 from PIL import Image, ImageChops
 
@@ -25,13 +25,15 @@ CUTS = (("uncorrected", "cut-1.csv", 0), ("mirror of the paper", "cut-2.csv", 1)
 HALF_WIDTH_MM = 7.0
 WIDTHS = {"wide": 1200, "narrow": 480}
 TALLEST = 14_000  # px, of what the browser draws
-COLOURS = 160  # of a screenshot: enough for its scales of colour
+COLOURS = 160  # of a screenshot, by how often they are; the maps' scale is added, whose colours are seldom
+OF_SCALE = 64
 CONFIG = str(OUT / "machine.toml")
 PROGRAM = str(ROOT / "fdhil" / "cli" / "demo" / "bench_10m.ngc")
 PAGES = {
     "report": ["report", CONFIG, "--out"],
     "predict": ["predict", PROGRAM, "--config", CONFIG, "--from-history", "--report"],
     "correct": ["correct", PROGRAM, "--config", CONFIG, "--from-history", "--report"],
+    "acceptance": ["acceptance", CONFIG, "--by", "A. Fitter", "--circle-um", "3", "--out"],
 }
 
 
@@ -79,7 +81,12 @@ def screenshot(browser: str, folder: Path, page: Path, picture: Path, width: int
     empty = Image.new("RGB", image.size, image.getpixel((0, TALLEST - 1)))
     used = ImageChops.difference(image, empty).getbbox()
     assert used is not None
-    image.crop((0, 0, width, min(TALLEST, used[3] + 20))).quantize(COLOURS).save(picture, optimize=True)
+    cropped = image.crop((0, 0, width, min(TALLEST, used[3] + 20)))
+    often = (cropped.quantize(COLOURS).getpalette() or [])[: 3 * COLOURS]
+    scale = 255 * colormaps["viridis"](np.linspace(0, 1, OF_SCALE))[:, :3]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([*often, *scale.round().astype(int).ravel().tolist()])
+    cropped.quantize(palette=palette, dither=Image.Dither.NONE).save(picture, optimize=True)
 
 
 if __name__ == "__main__":

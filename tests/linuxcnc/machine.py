@@ -22,6 +22,7 @@ from tests.sim.twin_process import TwinProcess
 
 HERE = Path(__file__).parent
 PATIENCE_S = 300.0
+LEAVING_S = 30.0
 # what the how-to has: a row of the demand for each servo cycle of 1 ms
 ROWS = r"""stdbuf -oL halsampler -t | mawk -W interactive '
 BEGIN { print "time_s,X_mm,Y_mm" } NF >= 3 { printf "%.3f,%s,%s\n", $1 / 1000, $2, $3 }'"""
@@ -141,7 +142,7 @@ class LinuxCnc:
         if self._lines is not None:
             self._lines.close()
             with suppress(subprocess.TimeoutExpired):
-                self._child.wait(PATIENCE_S)
+                self._child.wait(LEAVING_S)
         _end(self._child)
         self._alone.close()
         shutil.rmtree(self.folder)
@@ -192,7 +193,7 @@ def _end(child: subprocess.Popen[bytes]) -> None:
     with suppress(ProcessLookupError):
         os.killpg(child.pid, signal.SIGTERM)
     try:
-        child.wait(PATIENCE_S)
+        child.wait(LEAVING_S)
     except subprocess.TimeoutExpired:
         os.killpg(child.pid, signal.SIGKILL)
         child.wait()

@@ -71,7 +71,7 @@ def test_the_second_cut_of_a_program_is_corrected(shop: Shop) -> None:
     loads = f"loadusr -Wn {bridge.NAME} /usr/bin/python3 {bridge.__file__} --port {shop.bridge_port} --channel 1\n"
     with LinuxCnc(hal=loads, axes="XY") as nc, nc.driving(shop.twin):
         nc.run(SHUTTLE)
-        until(lambda: all(axis["accepted"] == 6 for axis in shop.status()["axes"].values()))
+        until(lambda: all(axis["accepted"] >= 4 for axis in shop.status()["axes"].values()))
         record(shop.file, part, lambda: nc.run(PART))
         promised = fdhil("correct", part, "--config", shop.file, "--from-history")
         fdhil("arm", shop.file, part)

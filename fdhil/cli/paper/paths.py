@@ -18,7 +18,7 @@ from fdhil.cli.paper.drawings import Traced
 from fdhil.cli.paper.scenarios import PATHS, machine
 from fdhil.config import MachineConfig
 from fdhil.correction import flatness, linear
-from fdhil.prediction import contour_error_um, predict
+from fdhil.prediction import contour_error_um
 from fdhil.prediction.models import nominal_models
 from fdhil.prediction.predict import predict_corrected
 from fdhil.program import load_trajectory
@@ -69,7 +69,8 @@ def _models(changes: tuple[tuple[str, float], ...], config: MachineConfig) -> di
 def predicted(scenario: str, program: str = SLOW, changes: tuple[tuple[str, float], ...] = ()) -> Prediction:
     """Predict a program without correction; ``changes`` are parameters of X that are not the nominal ones."""
     config = machine(scenario)
-    return predict(reference(scenario, program), _models(changes, config), config)
+    # nothing is added: what is predicted of the corrected path, without the zones that are not asked for here
+    return predict_corrected(reference(scenario, program), _models(changes, config), config, None)
 
 
 @cache
