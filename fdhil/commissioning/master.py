@@ -152,7 +152,9 @@ class Master:
             heard.emergencies.append(data)
         elif can_id == cia402.COB_HEARTBEAT + node and data:
             heard.nmt = data[0] & 0x7F
-        elif can_id not in self._guarded and (sign := shows_master(can_id)) is not None:
+        elif can_id in self._guarded:
+            self.loop.offsets_heard.add(can_id)
+        elif (sign := shows_master(can_id)) is not None:
             heard.master = heard.master or sign
 
     # what the steps use ---------------------------------------------------------------------------------------
