@@ -38,6 +38,7 @@ class SlowNode:
         self.waiting = []
 
 
+@pytest.mark.fault("A26")
 def test_the_roll_back_is_not_spoilt_by_a_late_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sdo, "RESPONSE_TIMEOUT_S", 0.02)
     node = SlowNode()
@@ -51,6 +52,7 @@ def test_the_roll_back_is_not_spoilt_by_a_late_answer(monkeypatch: pytest.Monkey
     assert link.read_int(0x6041) == 7
 
 
+@pytest.mark.fault("A26")
 def test_an_answer_to_what_another_program_asked_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sdo, "QUIET_S", 0.0)
     node = SlowNode()
