@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
+import json
 import struct
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from fdhil.guard.protocol import Mode
+from fdhil.guard.settings import to_json
 from tests.guard.machine import FACTS_GIVEN, Bench, arm_request, bench
+from tests.guard.shop import TOKEN, Shop
 
 
 def cutting(machine: Bench) -> Bench:
@@ -99,3 +104,54 @@ def test_a_pdo_longer_than_its_mapping_arms_nothing() -> None:
     machine.sync()
     assert "PdoMapping" in {alarm.code for alarm in machine.arm()}
     assert machine.frames == []
+
+
+class LateSync(Bench):
+    """A machine of the host's clock, whose SYNC comes ``late_s`` after its time."""
+
+    late_s = 0.0
+
+    def delay(self) -> None:
+        """Put the delay between the SYNC and the listener."""
+        hear = self.listener.at_sync
+        self.listener.at_sync = lambda data, stamp, arrival: hear(  # type: ignore[method-assign]
+            data, stamp + self.late_s, arrival + self.late_s
+        )
+
+
+@pytest.mark.fault("A8")
+def test_a_sync_that_is_late_once_is_held_and_another_period_ends_it() -> None:
+    made = bench(clock="monotonic")
+    machine = LateSync(made.settings, made.path, made.demand)
+    machine.delay()
+    cutting(machine)
+    machine.late_s += 0.0025
+    machine.sync()
+    assert machine.mode is Mode.HOLD
+    machine.until(Mode.ACTIVE, 40)
+    while machine.mode is not Mode.RAMP_DOWN:
+        machine.late_s += 0.00005  # 5 percent of the period with each
+        machine.sync()
+        assert machine.tick < 600
+    assert machine.state.cause is not None
+    assert machine.state.cause.code == "SyncJitter"
+    ends_at_zero_by(machine, "SyncJitter")
+
+
+@pytest.mark.fault("G10")
+def test_the_operators_token_is_in_nothing_that_is_written(tmp_path: Path) -> None:
+    """Neither in the settings, the journal, the status, nor in any answer, right or wrong."""
+    shop = Shop(tmp_path)
+    try:
+        client = shop.into_the_cut()
+        answers = [
+            shop.ask(client, {"request": "arm", "token": TOKEN}),
+            shop.ask(client, {"request": "adopt", "token": TOKEN, TOKEN: 1}),
+            shop.ask(client, {"request": "status", "token": TOKEN}),
+        ]
+        written = json.dumps([answers, shop.events()]) + to_json(shop.settings)
+        assert TOKEN not in written
+        assert repr(TOKEN)[1:-1] not in written
+        assert hashlib.sha256(TOKEN.encode()).hexdigest() in to_json(shop.settings)
+    finally:
+        shop.close()

@@ -203,3 +203,34 @@ def test_a_load_that_changed_between_the_windows_is_seen() -> None:
     _, verdict = pool([analyse(light, SETTINGS), analyse(heavy, SETTINGS)], SETTINGS)
     assert not verdict.accepted
     assert [reason.code for reason in verdict.reasons] == ["LoadChanged"]
+
+
+@pytest.mark.fault("D6")
+@pytest.mark.parametrize("error", [np.linalg.LinAlgError("singular"), FloatingPointError("overflow")])
+def test_a_solver_that_raises_costs_the_window_alone(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    good, bad = windows(0.003, moves=2)[:2]
+
+    def fail(*_: object) -> None:
+        raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr("fdhil.pipeline.analysis.maximum_likelihood.fit_windows", fail)
+        outcome = analyse(bad, SETTINGS)
+    assert not outcome.verdict.accepted
+    assert "SolverFailed" in _codes(outcome)
+    assert outcome.estimate is not None
+    assert np.isnan(outcome.estimate.values).all()
+    assert analyse(good, SETTINGS).verdict.accepted
+
+
+@pytest.mark.fault("C4")
+def test_a_rapid_whose_beginning_was_missed_lacks_its_acceleration() -> None:
+    signals = bench.run(bench.Plant(), bench.shuttle())
+    rows = bench.as_csv(signals, 0.003).splitlines(keepends=True)
+    head = next(k for k, line in enumerate(rows) if line.startswith("time_s")) + 1
+    speed = np.abs(np.asarray(signals.speed))
+    late = int(np.argmax(speed > 0.95 * speed.max()))
+    windows_found = find_windows(parse_recording("".join(rows[:head] + rows[head + late :])))
+    outcome = analyse(windows_found[0], SETTINGS)
+    assert not outcome.verdict.accepted
+    assert "MissingStage(accel)" in _codes(outcome)
