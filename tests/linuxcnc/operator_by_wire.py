@@ -19,7 +19,7 @@ from typing import Any
 import linuxcnc  # type: ignore[import-not-found]  # the package's own module, for the system's Python alone
 
 JOINTS = int(os.environ["JOINTS"])
-PATIENCE_S = 90.0
+PATIENCE_S = 300.0
 
 
 class Failed(Exception):
