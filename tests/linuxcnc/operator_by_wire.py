@@ -19,7 +19,7 @@ from typing import Any
 import linuxcnc  # type: ignore[import-not-found]  # the package's own module, for the system's Python alone
 
 JOINTS = int(os.environ["JOINTS"])
-PATIENCE_S = 300.0
+PATIENCE_S = 90.0
 
 
 class Failed(Exception):
@@ -84,9 +84,9 @@ class Operator:
             case "rest":
                 self.rest()
             case "override":
-                self.command.feedrate(order["value"])
+                self.order(self.command.feedrate, order["value"])
             case "rapid_override":
-                self.command.rapidrate(order["value"])
+                self.order(self.command.rapidrate, order["value"])
             case "pause":
                 self.command.auto(linuxcnc.AUTO_PAUSE)
             case "resume":
