@@ -70,7 +70,7 @@ def record(config: Path, out: Path, cut: Callable[[], None]) -> None:
 
 
 def repeated(status: Mapping[str, Any]) -> bool:
-    """Whether the last pass was the armed demand to its end; else the guard has seen another one, and ramped to zero."""
+    """Whether the last pass was the armed demand to its end; else the guard saw another one and ramped to zero."""
     return bool(status["passes"][-1]["ended_by"] == FINISHED)
 
 
