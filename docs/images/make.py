@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from matplotlib import style
+from matplotlib import colormaps, style
 from matplotlib.figure import Figure
 from PIL import Image, ImageChops
 
@@ -24,9 +24,10 @@ IMAGES, OUT = ROOT / "docs" / "images", ROOT / "out"
 CUTS = (("uncorrected", "cut-1.csv", 0), ("mirror of the paper", "cut-2.csv", 1), ("inverse", "cut-3.csv", 2))
 HALF_WIDTH_MM = 7.0
 WIDTHS = {"wide": 1200, "narrow": 480}
+TOP_OF_PAGE = 800  # px, of the prediction's page: its map and error
 TALLEST = 14_000  # px, of what the browser draws
-COLOURS = 200  # of a screenshot: enough for its scales of colour
-RARE = Image.Quantize.MAXCOVERAGE  # a colour of a scale is seldom, and counts
+COLOURS = 160  # of a screenshot, by how often they are; the maps' scale is added, whose colours are seldom
+OF_SCALE = 64
 CONFIG = str(OUT / "machine.toml")
 PROGRAM = str(ROOT / "fdhil" / "cli" / "demo" / "bench_10m.ngc")
 PAGES = {
@@ -50,6 +51,8 @@ def main() -> None:
         for page, path in pages.items():
             for label, width in WIDTHS.items():
                 screenshot(browser, folder, path, IMAGES / f"{page}-{label}.png", width)
+    with Image.open(IMAGES / "predict-wide.png") as page_seen:
+        page_seen.crop((0, 0, page_seen.width, TOP_OF_PAGE)).save(IMAGES / "path.png", optimize=True)
 
 
 def draw_corner() -> None:
@@ -81,7 +84,12 @@ def screenshot(browser: str, folder: Path, page: Path, picture: Path, width: int
     empty = Image.new("RGB", image.size, image.getpixel((0, TALLEST - 1)))
     used = ImageChops.difference(image, empty).getbbox()
     assert used is not None
-    image.crop((0, 0, width, min(TALLEST, used[3] + 20))).quantize(COLOURS, RARE).save(picture, optimize=True)
+    cropped = image.crop((0, 0, width, min(TALLEST, used[3] + 20)))
+    often = (cropped.quantize(COLOURS).getpalette() or [])[: 3 * COLOURS]
+    scale = 255 * colormaps["viridis"](np.linspace(0, 1, OF_SCALE))[:, :3]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([*often, *scale.round().astype(int).ravel().tolist()])
+    cropped.quantize(palette=palette, dither=Image.Dither.NONE).save(picture, optimize=True)
 
 
 if __name__ == "__main__":

@@ -155,6 +155,12 @@ class Listeners:
             except OSError:
                 self._let_go(listener)
 
+    def close(self) -> None:
+        """Let everybody go."""
+        for listener in list(self._waiting):
+            self._let_go(listener)
+        self._socket.close()
+
     def _admit(self) -> None:
         while True:
             try:

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from fdhil.config import MachineConfig
 
 _FILE = click.Path(path_type=Path)
-SWITCH_INTERVAL_S = 0.0002  # the cycle must not wait 5 ms for the thread that only looks on
 NOBODY = "nobody is there to press Enter, and nothing was played; leave --hold out"
 MARKED_S = 1.0  # a daemon beside the guard marks a record that late
 SIGNALS: Mapping[int, str] = {
@@ -79,13 +78,13 @@ def _play(machine: MachineConfig, plan: Plan, program: Path, go_to_start: bool, 
     """Ask, lead the drives and play; DriveFault when it is refused."""
     from fdhil.cli.bus_lock import lock_place
     from fdhil.commissioning.play import on_bench, valid_records
+    from fdhil.commissioning.realtime import before_other_work
 
     records = valid_records(machine)
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
     with ExitStack() as held, _raised():
         for name in dict.fromkeys(axis.drive.bus for axis in machine.axis.values()):
             held.enter_context(lock_place(machine.bus[name], "set-points"))
-        _quiet()
+        held.enter_context(before_other_work())
         bench = held.enter_context(on_bench(plan, _say))
         bench.compare(records)
         here = bench.here()
@@ -136,18 +135,6 @@ def _tell_guard(machine: MachineConfig, records: Mapping[str, CommissioningRecor
 def _say(text: str) -> None:
     if sys.stderr.isatty():
         click.echo(text, err=True)
-
-
-def _quiet() -> None:
-    """What is there now stays: no collector looks at it between two SYNCs. No other work comes before them."""
-    import gc
-
-    from fdhil.commissioning.realtime import BESIDE, lock_memory, prioritise
-
-    gc.collect()
-    gc.freeze()
-    lock_memory()
-    prioritise(BESIDE)
 
 
 @contextmanager

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import gc
 import os
+import sys
+from collections.abc import Iterator
 
 CYCLE = 50  # as the interrupt threads of a real-time kernel have it, above all ordinary work
 BESIDE = 45  # the other threads of its process: the cycle waits for one that holds the interpreter and may not run
+SWITCH_INTERVAL_S = 0.0002  # the cycle must not wait 5 ms for a thread that only looks on
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 
 
@@ -19,7 +23,24 @@ def prioritise(priority: int) -> str:
     return "SCHED_OTHER"
 
 
-def lock_memory() -> bool:
-    """Keep the process' memory, also what it will have, from being paged out; whether the kernel does."""
-    libc = ctypes.CDLL(None, use_errno=True)
-    return bool(libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) == 0)
+@contextlib.contextmanager
+def before_other_work() -> Iterator[None]:
+    """For as long as it lasts nothing waits that need not: not for other processes, memory, or the collector.
+
+    What is there now stays in memory and is not looked at by the collector; threads that are started have a real-time
+    priority, and get the interpreter soon.
+    """
+    libc, interval_s = ctypes.CDLL(None, use_errno=True), sys.getswitchinterval()
+    policy, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
+    gc.collect()
+    gc.freeze()
+    libc.mlockall(_MCL_CURRENT | _MCL_FUTURE)
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    prioritise(BESIDE)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, policy, parameter)
+        sys.setswitchinterval(interval_s)
+        libc.munlockall()

@@ -18,6 +18,7 @@ from fdhil.config import Axis
 from fdhil.records import Float
 
 ROUNDING = 2.0  # increments: what a demand that was rounded to increments adds to its second difference
+AGE_CYCLES = 4  # a position is so many SYNCs old at most, its sampling and the loop's own lag included
 Row = Sequence[float]
 
 
@@ -80,7 +81,9 @@ class SetPoints:
         self._before = self._last
         self._rows: Iterator[Row] | None = None
         self._brake: Iterator[tuple[float, ...]] | None = None
-        self._sent = [deque([at], maxlen=of.delay_cycles + 2) for at, of in zip(self._last, bounds, strict=True)]
+        self._sent = [
+            deque([at], maxlen=of.delay_cycles + AGE_CYCLES) for at, of in zip(self._last, bounds, strict=True)
+        ]
 
     @property
     def resting(self) -> bool:

@@ -12,7 +12,7 @@ from fdhil.arming import passes
 from fdhil.arming.standstill import Standstill
 from fdhil.config import MachineConfig
 from fdhil.config.controller import Correction as Learning
-from fdhil.records import Correction
+from fdhil.records import Correction, MoveKind, NcState
 from tests.arming.mill import Mill
 from tests.arming.test_ahead import opened
 from tests.arming.test_passes import heard, measured
@@ -42,25 +42,35 @@ async def test_the_next_pass_carries_what_the_last_one_taught(
     offsets, warnings = [], []
     async with opened(config, mill) as shop:
         for number, (demand, cause) in enumerate(
-            [(slower, "Finished"), (reference.position_mm, "Disarmed"), (reference.position_mm, "Finished")], 1
+            [
+                (slower, "Finished"),
+                (reference.position_mm, "Disarmed"),
+                (reference.position_mm, "Finished"),
+                (reference.position_mm, "Finished"),
+            ],
+            1,
         ):
             answer = await shop.arm(program)
             assert answer["ok"], answer
             warnings.append(answer["warnings"])
             offsets.append(np.array([row[2:] for row in mill.rows]))
+            shop.desk.hear_nc(NcState(0, 0, MoveKind.FEED, 3, feed_override=0.8 if number == 3 else 1.0))
             for block in heard(demand, off if demand is not slower else demand):
                 shop.desk.hear(block)
             mill.state, mill.cause = "OFF", cause
             await shop.until(partial(measured, shop.desk, number))
         answer = await shop.arm(program)
         learned = np.array([row[2:] for row in mill.rows])
-    assert [told.get("learned") is not None for told in shop.desk.passes] == [False, False, True]
+    assert [told.get("learned") is not None for told in shop.desk.passes] == [False, False, False, True]
+    assert shop.desk.passes[2]["text"].endswith(
+        "the NC's override was 80 % in line 3: nothing is learned from this pass"
+    )
     assert shop.desk.passes[-1]["learned"]["passes"] == 1
     # the first arming did not know yet at which current the axes stand
-    assert np.array_equal(offsets[1], offsets[2]), "a disturbed pass has taught something"
+    assert np.array_equal(offsets[1], offsets[3]), "a disturbed pass has taught something"
     assert not any("Learned" in text for told in warnings for text in told)
     assert any("Learned: what 1 passes taught is added" in text for text in answer["warnings"])
-    added_mm = (learned - offsets[2])[: wave.size, 0] * config.axis["X"].screw_pitch_mm / 65536
+    added_mm = (learned - offsets[3])[: wave.size, 0] * config.axis["X"].screw_pitch_mm / 65536
     assert np.corrcoef(added_mm, -wave)[0, 1] > 0.95
-    assert not np.array_equal(learned[:, 0], offsets[2][:, 0])
-    assert np.abs((learned - offsets[2])[:, 1]).max() <= 2, "Y had nothing to learn"
+    assert not np.array_equal(learned[:, 0], offsets[3][:, 0])
+    assert np.abs((learned - offsets[3])[:, 1]).max() <= 2, "Y had nothing to learn"

@@ -27,7 +27,7 @@ SHIPPED = ROOT / "configs" / "paper.toml"
 
 
 def claim(trials: Sequence[Trial]) -> Claim:
-    return Claim("figure-0", "figure", "Figure 0", "It is so.", "1 mm", "at most 1", trials)
+    return Claim("figure-0", "a figure", "figure", "Figure 0", "It is so.", "1 mm", "at most 1", trials)
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from fdhil.errors import RecordingError, StoreError
-from fdhil.records import Stages, Window, frozen
+from fdhil.records import NcMove, Stages, Window, frozen
 from fdhil.store.windows import RawScale, WindowStore, decode_window, encode_window, list_windows, read_window
 from tests.store.made import INCREMENTS_PER_MM, same, window
 
@@ -45,6 +45,8 @@ def test_a_window_comes_back_bit_by_bit(raw: bool, scales: Any) -> None:
         {"voltage_v": None, "voltage_delay_s": None, "temperature_c": None},
         {"stages": Stages(None, None, None), "gaps": (), "direction": -1, "voltage_sampling": "instant"},
         {"table_mm": frozen(np.r_[np.nan, np.linspace(0.0, 1.0, 599)]), "table_m_s2": frozen(np.full(600, -0.1))},
+        {"nc": NcMove(12, "part.ngc", (0.5, 1.0), True)},
+        {"nc": NcMove()},
         {"source": 'umlaut ä "quoted" \x1b[31m', "start_tick": 2**40},
     ],
 )

@@ -11,7 +11,7 @@ import pytest
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows, moving_range
 from fdhil.pipeline import analyse
-from fdhil.records import WindowOutcome
+from fdhil.records import NcMove, WindowOutcome
 from fdhil.validation import Evidence
 from fdhil.validation.interruptions import interruptions
 from studies import drives, faults
@@ -76,6 +76,22 @@ def test_an_override_that_changes_on_the_way_is_refused_with_the_speed(rate: obj
     (reason,) = _reasons(_rows(drives.rates(MOVE, rate)))
     assert reason.startswith("EpisodeAborted: ")
     assert words in reason
+
+
+@pytest.mark.parametrize(
+    ("nc", "words"),
+    [
+        (NcMove(12, "part.ngc", (0.5, 0.5), False), "the NC says that its override was 50 % in line 12"),
+        (NcMove(12, "part.ngc", (0.5, 1.0), False), "the NC says that its override was 50 to 100 % in line 12"),
+        (NcMove(None, None, None, True), "the NC says that its feed was held"),
+    ],
+)
+def test_what_the_nc_says_was_no_rapid_as_planned_is_refused(nc: NcMove, words: str) -> None:
+    (outcome,) = _judged(_rows(drives.rates(MOVE)))
+    evidence = Evidence(replace(outcome.window, nc=nc), Identification())
+    assert [str(reason) for reason in interruptions(evidence)] == [f"EpisodeAborted: {words}"]
+    good = Evidence(replace(outcome.window, nc=NcMove(12, "part.ngc", (1.0, 1.0), False)), Identification())
+    assert list(interruptions(good)) == []
 
 
 @pytest.mark.fault("C7")

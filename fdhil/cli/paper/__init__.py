@@ -54,7 +54,7 @@ def paper(out: Path, runs: int, as_json: bool) -> int:
 
 def gather(runs: int, say: Callable[[str], object]) -> list[Claim]:
     """Put all claims to their trials, in the order of the paper; ``say`` hears what is being done."""
-    from fdhil.cli.paper import correcting, estimating, measuring, predicting
+    from fdhil.cli.paper import concluding, correcting, estimating, measuring, predicting
 
     say(f"identifying one rapid {runs} times by every method")
     found = estimating.claims(runs)
@@ -63,7 +63,8 @@ def gather(runs: int, say: Callable[[str], object]) -> list[Claim]:
     say("cutting the path in every scenario")
     structure, *predicted = predicting.claims()
     say("correcting it")
-    return [structure, *found, *predicted, *correcting.claims(predicted)]
+    corrected = correcting.claims()
+    return [structure, *found, *predicted, *corrected, *concluding.claims([*predicted, *corrected])]
 
 
 def _make(out: Path) -> None:

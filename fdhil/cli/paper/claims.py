@@ -65,6 +65,7 @@ class Claim:
     """
 
     key: str
+    title: str
     kind: str
     source: str
     says: str

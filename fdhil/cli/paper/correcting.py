@@ -1,9 +1,6 @@
-"""Section 6 of the paper and its conclusion: equations [9] and [11], figures 16 to 20, and what was left to study."""
+"""Section 6 of the paper: equations [9] and [11], the mirror, and figures 16 to 20."""
 
 from __future__ import annotations
-
-import time
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -12,10 +9,7 @@ from fdhil.cli.paper.claims import Claim, Picture, Trial
 from fdhil.cli.paper.drawings import Traced, View
 from fdhil.cli.paper.paths import CORNERS, PLACES
 from fdhil.cli.paper.predicting import FEW_UM, linear_response
-from fdhil.cli.paper.scenarios import DEMANDED, PATHS, machine
-from fdhil.correction import flatness
-from fdhil.prediction import predict
-from fdhil.prediction.models import nominal_models
+from fdhil.cli.paper.scenarios import DEMANDED, PATHS
 from fdhil.records import Float, Prediction, rms
 from fdhil.report import Table
 
@@ -25,9 +19,9 @@ ROUNDED_END = (20.0, 75.0)  # of the arc at A, on the cutter's path
 AROUND_MM = 20.0
 
 
-def claims(others: Sequence[Claim]) -> list[Claim]:
-    """Return the claims of section 6; of ``others`` those on the path are counted with them."""
-    found = [
+def claims() -> list[Claim]:
+    """Return the claims of section 6."""
+    return [
         _linear(),
         _ideal(),
         _mirror(),
@@ -39,11 +33,7 @@ def claims(others: Sequence[Claim]) -> list[Claim]:
         _cutter_path(),
         _rounded(oscillation=False),
         _rounded(oscillation=True),
-        _flat(),
-        _stop(),
-        _on_line(),
     ]
-    return [*found, _all_at_once([*others, *found])]
 
 
 def _linear() -> Claim:
@@ -56,7 +46,8 @@ def _linear() -> Claim:
         missed = max(100.0 * rms(2.0 * half[axis] - full[axis]) / rms(full[axis]) for axis in whole)
         trials.append(Trial(name, "twice the answer to half an offset, less that to all of it", missed, "%", most=5.0))
     return Claim(
-        key="equation-9", kind="equation", source="Equation [9], section 6",
+        key="equation-9", title="the drive is a transfer function",
+        kind="equation", source="Equation [9], section 6",
         says="The predicted positions follow from the reference by a transfer function: pp = Hr pr.",
         paper="no figures are given",
         rule="half an offset moves the table half as far, to 5 % (RMS)",
@@ -72,7 +63,8 @@ def _ideal() -> Claim:
         before, after = (paths.rms_um(name, a) for a in (paths.predicted(name), paths.corrected(name, "inverse")))
         trials.append(Trial(name, "RMS left of the error", 100.0 * after / before, "%", most=10.0))
     return Claim(
-        key="equation-11", kind="equation", source="Equation [11], section 6",
+        key="equation-11", title="the ideal correction",
+        kind="equation", source="Equation [11], section 6",
         says="pr = Hr (pr - Hr^-1 e): with the inverse of Hr the table would follow the reference; it cannot be easily "
              "calculated.",
         paper="not tried",
@@ -110,7 +102,8 @@ def _mirror() -> Claim:
                 }, "Y less reference (um)"),
             ))  # fmt: skip
     return Claim(
-        key="figure-16", kind="figure", source="Figure 16, section 6",
+        key="figure-16", title="the mirror makes the error smaller",
+        kind="figure", source="Figure 16, section 6",
         says="With Hr^-1 ~ 1 the correction becomes a mirror: the predicted errors are subtracted from the reference.",
         paper="a scheme; \"quite good results for smooth trajectories\"",
         rule="the mirror makes the contour error of the whole path smaller (RMS)",
@@ -171,7 +164,8 @@ def _oscillates() -> Claim:
                 _three(name, View((0.0, 25.0), 55.0, 4.0)),
             ))  # fmt: skip
     return Claim(
-        key="figure-17", kind="figure", source="Figure 17, section 6",
+        key="figure-17", title="the mirror oscillates at A",
+        kind="figure", source="Figure 17, section 6",
         says="With the mirror the position oscillates around the desired path in A.",
         paper="Y 54.4 to 55.4 mm behind A: 0.6 mm at most",
         rule="behind A the error in Y changes sides twice or more with the mirror, and more often than without",
@@ -188,7 +182,8 @@ def _worse() -> Claim:
             ratio = paths.largest_um(name, after, place) / paths.largest_um(name, before, place)
             trials.append(Trial(name, f"largest error at {place}, with over without", ratio, "x", least=1.0))
     return Claim(
-        key="figure-17-worse", kind="figure", source="Figure 17, section 6",
+        key="figure-17-worse", title="the mirror is worse in corners",
+        kind="figure", source="Figure 17, section 6",
         says="In the areas A, C, E and G the correction generates more inaccuracy on the followed shape.",
         paper="0.6 mm at most with, 0.15 to 0.2 mm without (Figure 11)",
         rule="the largest error near each of the four is larger with the mirror than without",
@@ -208,7 +203,8 @@ def _straight(place: str, key: str, source: str) -> Claim:
                 _three(name, View((30.0, 75.0), 55.0, 1.0, fine=True)),
             ))  # fmt: skip
     return Claim(
-        key=key, kind="figure" if place == "B" else "claim", source=source,
+        key=key, title=f"the mirror on the straight at {place}",
+        kind="figure" if place == "B" else "claim", source=source,
         says=f"With the mirror the obtained path is only few micrometres from the desired one in {place}.",
         paper="a few um" + ("; Y 54.996 to 55.001 mm" if place == "B" else ""),
         rule=f"at most {FEW_UM:g} um within 10 mm of {place}",
@@ -228,7 +224,8 @@ def _arc() -> Claim:
             Trial(name, "with over without", after / before, "x", most=1.0),
         ]
     return Claim(
-        key="claim-d", kind="claim", source="Section 6",
+        key="claim-d", title="the mirror in the arc at D",
+        kind="claim", source="Section 6",
         says="In D the difference between obtained and desired path is 0.07 mm, compared to 0.08 mm and 0.13 mm.",
         paper="80 and 130 um without, 70 um with the mirror",
         rule="60 to 150 um without, 50 to 90 um with, and less with than without, 10 m/min",
@@ -246,7 +243,8 @@ def _cutter_path() -> Claim:
         worst = float(np.abs(np.array(gaps) - CUTTER_MM).max())
         trials.append(Trial(name, "farthest from 20 mm beside the shape", worst, "mm", most=0.1))
     return Claim(
-        key="figure-19", kind="figure", source="Figure 19, section 6",
+        key="figure-19", title="the path of the cutter",
+        kind="figure", source="Figure 19, section 6",
         says="The path of the centre of a 40 mm cutter round the shape, with arcs of 20 mm at A, C and E.",
         paper="a figure",
         rule="the demand runs 20 mm beside the shape, to 0.1 mm",
@@ -286,7 +284,9 @@ def _rounded(oscillation: bool) -> Claim:
                 _three(name, View((5.0, 45.0), 75.0, 4.0), "rounded"),
             ))  # fmt: skip
     return Claim(
-        key="figure-20-oscillation" if oscillation else "figure-20", kind="figure", source="Figure 20, section 6",
+        key="figure-20-oscillation" if oscillation else "figure-20",
+        title="oscillation on the rounded path" if oscillation else "mean error on the rounded path",
+        kind="figure", source="Figure 20, section 6",
         says="On the rounded path the oscillations with the correction are more important." if oscillation else
              "On the rounded path the mean trajectory with the correction is far better than without.",
         paper="Y 74.6 to 75.3 mm, on both sides of 75 with the correction",
@@ -294,93 +294,3 @@ def _rounded(oscillation: bool) -> Claim:
              else "within 20 mm of the arc's end the mean error is at least halved",
         trials=trials, pictures=pictures,
     )  # fmt: skip
-
-
-def _flat() -> Claim:
-    trials = []
-    for name in DEMANDED:
-        mirror, flat = (paths.rms_um(name, paths.corrected(name, method)) for method in ("mirror", "flatness"))
-        trials.append(Trial(name, "RMS error of the mirror over that of flatness", mirror / flat, "x", least=2.0))
-    return Claim(
-        key="conclusion-flat", kind="claim", source="Conclusion, after [ROT 99]",
-        says="Flat systems could provide interesting performances; the oscillations are to be reduced.",
-        paper="not tried",
-        rule="a feed-forward by flatness leaves at most half of what the mirror leaves (RMS)",
-        trials=trials,
-        note="After a sharp corner the drive is at its limits, and nothing helps but a lower feed or a smoother NC.",
-    )  # fmt: skip
-
-
-def _stop() -> Claim:
-    trials = []
-    for name in DEMANDED:
-        reference, config = paths.reference(name), machine(name)
-        models = nominal_models(config)
-        seconds = min(_seconds(lambda: predict(reference, models, config)) for _ in range(3))  # noqa: B023
-        share = 100.0 * seconds / float(reference.time_s[-1])
-        trials.append(Trial(name, "time to predict, of the time to cut", share, "%", least=100.0))
-    return Claim(
-        key="conclusion-stop", kind="claim", source="Conclusion",
-        says="The calculus of the predicted errors requires to stop the operation for a while.",
-        paper="no figures are given (1999)",
-        rule="to predict takes longer than to cut",
-        trials=trials,
-        note="Measured on this computer. The claim was true of its time.",
-    )  # fmt: skip
-
-
-def _seconds(work: object) -> float:
-    assert callable(work)
-    begin = time.perf_counter()
-    work()
-    return time.perf_counter() - begin
-
-
-def _on_line() -> Claim:
-    trials = []
-    for name in DEMANDED:
-        config, reference = machine(name), paths.reference(name)
-        model, axis = nominal_models(config)["X"], config.axis["X"]
-        known = np.asarray(reference.position_mm["X"])
-        middle = known.size // 2
-        whole, part = (flatness.offsets(p, model, axis, reference.dt_s) for p in (known, known[:middle]))
-        same = [np.flatnonzero(a[:middle] != b) for a, b in zip(whole, part, strict=True)]
-        first = min((int(rows[0]) for rows in same if rows.size), default=middle)
-        seconds = (middle - first) * reference.dt_s
-        trials.append(Trial(name, "look-ahead of the feed-forward", 1e3 * seconds, "ms", most=100.0))
-    return Claim(
-        key="conclusion-on-line", kind="claim", source="Conclusion",
-        says="To avoid the stop, an on-line technique is to be studied.",
-        paper="not tried",
-        rule="a correction by flatness knows at most 0.1 s of the path ahead",
-        trials=trials,
-    )  # fmt: skip
-
-
-def _all_at_once(found: Sequence[Claim]) -> Claim:
-    """Count what each scenario shows of all that the paper saw on its path."""
-    saw = [claim for claim in found if claim.key in SEEN]
-    assert len(saw) == len(SEEN)
-    trials = [
-        Trial(name, "shown of what the paper saw", float(sum(claim.shown_by(name) for claim in saw)),
-              f"of {len(saw)}", least=float(len(saw)))
-        for name in DEMANDED
-    ]  # fmt: skip
-    rows = [
-        [name, *("yes" if claim.shown_by(name) else "no" for claim in saw), str(sum(c.shown_by(name) for c in saw))]
-        for name in DEMANDED
-    ]
-    return Claim(
-        key="all-at-once",
-        kind="claim",
-        source="Sections 5.3 and 6 together",
-        says="One machine showed all of the path's figures.",
-        paper="one simulator",
-        rule="one scenario shows them all",
-        trials=trials,
-        tables=[Table(("scenario", *(claim.key for claim in saw), "shown"), rows)],
-    )
-
-
-SEEN = ("figure-11", "figure-11-size", "figure-12", "figure-13", "figure-14", "figure-15", "figure-17",
-        "figure-17-worse", "figure-18", "claim-d", "claim-f", "figure-20", "figure-20-oscillation")  # fmt: skip

@@ -98,7 +98,8 @@ def _constant() -> Claim:
         last = vector(bench.plant(celsius=float(celsius)))[4:] @ [RAPID_RAD_S, 1.0]
         trials.append(Trial(name, "change of the friction at 60 rad/s", 100.0 * float(1 - last / first), "%", most=5.0))
     return Claim(
-        key="claim-constant", kind="claim", source="Section 2.1",
+        key="claim-constant", title="parameters are constant during a cut",
+        kind="claim", source="Section 2.1",
         says="The drifts are not significant at the time scale of a machining operation: the parameters are constant "
              "during a whole cutting operation.",
         paper="2 K of the slide-ways; the time they took is not given",
@@ -121,7 +122,8 @@ def _architecture() -> Claim:
     ]
     reasons = [[name, outcome.verdict.reasons[0].text] for name, outcome in told if outcome.verdict.reasons]
     return Claim(
-        key="figure-2", kind="figure", source="Figure 2 and section 3.2",
+        key="figure-2", title="the architecture tells sound from unsound",
+        kind="figure", source="Figure 2 and section 3.2",
         says="Measurements are filtered and stored, the parameters estimated, the model simulated with the measured "
              "input and compared; a mismatch (backlash) means that the parameters are not validated.",
         paper="a scheme",
@@ -161,7 +163,8 @@ def _whiteness() -> Claim:
             trials.append(Trial(name, what, worst, "", **bounds))
             curves[f"{name}, {label}"] = found
     return Claim(
-        key="claim-whiteness", kind="claim", source="Section 3.2",
+        key="claim-whiteness", title="the whiteness test tells a wrong model",
+        kind="claim", source="Section 3.2",
         says="Statistical tests like the whiteness test, used for the least square estimator, can be adopted to detect "
              "whether the model behaves like the system.",
         paper="no figures are given",
@@ -184,7 +187,8 @@ def _backlash() -> Claim:
         trials.append(Trial(name, "dead band found over the true one", found / true, "x", least=0.8, most=1.2))
         rows.append([f"{true:g}", f"{found:.1f}", f"{std:.1f}"])
     return Claim(
-        key="claim-backlash", kind="claim", source="Section 3.2",
+        key="claim-backlash", title="backlash from speed and table position",
+        kind="claim", source="Section 3.2",
         says="Backlash is easily detected by measuring the motor's speed and the position of the table.",
         paper="after [POD 97]; no figures are given",
         rule="the dead band is found to 20 %, from the integral of the speed before the table follows",
@@ -206,7 +210,8 @@ def _signals() -> Claim:
             Trial(name, "largest current", float(np.abs(window.current_a).max()), "A", 10.0, 25.0),
         ]
     return Claim(
-        key="figure-4", kind="figure", source="Figure 4, section 4",
+        key="figure-4", title="signals of a rapid",
+        kind="figure", source="Figure 4, section 4",
         says="Speed, current and tension of a rapid as the NC measured them.",
         paper="60 rad/s; the axis ends at 70, speed on top, then tension, then current; 3.5 s",
         rule="60 rad/s within 5, voltage and current of that order",
@@ -230,7 +235,8 @@ def _torques() -> Claim:
         trials.append(Trial("noise-0.1", f"largest torque at {celsius:g} degC", peak, "N.m", 10.0, 14.0))
     trials.append(Trial("noise-0.1", "torque of the cruise, cold less warm", cruise[0] - cruise[1], "N.m", 0.3, 0.8))
     return Claim(
-        key="figure-5", kind="figure", source="Figure 5, section 4",
+        key="figure-5", title="estimated torque, cold and warm",
+        kind="figure", source="Figure 5, section 4",
         says="The estimated torque of a rapid at 20 degC is above that at 22 degC.",
         paper="12 to 13 N.m while it accelerates; the axis ends at 14; about half a N.m apart",
         rule="10 to 14 N.m at most; 0.3 to 0.8 N.m less in the cruise when warm",
@@ -259,12 +265,13 @@ def _drifted(
         for celsius, value, std in zip(*drift.series(symbol), strict=True)
     ]
     return Claim(
-        key=f"figure-{number}", kind="figure", source=f"Figure {number}, section 4",
+        key=f"figure-{number}", title=f"{symbol} falls as the slide-ways warm",
+        kind="figure", source=f"Figure {number}, section 4",
         says=f"{symbol} falls as the slide-ways warm from 20 to 22 degC.",
         paper=f"{printed[0]:g} to {printed[1]:g} {UNITS[symbol]}",
         rule="a fall as printed is beyond chance (1.96 standard deviations); the one that is found is it within three",
         trials=trials,
-        tables=[Table(("scenario", "°C", f"{symbol} {UNITS[symbol]}", "± 95 %"), rows)],
+        tables=[Table(("scenario", "°C", f"{symbol} {UNITS[symbol]}", "± 95 %"), rows, folded="The values")],
         pictures=[
             Picture(
                 f"{symbol} against the slide-ways' temperature, maximum likelihood, bars of 95 %; the line is the "
@@ -307,7 +314,8 @@ def _behaviour() -> Claim:
                 ),
             ))  # fmt: skip
     return Claim(
-        key="figure-8", kind="figure", source="Figure 8, section 4",
+        key="figure-8", title="the model answers as the drive does",
+        kind="figure", source="Figure 8, section 4",
         says="No difference between the behaviours of the feed-drive and of its model has been observed: the model is "
              "valid.",
         paper="no difference to be seen",

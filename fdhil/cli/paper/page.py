@@ -18,7 +18,7 @@ CITATION = (
     'X. Desforges, A. Habbadi, G. Dessein, "Trajectory shortcoming prediction from physical parameter estimation"'
 )
 SHOWN, NOT_SHOWN = "✓", "✗"
-SUMMARY_HEAD = ("claim", "place in the paper", "verdict", "shown in")
+SUMMARY_HEAD = ("claim", "verdict", "shown by", "place in the paper")
 
 
 def counts(claims: Sequence[Claim]) -> dict[str, int]:
@@ -29,7 +29,7 @@ def counts(claims: Sequence[Claim]) -> dict[str, int]:
 
 def summary_rows(claims: Sequence[Claim]) -> list[list[str]]:
     """Return one row per claim for ``SUMMARY_HEAD``."""
-    return [[claim.key, claim.source, claim.verdict.value, _shown(claim)] for claim in claims]
+    return [[claim.title, claim.verdict.value, _shown(claim), claim.source] for claim in claims]
 
 
 def _shown(claim: Claim) -> str:
@@ -52,7 +52,8 @@ def _verdicts(claims: Sequence[Claim]) -> Section:
         "Verdicts",
         "A trial is a number that has to lie within bounds in a scenario. A claim holds where all its scenarios show "
         "it, with a condition where some do, and is not reproduced where none does. Nothing but this rule decides. "
-        "The safety ceiling of offsets on a machine does not apply: nothing here moves.",
+        "The safety ceiling of offsets on a machine does not apply: nothing here moves. Figures 1 and 2 are schemes "
+        "and Figure 3 is a photograph; the paper has no tables.",
         tables=[Table(SUMMARY_HEAD, summary_rows(claims))],
     )
 
@@ -60,14 +61,14 @@ def _verdicts(claims: Sequence[Claim]) -> Section:
 def _section(claim: Claim) -> Section:
     condition = f": {claim.condition}" if claim.condition else ""
     parts = [
-        claim.says,
+        f"{claim.source}: {claim.says}",
         f"The paper's value: {claim.paper}.",
         f"Rule: {claim.rule}.",
         f"Verdict: {claim.verdict.value}{condition}.",
         claim.note,
     ]
     return Section(
-        f"{claim.source} ({claim.key}): {claim.verdict.value}",
+        f"{claim.title[0].upper()}{claim.title[1:]}: {claim.verdict.value}",
         " ".join(part for part in parts if part),
         tables=[_trials(claim), *claim.tables],
         figures=[(picture.caption, picture.svg) for picture in claim.pictures],
@@ -80,7 +81,7 @@ def _trials(claim: Claim) -> Table:
     cells = {(trial.scenario, trial.what): cell(trial) for trial in claim.trials}
     head = ["scenario", *(f"{what}{f', {unit}' * bool(unit)} ({bounds})" for what, unit, bounds in columns)]
     rows = [[scenario, *(cells.get((scenario, what), "") for what, _, _ in columns)] for scenario in claim.scenarios]
-    if len(columns) > 4:  # a long table is read more easily than a wide one
+    if len(columns) > 4 or (len(columns) > 1 and len(claim.scenarios) < 7):  # heads are longer than scenarios
         head = ["measured", *claim.scenarios]
         rows = [
             [f"{what}{f', {unit}' * bool(unit)} ({bounds})", *(cells.get((s, what), "") for s in claim.scenarios)]
@@ -132,6 +133,7 @@ def document(claims: Sequence[Claim], runs: int, version: str, files: Mapping[st
 def _claim(claim: Claim, files: Sequence[str]) -> dict[str, Any]:
     return {
         "key": claim.key,
+        "title": claim.title,
         "kind": claim.kind,
         "source": claim.source,
         "says": claim.says,

@@ -54,7 +54,8 @@ def _structure() -> Claim:
         missed = np.abs(paths.measured_mm(name) - paths.path_mm(paths.predicted(name))).max()
         trials.append(Trial(name, "largest difference of the two", 1e3 * float(missed), "um", most=5.0))
     return Claim(
-        key="equation-1-2", kind="equation", source="Equations [1] and [2], Figure 1, section 1",
+        key="equation-1-2", title="the model of a feed drive",
+        kind="equation", source="Equations [1] and [2], Figure 1, section 1",
         says="u - K w = L di/dt + R i; K i - Tl = Jt dw/dt + ft w + Cd sign(w); with position, speed and current "
              "regulators they are the model of a feed-drive.",
         paper="a scheme",
@@ -73,7 +74,8 @@ def _abrupt() -> Claim:
         trials.append(Trial(name, "least of A, C, E, G over the largest of B, D, F", ratio, "x", least=2.0))
         rows.append([name, *(f"{found[place]:.0f}" for place in PLACES)])
     return Claim(
-        key="claim-abrupt", kind="claim", source="Section 5.1",
+        key="claim-abrupt", title="errors arise at abrupt changes",
+        kind="claim", source="Section 5.1",
         says="Path shortcomings become significant where abrupt changes of direction or interpolation happen.",
         paper="no figures are given",
         rule="within 10 mm of each corner the error is at least twice that on straights and arc, 10 m/min",
@@ -92,7 +94,8 @@ def _feed_down() -> Claim:
             Trial(name, "time at 10 over that at 20 m/min", float(times[0] / times[1]), "x", least=1.5),
         ]
     return Claim(
-        key="claim-feed", kind="claim", source="Section 5.1 and conclusion",
+        key="claim-feed", title="a lower feed errs less and takes longer",
+        kind="claim", source="Section 5.1 and conclusion",
         says="If the feed rate is reduced the shortcomings decrease, and the manufacturing time increases.",
         paper="no figures are given",
         rule="the RMS error grows and the time shrinks from 10 to 20 m/min",
@@ -125,7 +128,8 @@ def _prediction() -> Claim:
                                  [("machine", measured), ("predicted", told)]),
             ))  # fmt: skip
     return Claim(
-        key="figure-9", kind="figure", source="Figure 9 and equation [10], section 5.2",
+        key="figure-9", title="the shortcomings are predicted",
+        kind="figure", source="Figure 9 and equation [10], section 5.2",
         says="Parameters from rapids, put into the closed loops and run along the reference, predict the shortcomings "
              "e = pp - pr before the cut.",
         paper="a scheme",
@@ -145,7 +149,8 @@ def _cutting() -> Claim:
         moved = bench.run(axis, config.machine.sync_period_s, true, demand, load).table_mm - free
         trials.append(Trial(name, "table moved by the force", 1e3 * float(np.abs(moved).max()), "um", most=FEW_UM))
     return Claim(
-        key="claim-cutting", kind="claim", source="Section 5.2",
+        key="claim-cutting", title="cutting forces can be neglected",
+        kind="claim", source="Section 5.2",
         says="The effect of the cutting forces of high-speed machining of aluminium and of finishing can be neglected: "
              "Tl = 0.",
         paper="no figures are given",
@@ -164,7 +169,8 @@ def _path() -> Claim:
         trials.append(Trial(name, "farthest of the places from the demand", missed, "mm", most=0.1))
     desired = paths.desired_mm("sharp-lag")
     return Claim(
-        key="figure-10", kind="figure", source="Figure 10, section 5.3",
+        key="figure-10", title="the programmed path",
+        kind="figure", source="Figure 10, section 5.3",
         says="The tool is asked to follow this planar path, with areas A to G.",
         paper="(0, 0), A (0, 55), C (100, 55), arc through D, E (200, 55), G (250, 55), (250, 0) mm",
         rule="the NC's demand at 10 m/min comes within 0.1 mm of each place",
@@ -197,7 +203,8 @@ def _feeds(place: str, number: int, little: bool) -> Claim:
         ))  # fmt: skip
     ratios = [trial.value for trial in trials]
     return Claim(
-        key=f"figure-{number}", kind="figure", source=f"Figure {number}, section 5.3",
+        key=f"figure-{number}", title=f"the feed matters {'little' if little else 'much'} at {place}",
+        kind="figure", source=f"Figure {number}, section 5.3",
         says=says,
         paper="two curves of like size" if little else "the faster one clearly farther off",
         rule=f"the largest error grows by {'less' if little else 'more'} than a quarter from 10 to 20 m/min",
@@ -220,7 +227,8 @@ def _size() -> Claim:
         for name in PATHS
     ]
     return Claim(
-        key="figure-11-size", kind="figure", source="Figure 11, section 5.3",
+        key="figure-11-size", title="the size of the error at A",
+        kind="figure", source="Figure 11, section 5.3",
         says="Behind A the table runs over by 0.15 to 0.2 mm.",
         paper="Y 55.15 to 55.2 mm beside 55, read from the figure",
         rule="75 to 300 um",
@@ -260,7 +268,9 @@ def _drifted(number: int, changes: Sequence[tuple[str, float]], label: str) -> C
             drawings.place(traced, view("E", 5.0, 4.0), "distance (um)"),
         ))  # fmt: skip
     return Claim(
-        key=f"figure-{number}", kind="figure", source=f"Figure {number}, section 5.3",
+        key=f"figure-{number}",
+        title="an added mass moves the path" if mass else "friction's drift moves the path little",
+        kind="figure", source=f"Figure {number}, section 5.3",
         says="An added mass moves the path by more than 0.01 mm." if mass else
              "A drift of ft and Cd of one axis moves the path by a few micrometres only.",
         paper="more than 10 um at E" if mass else "a few um at E",
@@ -279,7 +289,8 @@ def _less_than_feed() -> Claim:
         )
         trials.append(Trial(name, "growth by the feed over the change by friction", feed / friction, "x", least=1.0))
     return Claim(
-        key="claim-drift-feed", kind="claim", source="Section 5.3",
+        key="claim-drift-feed", title="drifts matter less than the feed",
+        kind="claim", source="Section 5.3",
         says="The effects of those drifts are less important than those of the larger feed.",
         paper="no figures are given",
         rule="from 10 to 20 m/min the error at E grows by more than the drift of friction changes it",

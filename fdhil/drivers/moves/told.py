@@ -22,6 +22,7 @@ from fdhil.drivers.moves.stretches import Stretch, Stretches
 from fdhil.records import AxisSamples, MoveEvent, MoveKind, NcMove, NcState, TickTimes
 
 PATIENCE_S = 1.0  # beyond the NC's own silence, until a move of which it said nothing is UNKNOWN
+AFTER_HOLD_S = 0.25  # of standstill that a rapid needs: one that goes on sooner after a hold is none
 MOST_STATES = 20_000
 MOVING = (MoveKind.RAPID, MoveKind.FEED, MoveKind.ARC, MoveKind.UNKNOWN)
 NEXT = 1.5  # ticks between two states that are those of neighbouring cycles
@@ -46,6 +47,7 @@ class ToldG0:
         increment_mm = 1 / config.axis[axis].scaling.increments_per_mm
         period_s = config.machine.sync_period_s
         self._axis, self._source = axis, config.g0.source
+        self._after_hold = round(AFTER_HOLD_S / period_s)
         self._patience = round((config.nc_source.silence_s + PATIENCE_S) / period_s)
         self._clock = TickClock(period_s)
         self._alignment = DemandAlignment(axis, period_s, increment_mm)
@@ -116,7 +118,8 @@ class ToldG0:
         said = self._about(stretch)
         pieces = list(self._pieces(stretch, said))
         for (begin, kind), (end, _) in pairwise([*pieces, (stretch.end, MoveKind.REST)]):
-            told = _move(_of_a_piece(said, begin, end), begin, kind)
+            held = _held(_of_a_piece(said, begin - self._after_hold, end))
+            told = _move(_of_a_piece(said, begin, end), begin, kind, held)
             if kind is not self._kind:
                 yield MoveEvent(self._axis, kind, begin, self._source, told)
             self._kind = kind
@@ -127,7 +130,7 @@ class ToldG0:
     def _about(self, stretch: Stretch) -> list[Said]:
         """Return what the NC said in a stretch, and the last before it: that still held; older ones are forgotten."""
         placed = [found for found in map(self._where, self._said) if found is not None]
-        found = _of_a_piece(placed, stretch.begin, stretch.end)
+        found = _of_a_piece(placed, stretch.begin - self._after_hold, stretch.end)
         while found and self._said[0].state is not found[0].state:
             self._said.popleft()
         return found
@@ -155,17 +158,22 @@ def _of_a_piece(said: Sequence[Said], begin: int, end: int) -> list[Said]:
     return [*before[-1:], *(each for each in said if each.high >= begin and each.low <= end)]
 
 
-def _move(said: Sequence[Said], begin: int, kind: MoveKind) -> NcMove:
+def _held(said: Sequence[Said]) -> bool | None:
+    """Return whether a feed hold was on; None where that was not told."""
+    holds = [each.state.held for each in said if each.state.feed_hold is not None or each.state.held]
+    return any(holds) if holds else None
+
+
+def _move(said: Sequence[Said], begin: int, kind: MoveKind, held: bool | None) -> NcMove:
     """Return what was said of a move, all of it together; its line is the first that was said while it ran."""
     states = [each.state for each in said]
     own = [each.state for each in said if each.low > begin and each.state.motion is kind]
     overrides = [override for state in states if (override := _override(state, kind)) is not None]
-    holds = [state.held for state in states if state.feed_hold is not None or state.motion is MoveKind.HOLD]
     return NcMove(
         line=next((state.line for state in own if state.line is not None), None),
         program=next((state.program for state in own if state.program), None),
         override=(min(overrides), max(overrides)) if overrides else None,
-        held=any(holds) if holds else None,
+        held=held,
     )
 
 

@@ -9,18 +9,23 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Any, Self
 
 from fdhil.config import MachineConfig
+from fdhil.drivers.can.host_clock import DistantClock
 from fdhil.errors import ConnectError, DeviceError, ProtocolError
 from fdhil.records import MoveKind, NcState
 
 SCHEMA = "fdhil-linuxcnc-1"
 MOST_BYTES = 1 << 16
 CONNECT_S = 2.0
+HERE = ("127.0.0.1", "localhost", "::1")
+DISTANT_WINDOW_S = 60.0
+NETWORK_NS = 5_000_000  # by which the quickest line of a while may be late
 
 
 class LinuxCnc:
@@ -34,6 +39,8 @@ class LinuxCnc:
         self._reader: asyncio.StreamReader | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._period_s = 0.0
+        # another computer has a monotonic clock of its own
+        self._distant = None if settings.host in HERE else DistantClock(DISTANT_WINDOW_S)
         self._waiting: deque[bytes] = deque()  # lines
         self._rest = b""  # the beginning of a line
 
@@ -111,9 +118,13 @@ class LinuxCnc:
     def _state(self, told: Mapping[str, Any]) -> NcState:
         """Return the state that one line tells; ProtocolError."""
         try:
+            stamp_ns, error_ns = int(told["stamp_ns"]), int(told["error_ns"])
+            if self._distant is not None:
+                stamp_ns -= self._distant.ahead_ns(stamp_ns, time.monotonic_ns())
+                error_ns += NETWORK_NS
             return NcState(
-                stamp_ns=int(told["stamp_ns"]),
-                error_ns=int(told["error_ns"]),
+                stamp_ns=stamp_ns,
+                error_ns=error_ns,
                 motion=MoveKind(told["motion"]),
                 line=_maybe(told, "line", int),
                 programmed_feed_mm_min=_maybe(told, "programmed_feed_mm_min", _finite),

@@ -13,7 +13,7 @@ from fdhil.records import MoveKind, NcState, Notice
 
 BACK_OFF_S = (0.1, 5.0)
 CODE = "NcSilent"
-EFFECT = "which moves are rapids is not known meanwhile, and none is used"
+EFFECT = "Which moves are rapids is not known meanwhile, and none is used. It is tried again until it answers."
 
 
 class NcListener:
@@ -24,11 +24,6 @@ class NcListener:
         self._silence_s = config.nc_source.silence_s
         self._states = self._failures = 0
         self._silent = False
-
-    @property
-    def name(self) -> str:
-        """Which NC it is, for people."""
-        return self._source.name
 
     async def run(self, take: Callable[[NcState | Notice], None]) -> None:
         """Hand states over for ever; an NC that is not heard is UNKNOWN from then on, and told once."""
@@ -63,7 +58,7 @@ class NcListener:
         take(NcState(time.monotonic_ns(), 0, MoveKind.UNKNOWN))
         if not self._silent:
             self._silent = True
-            take(Notice(CODE, "MAJOR", f"{error}; {EFFECT}. It is tried again until it answers."))
+            take(Notice(CODE, "MAJOR", f"{error}{'' if str(error).endswith('?') else '.'} {EFFECT}"))
 
     def counters(self) -> dict[str, int]:
         """States that were told, and how often the NC was lost or not reached."""

@@ -168,6 +168,14 @@ def test_a_hold_and_an_override_within_the_move_are_told() -> None:
         assert (move.nc.override, move.nc.held) == (override, hold)
 
 
+def test_what_goes_on_after_a_hold_is_no_whole_rapid() -> None:
+    told = course(
+        [rest(300), rapid(200), Part(HOLD, 1, np.zeros(30)), rapid(200), rest(300), rapid(-400, 2), rest(400)]
+    )
+    rapids = [e.nc and e.nc.held for e in hear(told, exact(told, 0), 3) if e.kind is RAPID]
+    assert rapids == [False, True, False]
+
+
 def test_an_override_that_was_set_before_the_move_counts() -> None:
     told = course([rest(1000), rapid(400), rest(400)])
     states = [

@@ -1,0 +1,116 @@
+"""The paper's conclusion: what it left to study, what the calculus takes, and whether one machine shows it all."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+
+from fdhil.cli.paper import paths
+from fdhil.cli.paper.claims import Claim, Trial
+from fdhil.cli.paper.scenarios import DEMANDED, machine
+from fdhil.correction import flatness
+from fdhil.prediction import predict
+from fdhil.prediction.models import nominal_models
+from fdhil.records import Prediction
+from fdhil.report import Table
+
+SEEN = ("figure-11", "figure-11-size", "figure-12", "figure-13", "figure-14", "figure-15", "figure-17",
+        "figure-17-worse", "figure-18", "claim-d", "claim-f", "figure-20", "figure-20-oscillation")  # fmt: skip
+"""What the paper saw on its path."""
+
+
+def claims(others: Sequence[Claim]) -> list[Claim]:
+    """Return the claims of the conclusion; those of ``others`` that are on the path are counted."""
+    return [_flat(), _stop(), _on_line(), _all_at_once(others)]
+
+
+def _flat() -> Claim:
+    trials = []
+    for name in DEMANDED:
+        mirror, flat = (paths.rms_um(name, paths.corrected(name, method)) for method in ("mirror", "flatness"))
+        trials.append(Trial(name, "RMS error of the mirror over that of flatness", mirror / flat, "x", least=2.0))
+    return Claim(
+        key="conclusion-flat", title="flatness corrects better",
+        kind="claim", source="Conclusion, after [ROT 99]",
+        says="Flat systems could provide interesting performances; the oscillations are to be reduced.",
+        paper="not tried",
+        rule="a feed-forward by flatness leaves at most half of what the mirror leaves (RMS)",
+        trials=trials,
+        note="After a sharp corner the drive is at its limits, and nothing helps but a lower feed or a smoother NC.",
+    )  # fmt: skip
+
+
+def _stop() -> Claim:
+    trials = []
+    for name in DEMANDED:
+        reference, config = paths.reference(name), machine(name)
+        models = nominal_models(config)
+        seconds = min(_seconds(partial(predict, reference, models, config)) for _ in range(3))
+        share = 100.0 * seconds / float(reference.time_s[-1])
+        trials.append(Trial(name, "time to predict, of the time to cut", share, "%", least=100.0))
+    return Claim(
+        key="conclusion-stop", title="the calculus takes a stop",
+        kind="claim", source="Conclusion",
+        says="The calculus of the predicted errors requires to stop the operation for a while.",
+        paper="no figures are given (1999)",
+        rule="to predict takes longer than to cut",
+        trials=trials,
+        note="Measured on this computer. The claim was true of its time.",
+    )  # fmt: skip
+
+
+def _seconds(work: Callable[[], Prediction]) -> float:
+    begin = time.perf_counter()
+    work()
+    return time.perf_counter() - begin
+
+
+def _on_line() -> Claim:
+    trials = []
+    for name in DEMANDED:
+        config, reference = machine(name), paths.reference(name)
+        model, axis = nominal_models(config)["X"], config.axis["X"]
+        known = np.asarray(reference.position_mm["X"])
+        middle = known.size // 2
+        whole, part = (flatness.offsets(p, model, axis, reference.dt_s) for p in (known, known[:middle]))
+        same = [np.flatnonzero(a[:middle] != b) for a, b in zip(whole, part, strict=True)]
+        first = min((int(rows[0]) for rows in same if rows.size), default=middle)
+        seconds = (middle - first) * reference.dt_s
+        trials.append(Trial(name, "look-ahead of the feed-forward", 1e3 * seconds, "ms", most=100.0))
+    return Claim(
+        key="conclusion-on-line", title="an on-line technique",
+        kind="claim", source="Conclusion",
+        says="To avoid the stop, an on-line technique is to be studied.",
+        paper="not tried",
+        rule="a correction by flatness knows at most 0.1 s of the path ahead",
+        trials=trials,
+    )  # fmt: skip
+
+
+def _all_at_once(found: Sequence[Claim]) -> Claim:
+    """Count what each scenario shows of all that the paper saw on its path."""
+    saw = [claim for claim in found if claim.key in SEEN]
+    assert len(saw) == len(SEEN)
+    trials = [
+        Trial(name, "shown of what the paper saw", float(sum(claim.shown_by(name) for claim in saw)),
+              f"of {len(saw)}", least=float(len(saw)))
+        for name in DEMANDED
+    ]  # fmt: skip
+    rows = [
+        [name, *("yes" if claim.shown_by(name) else "no" for claim in saw), str(sum(c.shown_by(name) for c in saw))]
+        for name in DEMANDED
+    ]
+    return Claim(
+        key="all-at-once",
+        title="one machine shows it all",
+        kind="claim",
+        source="Sections 5.3 and 6 together",
+        says="One machine showed all of the path's figures.",
+        paper="one simulator",
+        rule="one scenario shows them all",
+        trials=trials,
+        tables=[Table(("scenario", *(claim.key for claim in saw), "shown"), rows)],
+    )

@@ -1,0 +1,91 @@
+"""The bridge without LinuxCNC: which cycles it tells, at what time, and that no listener can hold it up."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+
+from fdhil.bridges.linuxcnc import MOST_WAITING, NAME, Cycle, Listeners, Status, Teller
+
+MS = 1_000_000
+STATUS = Status(1.0, 1.0, False, 2, "part.ngc")
+
+
+def cycle(number: int, place: float, kind: int, line: int = 1, held: bool = False) -> Cycle:
+    return Cycle(number, (place, place, 0.0), kind, line, 10.0, 20.0, held)
+
+
+def told(cycles: Sequence[Cycle], status: Status = STATUS, axes: str = "XYZ", mm: float = 1.0) -> list[dict[str, Any]]:
+    teller = Teller(list(axes), mm, MS)
+    teller.clock(cycles[0].number, 1000 * MS)
+    return [state for each in cycles for state in teller.tell(each, status)]
+
+
+def test_each_change_is_told_with_the_cycle_before_it_and_a_few_between() -> None:
+    cycles = [cycle(k, 0.0, 0, 0) for k in range(10)] + [cycle(10 + k, k + 1.0, 1) for k in range(35)]
+    cycles += [cycle(45 + k, 36.0 + k, 3, 2) for k in range(5)]
+    states = [(state["cycle"], state["motion"], state["line"]) for state in told(cycles)]
+    assert states == [
+        (0, "rest", None), (9, "rest", None), (10, "rapid", 1), (20, "rapid", 1), (30, "rapid", 1), (40, "rapid", 1),
+        (44, "rapid", 1), (45, "arc", 2),
+    ]  # fmt: skip
+
+
+def test_a_pause_is_a_hold_once_it_stands_still() -> None:
+    cycles = [cycle(0, 0.0, 1), cycle(1, 1.0, 1, held=True), cycle(2, 1.0, 1, held=True)]
+    assert [(state["motion"], state["feed_hold"]) for state in told(cycles)] == [
+        ("rapid", False), ("rapid", True), ("hold", True),
+    ]  # fmt: skip
+    paused = told([cycle(0, 0.0, 2), cycle(1, 0.0, 2)], STATUS._replace(paused=True))
+    assert paused[-1]["motion"] == "hold"
+
+
+def test_a_motion_that_is_none_of_a_program_is_unknown() -> None:
+    assert [told([cycle(0, 0.0, kind)])[0]["motion"] for kind in (4, 5, 6)] == ["unknown", "feed", "unknown"]
+
+
+def test_inches_become_millimetres_and_of_two_joints_of_an_axis_the_first_is_told() -> None:
+    (state,) = told([Cycle(0, (1.0, 2.0, 3.0), 1, 1, 0.1, 0.2, False)], axes="XXZ", mm=25.4)
+    assert state["mm"] == pytest.approx({"X": 25.4, "Z": 76.2})
+    assert state["feed_mm_min"] == pytest.approx(0.1 * 25.4 * 60)
+
+
+def test_a_cycle_that_is_seen_late_is_stamped_as_those_that_were_not() -> None:
+    teller = Teller(["X"], 1.0, MS)
+    teller.clock(100, 1000 * MS)
+    teller.clock(110, 1060 * MS)  # 50 ms late
+    (state,) = teller.tell(cycle(110, 0.0, 0), STATUS)
+    assert abs(state["stamp_ns"] - 1010 * MS) < MS
+
+
+def test_a_listener_that_does_not_read_is_let_go_and_holds_nobody_up() -> None:
+    listeners = Listeners("127.0.0.1", 0, b"greeting\n")
+    with socket.create_connection(("127.0.0.1", listeners.port)) as reads:
+        with socket.create_connection(("127.0.0.1", listeners.port)) as sleeps:
+            sleeps.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            listeners.send(b"first\n")
+            with reads.makefile("rb") as lines:
+                assert [lines.readline(), lines.readline()] == [b"greeting\n", b"first\n"]
+                line = b"x" * 65535 + b"\n"
+                for _ in range(20 * MOST_WAITING // len(line)):
+                    listeners.send(line)
+                    assert lines.readline() == line
+        listeners.send(b"last\n")
+    listeners.close()
+
+
+def test_the_line_for_the_hal_file_names_the_bridge() -> None:
+    done = subprocess.run([sys.executable, "-m", "fdhil.bridges"], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith(f"loadusr -Wn {NAME} /usr/bin/python3 /")
+    assert done.stdout.endswith("/fdhil/bridges/linuxcnc.py\n")
+
+
+def test_states_are_what_the_source_reads() -> None:
+    (state,) = told([cycle(0, 1.5, 1)])
+    assert json.loads(json.dumps(state))["mm"] == {"X": 1.5, "Y": 1.5, "Z": 0.0}

@@ -1,0 +1,56 @@
+"""What the NC says of itself is shown, and what is unusual about it is told once, and once that it is over."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from fdhil.cli.status_view import nc_line
+from fdhil.daemon.nc_watch import NcWatch
+from fdhil.records import MoveKind, NcState, Notice
+
+WORKING = NcState(
+    0, 1000, MoveKind.RAPID, 12, 1000.0, 500.0, 1.0, 1.0, False, 3, "/nc/part.ngc", {"X": 1.0}, 77, 0.001
+)  # fmt: skip
+TROUBLE = Notice("DriveFault", "MAJOR", "the drive has a fault", "X")
+
+
+def test_an_override_and_a_hold_are_told_once_and_when_they_are_over() -> None:
+    watch, told = NcWatch(), []
+    for state in (
+        WORKING,
+        replace(WORKING, rapid_override=0.5),
+        replace(WORKING, rapid_override=0.4),
+        replace(WORKING, rapid_override=0.4, feed_hold=True),
+        replace(WORKING, motion=MoveKind.UNKNOWN, rapid_override=None),
+        WORKING,
+    ):
+        told += [(notice.code, notice.severity) for notice in watch.note(state, 1.0)]
+    assert told == [
+        ("OverrideChanged", "minor"), ("FeedHold", "minor"), ("FeedHold", "info"), ("OverrideChanged", "info"),
+    ]  # fmt: skip
+
+
+def test_trouble_is_told_with_the_line_that_the_nc_works_at() -> None:
+    watch = NcWatch()
+    assert watch.placed(TROUBLE, 0.0) == TROUBLE
+    watch.note(WORKING, 1.0)
+    assert watch.placed(TROUBLE, 1.5).text == "the drive has a fault (the NC is at line 12 of part.ngc)"
+    assert watch.placed(replace(TROUBLE, severity="info"), 1.5).text == TROUBLE.text
+    assert watch.placed(TROUBLE, 3.0) == TROUBLE, "an NC that is not heard any more is nowhere"
+    watch.note(replace(WORKING, motion=MoveKind.REST), 4.0)
+    assert watch.placed(TROUBLE, 4.0) == TROUBLE
+
+
+def test_the_status_says_what_the_nc_does() -> None:
+    watch = NcWatch()
+    assert watch.status(0.0) is None
+    watch.note(replace(WORKING, rapid_override=0.5, feed_hold=True), 1.0)
+    status = watch.status(1.25)
+    assert status is not None
+    assert (status["heard_s_ago"], status["motion"], status["tool"]) == (0.25, "rapid", 3)
+    line = "NC: rapid line 12 of part.ngc, feed override 100 %, rapid override 50 %, feed held"
+    assert nc_line(status) == line
+    watch.note(NcState(0, 0, MoveKind.UNKNOWN), 2.0)
+    status = watch.status(5.0)
+    assert status is not None
+    assert nc_line(status) == "NC: not heard for 3 s, its moves are unknown"
