@@ -190,4 +190,4 @@ def marked() -> dict[str, tuple[Path, ...]]:
 def _rows_of(tree: ast.Module) -> set[str]:
     calls = (node for node in ast.walk(tree) if isinstance(node, ast.Call))
     marks = (call for call in calls if isinstance(call.func, ast.Attribute) and call.func.attr == "fault")
-    return {arg.value for mark in marks for arg in mark.args if isinstance(arg, ast.Constant)}
+    return {str(arg.value) for mark in marks for arg in mark.args if isinstance(arg, ast.Constant)}

@@ -93,7 +93,8 @@ def test_what_is_not_vouched_for_arms_nothing(fact: str, code: str) -> None:
     assert refused is not None
     assert [alarm.code for alarm in refused] == [code]
     machine.run(50)
-    assert machine.frames == machine.heartbeats == []
+    assert machine.frames == []
+    assert machine.heartbeats == []
 
 
 @pytest.mark.fault("A16")
@@ -114,8 +115,8 @@ class LateSync(Bench):
     def delay(self) -> None:
         """Put the delay between the SYNC and the listener."""
         hear = self.listener.at_sync
-        self.listener.at_sync = lambda data, stamp, arrival: hear(  # type: ignore[method-assign]
-            data, stamp + self.late_s, arrival + self.late_s
+        self.listener.at_sync = lambda data, stamp_s, now_s: hear(  # type: ignore[method-assign]
+            data, stamp_s + self.late_s, now_s + self.late_s
         )
 
 
@@ -129,10 +130,9 @@ def test_a_sync_that_is_late_once_is_held_and_another_period_ends_it() -> None:
     machine.sync()
     assert machine.mode is Mode.HOLD
     machine.until(Mode.ACTIVE, 40)
-    while machine.mode is not Mode.RAMP_DOWN:
+    for _ in range(60):
         machine.late_s += 0.00005  # 5 percent of the period with each
         machine.sync()
-        assert machine.tick < 600
     assert machine.state.cause is not None
     assert machine.state.cause.code == "SyncJitter"
     ends_at_zero_by(machine, "SyncJitter")

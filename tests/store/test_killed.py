@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from fdhil.store import atomic
 from fdhil.store.windows import WindowStore, list_windows, read_window
 from tests.store.made import same, window
 
@@ -59,7 +58,7 @@ def _die_at(nth: int) -> None:
         return step
 
     for name, call in (("write", _write), ("open", _open), ("fsync", _fsync)):
-        setattr(atomic.os, name, killing(call))
+        setattr(os, name, killing(call))  # what the store calls, too
     Path.rename = killing(_replace)  # type: ignore[method-assign] # in a process of its own
 
 
