@@ -206,7 +206,9 @@ def test_a_load_that_changed_between_the_windows_is_seen() -> None:
 
 
 @pytest.mark.fault("D6")
-@pytest.mark.parametrize("error", [np.linalg.LinAlgError("singular"), FloatingPointError("overflow")])
+@pytest.mark.parametrize(
+    "error", [np.linalg.LinAlgError("singular"), FloatingPointError("overflow"), ValueError("infs or NaNs")]
+)
 def test_a_solver_that_raises_costs_the_window_alone(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
     good, bad = windows(0.003, moves=2)[:2]
 
