@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,7 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cli.options import OutputFile, Writing
-from fdhil.errors import ConfigError, ConfigFault, OutputError
+from fdhil.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
     from fdhil.commissioning.init.draft import Asked, Draft
@@ -63,7 +63,7 @@ def init(
         raise click.UsageError("--eds fits files to drives on the bus, and --offline looks at none: give one of them")
     if file.exists() and not dry_run:
         raise OutputError(f"{file} is there already, and init never overwrites; name another file, or move it away")
-    given = _answers(answers) if answers is not None else {}
+    given = machine_config.read_toml(answers, "a file of answers") if answers is not None else {}
     from fdhil.commissioning.init.linuxcnc import read_linuxcnc  # late: --help imports nothing heavy
     from fdhil.commissioning.init.making import conclude, make
 
@@ -79,18 +79,6 @@ def init(
     elif dry_run:
         click.echo(text, nl=False)
     _tell(draft, file, dry_run, as_json)
-
-
-def _answers(path: Path) -> Mapping[str, Any]:
-    try:
-        with path.open("rb") as file:
-            raw = file.read(MAX_ANSWER_BYTES + 1)
-    except OSError as error:
-        fault = ConfigFault("--answers", f"cannot be read: {error.strerror}", "check the path")
-        raise ConfigError(str(path), [fault]) from None
-    if len(raw) > MAX_ANSWER_BYTES:
-        raise ConfigError(str(path), [ConfigFault("--answers", "is larger than 256 KiB", "answers are a few kB")])
-    return machine_config.toml_document(raw, str(path))
 
 
 def _look(places: Sequence[Path], folder: Path) -> Look:

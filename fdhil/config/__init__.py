@@ -21,7 +21,7 @@ from fdhil.config.bus import CanBus
 from fdhil.config.controller import Identification, Nc
 from fdhil.config.machine import MachineConfig
 from fdhil.config.offset_bounds import VARIATION_MM, OffsetBounds, share_fault
-from fdhil.config.reading import load, parse, toml_document, unlikely
+from fdhil.config.reading import load, parse, read_toml, toml_document, unlikely
 from fdhil.config.reality import Reality
 from fdhil.config.regulators import Regulators
 from fdhil.config.section import Section
@@ -59,6 +59,7 @@ __all__ = [
     "Voltage",
     "load",
     "parse",
+    "read_toml",
     "share_fault",
     "toml_document",
     "unlikely",

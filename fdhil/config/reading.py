@@ -30,18 +30,23 @@ def load(path: Path) -> MachineConfig:
 
     What is possible but unlikely is told on stderr.
     """
+    config = parse(read_toml(path, "a machine config"), str(path), path.parent)
+    for sentence in unlikely(config):
+        logging.getLogger("fdhil").warning("%s: %s", path, sentence)  # nobody else may be there to tell: on stderr
+    return config
+
+
+def read_toml(path: Path, what: str, advice: str = "check the path") -> dict[str, Any]:
+    """Return the tables of a TOML file that is ``what``; ConfigError when it cannot be read, is too large or none."""
     try:
         with path.open("rb") as file:
             raw = file.read(MAX_CONFIG_BYTES + 1)
     except OSError as error:
-        fault = ConfigFault("file", f"cannot be read: {error.strerror}", "check the path")
-        raise ConfigError(str(path), [fault]) from None
+        raise ConfigError(str(path), [ConfigFault("file", f"cannot be read: {error.strerror}", advice)]) from None
     if len(raw) > MAX_CONFIG_BYTES:
-        raise ConfigError(str(path), [ConfigFault("file", "is larger than 256 KiB", "a machine config is a few kB")])
-    config = parse(toml_document(raw, str(path)), str(path), path.parent)
-    for sentence in unlikely(config):
-        logging.getLogger("fdhil").warning("%s: %s", path, sentence)  # nobody else may be there to tell: on stderr
-    return config
+        fault = ConfigFault("file", f"is larger than {MAX_CONFIG_BYTES >> 10} KiB", f"{what} is a few kB")
+        raise ConfigError(str(path), [fault])
+    return toml_document(raw, str(path))
 
 
 def toml_document(raw: bytes, source: str) -> dict[str, Any]:

@@ -17,25 +17,15 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from fdhil.config import toml_document
+from fdhil.config import read_toml
 from fdhil.errors import ConfigError, ConfigFault
 from fdhil.sim.axis_unit import AxisUnit
 from fdhil.sim.fault_kinds import FAULTS, FaultEntry
 
-MAX_SCRIPT_BYTES = 256 * 1024
-
 
 def load(path: Path, axes: tuple[str, ...]) -> list[FaultEntry]:
     """Read a fault script for a machine with these axes; ConfigError with everything that is wrong with it."""
-    try:
-        with path.open("rb") as file:
-            raw = file.read(MAX_SCRIPT_BYTES + 1)
-        if len(raw) > MAX_SCRIPT_BYTES:
-            raise ConfigError(str(path), [ConfigFault("file", "is larger than 256 KiB", "a fault script is a few kB")])
-    except OSError as error:
-        fault = ConfigFault("file", f"cannot be read: {error.strerror}", "check the path")
-        raise ConfigError(str(path), [fault]) from None
-    document = toml_document(raw, str(path))
+    document = read_toml(path, "a fault script")
     faults = [ConfigFault(key, "is no key of a fault script", "[[fault]] is") for key in document if key != "fault"]
     entries: list[FaultEntry] = []
     listed = document.get("fault", [])

@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationError
 
-from fdhil.config.reading import toml_document
+from fdhil.config.reading import read_toml
 from fdhil.config.section import Finite, Section
 from fdhil.csv_text import shown
 from fdhil.errors import ConfigError, ConfigFault, RecordingError
@@ -21,7 +21,6 @@ from fdhil.records import Float
 from fdhil.store.recording_table import COLUMNS, FORMAT, REQUIRED, SAMPLING, VOLTAGE, RecordingTable
 from fdhil.store.trace_text import TraceText
 
-MAX_MAP_BYTES = 64 * 1024
 SHOWN_NAMES = 12
 PER_REVOLUTION = {"mm/s": 1e-3, "mm/min": 1e-3 / 60, "m/min": 1 / 60, "m/s": 1.0}  # of the table: by pitch to rad/s
 FACTORS: Mapping[str, Mapping[str, float]] = {
@@ -67,16 +66,7 @@ class ColumnMap(Section):
 def read_column_map(path: Path) -> ColumnMap:
     """Read a map; ConfigError with every fault of it."""
     try:
-        with path.open("rb") as file:
-            raw = file.read(MAX_MAP_BYTES + 1)
-    except OSError as error:
-        raise ConfigError(
-            str(path), [ConfigFault("file", f"cannot be read: {error.strerror}", "check the path")]
-        ) from None
-    if len(raw) > MAX_MAP_BYTES:
-        raise ConfigError(str(path), [ConfigFault("file", "is larger than 64 KiB", "a column map is a few lines")])
-    try:
-        told = ColumnMap.model_validate(toml_document(raw, str(path)))
+        told = ColumnMap.model_validate(read_toml(path, "a column map"))
     except ValidationError as error:
         items = error.errors(include_url=False)
         faults = [ConfigFault(".".join(map(str, e["loc"])), e["msg"], "see the how-to on recordings") for e in items]

@@ -18,13 +18,12 @@ from pydantic import TypeAdapter, ValidationError
 
 from fdhil import tables
 from fdhil.cia402 import LOGICAL_AXIS_STEP, Object, lay_out
-from fdhil.config import Drive
+from fdhil.config import Drive, read_toml
 from fdhil.drivers.cia402.device import read_device
 from fdhil.drivers.cia402.mapping import offered, suggest_rpdos, suggest_tpdos
 from fdhil.drivers.cia402.profile import LOGICAL_AXIS_PDOS, DriveProfile, ObjectKey, PdoSpec, speed_unit_of
 from fdhil.errors import ConfigError, ConfigFault
 
-MAX_PROFILE_BYTES = 64 * 1024
 MOST_BASES = 8
 NO_OFFSET_ADVICE = "let the NC play the corrected demand of `fdhil correct --out`; this axis needs no commissioning"
 _PDO_KEYS = frozenset({"name", "cob_base", "entries", "every_sync", "valid"})
@@ -124,18 +123,8 @@ def _toml(name: str) -> dict[str, Any]:
     if name in tables.DRIVE_PROFILES:
         package, _, file = tables.DRIVE_PROFILES[name].partition(":")
         return tomllib.loads((files(package) / file).read_text("utf-8"))
-    try:
-        with Path(name).open("rb") as file_:
-            raw = file_.read(MAX_PROFILE_BYTES + 1)
-    except OSError as error:
-        advice = "drive.profile is a packaged name, or a path from the configuration's folder"
-        raise _fault(name, "file", f"cannot be read: {error.strerror}", advice) from None
-    if len(raw) > MAX_PROFILE_BYTES:
-        raise _fault(name, "file", f"is larger than {MAX_PROFILE_BYTES >> 10} KiB", "a profile is a few kB")
-    try:
-        return tomllib.loads(raw.decode("utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise _fault(name, "file", f"is no TOML: {str(error)[:80]}", "check the line it names") from None
+    advice = "drive.profile is a packaged name, or a path from the configuration's folder"
+    return read_toml(Path(name), "a profile", advice)
 
 
 def profile_of(document: Mapping[str, Any], name: str, source: str) -> DriveProfile:

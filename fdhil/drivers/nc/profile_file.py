@@ -12,11 +12,11 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from fdhil import tables
+from fdhil.config import read_toml
 from fdhil.drivers.nc.profile import Condition, NcProfile, Rule, Signal
 from fdhil.errors import ConfigError, ConfigFault
 from fdhil.records import MoveKind
 
-MAX_BYTES = 1 << 16
 Word = Annotated[bool | int | Annotated[float, Field(allow_inf_nan=False)] | str, Field(union_mode="left_to_right")]
 Bound = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -64,17 +64,7 @@ def _document(name: str) -> dict[str, Any]:
     if name in tables.NC_PROFILES:
         package, _, file = tables.NC_PROFILES[name].partition(":")
         return tomllib.loads((files(package) / file).read_text("utf-8"))
-    try:
-        with Path(name).open("rb") as opened:
-            raw = opened.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise _faults(name, [("file", f"cannot be read: {error.strerror}")]) from None
-    if len(raw) > MAX_BYTES:
-        raise _faults(name, [("file", f"is larger than {MAX_BYTES >> 10} KiB")])
-    try:
-        return tomllib.loads(raw.decode("utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise _faults(name, [("file", f"is no TOML: {str(error)[:80]}")]) from None
+    return read_toml(Path(name), "a profile", "name a packaged profile, or a path from the configuration's folder")
 
 
 def profile_of(document: Mapping[str, Any], source: str) -> NcProfile:
