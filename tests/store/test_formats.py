@@ -96,13 +96,13 @@ def test_a_damaged_file_is_refused_in_one_sentence_or_read_as_numbers(name: str,
     export_table(_table(), path, name)
     whole, dice = path.read_bytes(), random.Random(7)
     refused = 0
-    for k in range(24):
+    for k in range(12):
         damaged = bytearray(whole[: dice.randrange(len(whole))] if k % 2 else whole)
         for _ in range(0 if k % 2 else 8):
             damaged[dice.randrange(len(damaged))] ^= 1 << dice.randrange(8)
         path.write_bytes(damaged)
         refused += _refused(path)
-    assert refused > 8  # every cut one, but for a format whose end tells nothing
+    assert refused >= 4  # every cut one, but for a format whose end tells nothing
     path.write_bytes(b"")
     with pytest.raises(RecordingError, match="is empty"):
         read_recording(path)
