@@ -8,7 +8,7 @@ VCAN   := bash tests/integration/vcan-vm.sh -t 900
 # a child process need not translate fdhil anew
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup docs demo test test-vcan test-full loaded lint bench study lock clean
+.PHONY: help setup docs demo test test-vcan test-full faults loaded lint bench study lock clean
 
 help:            ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -50,6 +50,9 @@ test-full: test  ## adds the tests against programs of others: LinuxCNC (linuxcn
 	@command -v chromium >/dev/null || { echo "make test-full needs chromium: apt-get install chromium" >&2; exit 1; }
 	@npm ci --prefix tests/foreign --ignore-scripts --no-audit --no-fund --silent
 	@$(BIN)/python -m pytest -q -m debian
+
+faults: setup    ## the fault matrix: each fault, its tests, survived or not; the table goes to docs/studies/faults.md
+	@$(BIN)/python -m pytest -q -p tests.fault_table --fault-table docs/studies/faults.md -m "fault and not socketcan and not debian"
 
 loaded: setup    ## make demo and make test, five times each beside four busy loops
 	@.ci/loaded "$(MAKE) -s demo" "$(MAKE) -s test"

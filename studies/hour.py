@@ -28,7 +28,7 @@ from fdhil.cli.demo.processes import Process
 from fdhil.cli.demo.toml import to_toml
 from fdhil.daemon.control import SOCKET_NAME
 from fdhil.program import load_trajectory
-from tests.linuxcnc.beside import PART, SHUTTLE, contour_of_each_cut, free_port, record, until
+from tests.linuxcnc.beside import PART, SHUTTLE, TRIES, contour_of_each_cut, free_port, record, repeated, until
 from tests.linuxcnc.machine import LinuxCnc, write_machine
 from tests.sim.twin_process import TwinProcess
 
@@ -151,24 +151,27 @@ def set_up(hour: Retrofit, twin: TwinProcess, port: int) -> None:
         hour.fdhil("commission", hour.file, "--yes", "--room", *ROOM_MM)
 
 
-def cut(hour: Retrofit, nc: LinuxCnc) -> dict[str, Any]:
-    """From the first rapids to the corrected cut; return what the correction promised."""
+def cut(hour: Retrofit, nc: LinuxCnc) -> None:
+    """From the first rapids to the corrected cut."""
     part = hour.folder / "part.csv"
     with hour.step("rapids of each axis, until fdhil believes what it has identified"):
         nc.run(SHUTTLE)
         until(lambda: all(axis["accepted"] >= 4 for axis in hour.status()["axes"].values()))
-    with hour.step("air cut, recorded by fdhil record", rest="longer than the program's longest dwell"):
-        record(hour.file, part, lambda: nc.run(PART))
-    with hour.step("fdhil correct, fdhil arm"):
-        promised = hour.fdhil("correct", part, "--config", hour.file, "--from-history")
-        hour.fdhil("arm", hour.file, part)
-    with hour.step("the corrected cut"):
-        nc.run(PART)
-        until(lambda: bool(hour.status()["passes"]))
-    return promised
+    for tried in range(1, TRIES + 1):
+        with hour.step("air cut, recorded by fdhil record", rest="longer than the program's longest dwell"):
+            record(hour.file, part, lambda: nc.run(PART))
+        with hour.step("fdhil correct, fdhil arm"):
+            hour.fdhil("correct", part, "--config", hour.file, "--from-history")
+            hour.fdhil("arm", hour.file, part)
+        with hour.step("the corrected cut"):
+            nc.run(PART)
+            until(lambda: len(hour.status()["passes"]) == tried)  # noqa: B023 - called at once
+        if repeated(hour.status()):
+            return
+        print("  LinuxCNC has ordered something else than before, the guard has ramped to zero: once more")
 
 
-def beside_linuxcnc(hour: Retrofit, twin: TwinProcess, port: int, stack: ExitStack) -> dict[str, Any]:
+def beside_linuxcnc(hour: Retrofit, twin: TwinProcess, port: int, stack: ExitStack) -> None:
     """Daemon, guard and LinuxCNC run; cut."""
     with hour.step("fdhil run, fdhil-guard"):
         for name, command in (("guard", ["fdhil.cli.guard"]), ("daemon", ["fdhil", "run"])):
@@ -180,7 +183,7 @@ def beside_linuxcnc(hour: Retrofit, twin: TwinProcess, port: int, stack: ExitSta
     with hour.step("LinuxCNC on and homed", loadusr="the line that `python -m fdhil.bridges` prints, in the HAL file"):
         nc = stack.enter_context(LinuxCnc(SPEED_MM_S, ACCELERATION_MM_S2, loads, "XY"))
         stack.enter_context(nc.driving(twin))
-    return cut(hour, nc)
+    cut(hour, nc)
 
 
 def install(hour: Retrofit) -> None:
@@ -222,7 +225,7 @@ def main() -> None:
                 beside_linuxcnc(hour, twin, port, stack)
             twin.event("finished")
         config = machine_config.load(hour.file)
-        before_um, after_um = contour_of_each_cut(trace, load_trajectory(hour.folder / "part.csv", config))
+        before_um, *_, after_um = contour_of_each_cut(trace, load_trajectory(hour.folder / "part.csv", config))
         tell(hour, before_um, after_um)
     sys.exit(after_um >= before_um)
 

@@ -30,6 +30,7 @@ def test_the_bench_is_complete_and_everything_else_has_a_default() -> None:
     assert machine.axis["X"].rapid_speed_rad_s == pytest.approx(157.0796, rel=1e-6)
 
 
+@pytest.mark.fault("F7")
 def test_all_faults_are_told_at_once() -> None:
     document = bench_document()
     del document["axis"]["X"]["screw_pitch_mm"]
@@ -201,6 +202,7 @@ def test_every_number_of_every_section_has_a_range() -> None:
     ],
     ids=lambda text: text[:24],
 )
+@pytest.mark.fault("G7")
 def test_a_hostile_file_is_a_config_error_of_few_words(text: str, expected: str, tmp_path: Path) -> None:
     path = tmp_path / "machine.toml"
     path.write_text(text)

@@ -24,6 +24,7 @@ IMAGES, OUT = ROOT / "docs" / "images", ROOT / "out"
 CUTS = (("uncorrected", "cut-1.csv", 0), ("mirror of the paper", "cut-2.csv", 1), ("inverse", "cut-3.csv", 2))
 HALF_WIDTH_MM = 7.0
 WIDTHS = {"wide": 1200, "narrow": 480}
+TOP_OF_PAGE = 800  # px, of the prediction's page: its map and error
 TALLEST = 14_000  # px, of what the browser draws
 COLOURS = 160  # of a screenshot, by how often they are; the maps' scale is added, whose colours are seldom
 OF_SCALE = 64
@@ -50,6 +51,8 @@ def main() -> None:
         for page, path in pages.items():
             for label, width in WIDTHS.items():
                 screenshot(browser, folder, path, IMAGES / f"{page}-{label}.png", width)
+    with Image.open(IMAGES / "predict-wide.png") as page_seen:
+        page_seen.crop((0, 0, page_seen.width, TOP_OF_PAGE)).save(IMAGES / "path.png", optimize=True)
 
 
 def draw_corner() -> None:

@@ -172,7 +172,7 @@ def _changes(found: Sequence[Step], windows: Sequence[StoredWindow]) -> list[dic
 
 
 def _rows(windows: Sequence[StoredWindow], values: Float, stds: Float, symbols: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the windows as the plot and JSON have them: number, time, temperature, value and standard deviation."""
+    """Return the windows as the plot and JSON have them: number, time, temperature, NC, value and deviation."""
     import numpy as np
 
     def told(number: float) -> float | None:
@@ -183,6 +183,7 @@ def _rows(windows: Sequence[StoredWindow], values: Float, stds: Float, symbols: 
             "window": window.number,
             "time": _date(window.stamp.wall_s),
             "temperature_c": window.temperature_c,
+            "nc": window.nc,
             "parameters": {
                 name: {"value": told(v), "std": told(s)} for name, v, s in zip(symbols, row, spread, strict=True)
             },

@@ -59,6 +59,8 @@ def init(
     drive, nothing moves, and a file that is there is never overwritten. Each value stands in FILE with who said so.
     Exit codes: 0 made, 2 something is not known or cannot be, 3 a bus, drive or file cannot be reached.
     """
+    if offline and places:
+        raise click.UsageError("--eds fits files to drives on the bus, and --offline looks at none: give one of them")
     if file.exists() and not dry_run:
         raise OutputError(f"{file} is there already, and init never overwrites; name another file, or move it away")
     given = _answers(answers) if answers is not None else {}

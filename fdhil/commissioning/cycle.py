@@ -19,6 +19,7 @@ from fdhil.config import MachineConfig
 from fdhil.errors import DeviceError
 
 LOCKSTEP_WAIT_S = 8.0
+GUARD_WAIT_S = 0.5
 MOST_CYCLE_US = 20_000
 STALL_CYCLES = 20
 
@@ -74,7 +75,8 @@ class Cycle:
     """The thread that runs some buses; a context manager. Nothing is sent before ``produce_sync`` or by the members.
 
     ``path`` gives the members' set-points while it is there, in their order; ``failure`` is what ended the thread.
-    ``guarded`` are the COB-IDs per bus that a guard beside it sends, and no member does.
+    ``guarded`` are the COB-IDs per bus that a guard beside it sends, and no member does; ``offsets_heard`` are those
+    that came since the last SYNC.
     ``realtime``: it asks for a real-time priority; ``scheduling`` says what it was given.
     """
 
@@ -83,6 +85,7 @@ class Cycle:
         self.period_s = config.machine.sync_period_s
         self.buses = {name: TransmitBus(name, config.bus[name]) for name in buses}
         self.guarded: dict[str, set[int]] = {name: set() for name in self.buses}
+        self.offsets_heard: set[int] = set()
         self.members: list[Member] = []
         self.path: SetPoints | None = None
         self.heartbeat: int | None = None
@@ -95,7 +98,8 @@ class Cycle:
         self.lockstep = config.guard.clock == "sync"
         self._sync_counter = 0
         self._sync_overflow: int | None = None
-        self._wait_until = 0.0
+        self._sent_s = 0.0
+        self._offsets_before: set[int] = set()
         self._heartbeat_due = 0.0
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fdhil-cycle", daemon=True)
@@ -119,7 +123,7 @@ class Cycle:
         if self.lockstep:
             self._receive()
         self._send_heartbeat()
-        if self._sync_overflow is not None and self._awaits_drive():
+        if self._sync_overflow is not None and self._awaits_others():
             self.lateness.skipped += 1
         elif self._sync_overflow is not None:
             self._send_sync()
@@ -141,16 +145,18 @@ class Cycle:
         if periods > STALL_CYCLES and self.path is not None and not self.lockstep:
             self.path.hold(f"this computer was late by {periods} SYNC; take load off it")
 
-    def _awaits_drive(self) -> bool:
-        """Whether a simulated drive has yet to answer the last SYNC: its process may sleep, and time is the SYNC count.
+    def _awaits_others(self) -> bool:
+        """Whether a simulated drive has yet to answer the last SYNC, or a guard to send its offset, as it did before.
 
-        One that has not answered in ``LOCKSTEP_WAIT_S`` is not waited for until it answers again.
+        Their processes may sleep, and time is the SYNC count. One that has not answered in ``LOCKSTEP_WAIT_S``, or
+        ``GUARD_WAIT_S``, is not waited for until it answers again.
         """
-        return (
-            self.lockstep
-            and any(0 < member.behind <= 1 for member in self.members)
-            and time.monotonic() < self._wait_until
-        )
+        now = time.monotonic()
+        if not self.lockstep or now >= self._sent_s + LOCKSTEP_WAIT_S:
+            return False
+        if any(0 < member.behind <= 1 for member in self.members):
+            return True
+        return bool(self._offsets_before - self.offsets_heard) and now < self._sent_s + GUARD_WAIT_S
 
     def _send_heartbeat(self) -> None:
         now = time.monotonic()
@@ -167,7 +173,8 @@ class Cycle:
         for bus in self.buses.values():
             bus.send(cia402.COB_SYNC, data)
         self.count += 1
-        self._wait_until = time.monotonic() + LOCKSTEP_WAIT_S
+        self._sent_s = time.monotonic()
+        self._offsets_before, self.offsets_heard = self.offsets_heard, set()
 
     def _send_set_points(self) -> None:
         """Send what the next SYNC latches."""

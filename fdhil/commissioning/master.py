@@ -88,6 +88,9 @@ class Master:
         if beside_guard:
             self._guarded.update(self._offset_ids())
         self._tpdos = {spec.cob_base + self.node_id: spec for spec in self.profile.tpdos}
+        # SYNC is answered by the last of them: one before it would let two SYNCs go for one
+        every = [can_id for can_id, spec in self._tpdos.items() if spec.valid and spec.every_sync == 1]
+        self._last_answer = max(every, default=None)
         self._plan: deque[int] = deque()
         self._answered = 0
         self._lock = threading.Lock()
@@ -138,7 +141,8 @@ class Master:
         error = bool(can_id & ERROR_FLAG)
         heard.errors, heard.frames = heard.errors + error, heard.frames + (not error)
         if spec is not None and len(data) >= spec.length:
-            self._answered = self.cycle
+            if can_id == self._last_answer:
+                self._answered = self.cycle
             for entry, value in zip(spec.entries, cia402.unpack(spec.entries, data), strict=True):
                 heard.objects[entry.index, entry.sub] = value
                 heard.cycle[entry.index, entry.sub] = self.cycle
@@ -148,7 +152,9 @@ class Master:
             heard.emergencies.append(data)
         elif can_id == cia402.COB_HEARTBEAT + node and data:
             heard.nmt = data[0] & 0x7F
-        elif can_id not in self._guarded and (sign := shows_master(can_id)) is not None:
+        elif can_id in self._guarded:
+            self.loop.offsets_heard.add(can_id)
+        elif (sign := shows_master(can_id)) is not None:
             heard.master = heard.master or sign
 
     # what the steps use ---------------------------------------------------------------------------------------

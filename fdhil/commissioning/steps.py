@@ -49,8 +49,8 @@ def prepare(master: Master) -> None:
     """Select CSP, start SYNC and the node, and take the actual position as target; the drive is not enabled yet."""
     overflow = read_optional(master, Object.SYNC_COUNTER_OVERFLOW) or 0
     master.sdo.write_int(Object.MODE, 0, Mode.CYCLIC_SYNC_POSITION, 1)
+    master.nmt(NmtCommand.START)  # first: who is not started answers no SYNC
     master.produce_sync(overflow)
-    master.nmt(NmtCommand.START)
     master.wait(
         lambda: master.profile.position in master.heard.objects and master.profile.statusword in master.heard.objects,
         2.0,

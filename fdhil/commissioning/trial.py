@@ -148,13 +148,16 @@ def guarded(master: Master) -> Iterator[None]:
 
 
 def time_bus(master: Master) -> Found:
-    """Listen beside our own SYNC: it must come evenly, and the drive must answer in time; DriveFault."""
+    """Listen beside our own SYNC: the drive must answer in time; DriveFault.
+
+    How evenly it comes is told, not judged: it is this computer's. ``fdhil check`` judges the NC's.
+    """
     name, counted = master.bus.name, master.config.guard.clock == "sync"
     with CanBus(name, master.config.bus[name]) as bus:
         master.wait_cycles(TIMING_CYCLES)
         timing = measure(bus.drain(), [spec.cob_base + master.node_id for spec in master.profile.tpdos])
     findings = [
-        judge_sync(timing.interval_s, master.period_s, counted),
+        judge_sync(timing.interval_s, master.period_s, counted=True),
         *judge_answers(timing, master.period_s, counted),
     ]
     require(master, findings)

@@ -49,6 +49,10 @@ class CorrectedPath:
         k = row - self.first
         return max([abs(values[k] - target) for values, target in zip(self.demand, targets, strict=True)])
 
+    def stands(self, row: int) -> bool:
+        """Whether the demand stands from this row to the next."""
+        return self.has(row) and self.mismatch(row + 1, [values[row - self.first] for values in self.demand]) == 0
+
     def standing_rows(self) -> int:
         """Return the number of the last row that still stands at the first row's demand."""
         row = self.first

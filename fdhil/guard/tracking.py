@@ -46,7 +46,8 @@ def track(state: State, path: CorrectedPath) -> tuple[State, Alarm | None]:
     distance = path.mismatch(state.anchor, targets)
     if targets == state.targets[1] and distance is not None and distance <= EPS:
         return state._replace(places=(Place(state.anchor),), resuming=True), Alarm("FeedHold")
-    places = around(path, state.anchor + 1, targets) if state.resuming else ()
+    looks = state.resuming or path.stands(state.anchor)  # a dwell ends by the NC's clock, a few cycles sooner or later
+    places = around(path, state.anchor + 1, targets) if looks else ()
     if places:
         return state._replace(places=places, anchor=places[0].row, resuming=False), None
     return state._replace(places=advance(path, state.places, None), resuming=False), _lost(state, path, targets)

@@ -18,7 +18,8 @@ from fdhil.records import Estimate, Reason, Result, Verdict, Window, WindowOutco
 from fdhil.validation import BEFORE_ANY_FIT, LEAST_ROWS, OF_THE_FIT, WEIGHED, Evidence, Findings, ask
 from fdhil.validation.at_the_table import at_the_table
 
-GAVE_UP = (np.linalg.LinAlgError, FloatingPointError, ZeroDivisionError, OverflowError)
+# what solvers raise; scipy's raise ValueError for what is not finite
+GAVE_UP = (np.linalg.LinAlgError, FloatingPointError, ZeroDivisionError, OverflowError, ValueError)
 SAME_PITCH = 0.01  # to which a recording and the section of its axis agree
 OVERRIDE = 2.0  # by which their rapid speeds may differ: an override slows what is recorded
 NOTICED = 0.2  # of what a model may leave: with less left no resonance is sought

@@ -124,11 +124,13 @@ def test_a_good_machine_is_vouched_for(config: MachineConfig, program: Path) -> 
         ({"skills": (Skill("X", 1, math.nan, 1.0, 0.0, 900.0),)}, "skill_enough"),
     ],
 )
+@pytest.mark.fault("E4", "E19")
 def test_a_fact_that_does_not_hold_is_withheld(changes: dict[str, Any], withheld: str, config: MachineConfig) -> None:
     facts = standing_facts(["X", "Y"], config, known(config, **changes), gain_um=20.0)
     assert [name for name, holds in facts.items() if not holds] == [withheld]
 
 
+@pytest.mark.fault("E7")
 def test_no_gain_is_no_gain(config: MachineConfig) -> None:
     for gain_um in (0.0, -1.0, math.nan):
         assert not standing_facts(["X", "Y"], config, known(config), gain_um)["gain_positive"]
@@ -145,6 +147,7 @@ def test_no_gain_is_no_gain(config: MachineConfig) -> None:
         (None, ["commissioned", "offset_in_feedforward_known", "watchdog_proven"]),
     ],
 )
+@pytest.mark.fault("E14")
 def test_a_drive_that_is_not_commissioned_is_not_vouched_for(
     changes: dict[str, Any] | None, withheld: list[str], config: MachineConfig, tmp_path: Path
 ) -> None:
@@ -189,6 +192,7 @@ def test_another_method_takes_the_same_road_however_long_the_program_is(config: 
     assert refused.reasons[0].text == "the method flatness plans no position offset"
 
 
+@pytest.mark.fault("G1")
 async def test_the_operators_token_decides_and_a_missing_guard_is_told(config: MachineConfig, program: Path) -> None:
     store = OutcomeStore(config)
     assert config.store.run_directory is not None

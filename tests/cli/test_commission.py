@@ -15,6 +15,7 @@ import pytest
 from fdhil import config as machine_config
 from fdhil.cli.main import cli, run_safely
 from fdhil.commissioning.record import load_record
+from fdhil.store.history import History
 from tests.bench import bench_toml
 from tests.drivers.peer import DrivePeer
 from tests.eds import write_eds
@@ -26,7 +27,13 @@ WAITS: tuple[tuple[str, str, float], ...] = (
     ("commissioning.watchdog", "STARVE_TIMEOUT_S", 0.1),
     ("drivers.can.sdo", "RESPONSE_TIMEOUT_S", 0.2),
     ("drivers.can.sdo", "QUIET_S", 0.1),
+    ("commissioning.strokes", "JOG_MM", 1.0),
+    ("commissioning.trial", "TIMING_CYCLES", 100),
+    ("commissioning.trial", "RAPIDS", 4),
+    ("commissioning.trial", "REST_S", 0.6),
+    ("commissioning.trial", "LAST_REST_S", 0.4),
 )
+TRUE = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075}
 
 
 @dataclass
@@ -37,8 +44,9 @@ class Bench:
     file: Path
     capsys: pytest.CaptureFixture[str]
 
-    def commission(self, *arguments: str) -> tuple[int, str, str]:
-        """Run the command; return exit code, stdout and stderr."""
+    def commission(self, *arguments: str, said: str = "") -> tuple[int, str, str]:
+        """Run the command, whose operator says these lines; return exit code, stdout and stderr."""
+        sys.stdin = io.StringIO(said)
         sys.argv[1:] = ["commission", str(self.file), *arguments]
         code = run_safely(cli)
         heard = self.capsys.readouterr()
@@ -63,7 +71,10 @@ def bench(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytes
     monkeypatch.setattr(sys, "stdin", io.StringIO())
     file = tmp_path / "machine.toml"
     bus = f'[bus.can0]\ninterface = "virtual"\nchannel = "{uuid.uuid4().hex}"\n[guard]\nclock = "sync"\n'
-    file.write_text(bench_toml("X") + "[axis.X.drive]\nnode_id = 1\n" + bus)
+    bus += "[play]\nheartbeat_s = 0.5\n"  # a busy computer is late
+
+    slow = bench_toml("X").replace("sync_period_s = 0.001", "sync_period_s = 0.002")
+    file.write_text(slow + "[axis.X.drive]\nnode_id = 1\n" + bus)
     with DrivePeer(machine_config.load(file)) as peer:
         yield Bench(peer, file, capsys)
 
@@ -76,8 +87,8 @@ def test_a_dry_run_says_what_each_step_moves_and_sends_nothing(bench: Bench) -> 
         "4 sign test: ",
         "Moves 10 um toward plus and back",
         "9 jog: ",
-        "Moves 5 mm toward plus at 5 mm/s, and back.",
-        "Moves 156.8 mm toward plus at 461 mm/s with 4000 mm/s2, and back, 3 times.",
+        "Moves 1 mm toward plus at 5 mm/s, and back.",
+        "Moves 156.8 mm toward plus at 461 mm/s with 4000 mm/s2, and back, 2 times.",
     ):
         assert words in out, words
     code, out, _ = bench.commission("--dry-run", "--json")
@@ -132,6 +143,49 @@ def test_what_was_stopped_goes_on_where_it_ended(bench: Bench, monkeypatch: pyte
     assert (code, "kept" in out, "step 4 of 7, sign test: Moving" in out) == (0, False, True)
 
 
+def test_an_axis_is_tried_where_the_operator_agrees_and_known_to_the_history(bench: Bench) -> None:
+    code, out, err = bench.commission(said="y\n" + "-2 130\n" + 3 * "y\n")
+    assert code == 0, err
+    for asked in (
+        "How far may axis X go from here",
+        "Now axis X moves 1 mm toward plus at 5 mm/s, and back. Is its way free, and may it?",
+        "The drive went 1 mm toward plus at 5 mm/s, and back. Is that what you saw the table do?",
+        "Now axis X moves 127.4 mm toward plus at 394 mm/s with 4000 mm/s2, and back, 2 times.",
+    ):
+        assert asked in err, asked
+    assert "step 3 of 6, test rapids: Moving the axis as fast as G0" in out
+    assert "axis X: identification: R 0.5" in out
+    with History.read(bench.store) as history:
+        (newest,) = history.revisions("X", limit=1)
+    for name, true in TRUE.items():
+        assert newest.set.parameters.as_dict()[name] == pytest.approx(true, rel=0.01), name
+
+    beats = bench.peer.heard.count(0x700 + machine_config.load(bench.file).play.node_id)
+    assert beats > 4  # the drive stops by itself when this process is gone
+    assert [bench.peer.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
+
+    heard = len(bench.peer.heard)
+    code, out, _ = bench.commission("--yes", "--json", "--room", "-2", "130")
+    tried = json.loads(out)["axes"]["X"]["trial"]
+    assert (code, tried.keys()) == (0, {"jog", "test rapids", "identification", "acceptance"})
+    assert (tried["jog"]["seen"], tried["test rapids"]["moves"]) == ("yes", 4)
+    assert abs(tried["test rapids"]["voltage_late_ms"]) < 0.1
+    assert all(move["left_rms_um"] < 0.1 * move["measured_rms_um"] for move in tried["acceptance"]["moves"])
+    assert not {0x000, 0x080, 0x201, 0x301} & set(bench.peer.heard[heard:])
+    assert bench.peer.drive.table_mm == pytest.approx(0.0, abs=0.05)
+
+
+@pytest.mark.parametrize(("said", "code"), [("y\n\n", 0), ("y\n-2 130\nn\n", 1), ("y\nfar\n", 1)])
+def test_who_does_not_agree_is_not_moved(said: str, code: int, bench: Bench) -> None:
+    got, out, err = bench.commission(said=said)
+    assert (got, "jog: " in out) == (code, False)
+    assert ("is not tried by moving it" in out) is (code == 0)
+    assert ("nobody said yes; the axis was not moved, its record holds" in err) is ("130" in said)
+    assert ("'far' is not two numbers" in err) is ("far" in said)
+    assert load_record(bench.store, "X") is not None
+    assert bench.peer.drive.power.state.name == "SWITCH_ON_DISABLED"
+
+
 def without(peer: DrivePeer, index: int) -> None:
     """Take an object out of the drive."""
     dictionary = peer.drive.dictionary
@@ -173,7 +227,7 @@ WRONG: dict[str, tuple[Callable[[Bench], None], str, bool]] = {
     "other EDS": (other_eds, "choose another profile", False),
     "other profile": (
         said("node_id = 1\n", 'node_id = 1\nprofile = "epos4"\n'), "which profile epos4 is not made for", False),
-    "other cycle": (set_object(0x60C2, 1, 2), "it interpolates over 2 ms", False),
+    "other cycle": (set_object(0x60C2, 1, 1), "it interpolates over 1 ms", False),
     "no heartbeat consumer": (lambda b: without(b.peer, 0x1016), "it has no heartbeat consumer (0x1016)", True),
     "sign of the offset": (fault("offset_scale", -1.0), "does not add 0x60B0 to the target", True),
 }  # fmt: skip

@@ -40,7 +40,7 @@ def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[TwinProcess
         joined = folder / "joined"
         joined.mkdir()
         file = write_config(joined, bus=f'interface = "socketcand"\nport = {running.bus_settings["port"]}', axes="X")
-        file.write_text('[guard]\nclock = "sync"\n' + file.read_text())
+        file.write_text('[guard]\nclock = "sync"\n[play]\nheartbeat_s = 1.0\n' + file.read_text())
         yield running, file
 
 

@@ -38,9 +38,12 @@ WITH_CONFIG = {
     "correct": ["part.ngc", "--config", "{config}"],
     "advise": ["part.ngc", "--config", "{config}", "--tolerance-um", "50"],
     "replay": ["shuttle.csv", "--config", "{config}"],
+    "play": ["part.ngc", "--config", "{config}"],
 }
 WITHOUT_CONFIG = {
     "demo": ["--out", "out"],
+    "init": ["new.toml", "--offline"],
+    "paper": ["--out", "out"],
     "eds": ["drive.eds"],
     "interpret": ["part.ngc"],
     "export": ["w.parquet", "--out", "out.csv"],
@@ -57,14 +60,15 @@ WITH_FILE = {
     "correct": ["{file}", "--config", "bench.toml"],
     "acceptance": ["bench.toml", "--out", "out.html", "--measured-circle", "{file}"],
     "advise": ["{file}", "--config", "bench.toml", "--tolerance-um", "50"],
+    "play": ["{file}", "--config", "bench.toml", "--dry-run"],
 }
 SUFFIXES = {
     "arm": [".ngc"],
     "eds": [".eds", ".dcf"],
-    "identify": [".csv"],
+    "identify": [".csv", ".mat", ".mf4", ".h5"],
     "acceptance": [".csv"],
     "replay": [".csv", ".parquet"],
-    "export": [".parquet"],
+    "export": [".parquet", ".mat", ".mf4", ".h5"],
     "interpret": [".ngc"],
 }
 # what a command is called with where the file that it is to write cannot be
@@ -89,7 +93,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     Path("part.ngc").write_text("G21 G90 G64\nG1 X10 F1000\nM2\n")
     Path("profile.toml").write_text(f'[machine]\nname = "m"\n{axis_toml("X")}[axis.X.drive]\nprofile = "maxon_epos4"\n')
     Path("key.toml").write_text(bench_toml().replace("screw_pitch_mm", "screw_pich_mm", 1))
-    for suffix in (".toml", ".csv", ".parquet", ".ngc", ".eds", ".dcf"):
+    for suffix in (".toml", ".csv", ".parquet", ".ngc", ".eds", ".dcf", ".mat", ".mf4", ".h5"):
         Path(f"junk{suffix}").write_bytes(bytes(range(256)) * 8)
         Path(f"empty{suffix}").touch()
         Path(f"folder{suffix}").mkdir()

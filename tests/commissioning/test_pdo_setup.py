@@ -69,6 +69,7 @@ def test_a_drive_that_is_right_is_left_alone(peer: tuple[DrivePeer, MachineConfi
     assert set(drive.heard) == {0x601}
 
 
+@pytest.mark.fault("A25")
 def test_a_drive_that_refuses_an_object_keeps_all_its_pdos(tmp_path: Path) -> None:
     own = tmp_path / "own.toml"
     own.write_text(

@@ -65,11 +65,13 @@ WRONG: dict[str, tuple[Callable[[Recording], Recording], str]] = {
 
 
 @pytest.mark.parametrize("what", WRONG)
+@pytest.mark.fault("B10")
 def test_what_is_wrong_is_named(what: str) -> None:
     spoil, says = WRONG[what]
     assert says in causes(spoil(jogged()))
 
 
+@pytest.mark.fault("B10")
 def test_words_that_are_swapped_are_told() -> None:
     """A float whose two words are swapped is noise of any size."""
     jog = jogged()

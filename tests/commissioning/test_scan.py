@@ -126,6 +126,7 @@ def test_eds_files_are_read_and_others_are_left(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", [b"\x1b]0;owned\x07", b"a\rb\nc", b"\xff\xfe", b"x" * 500])
+@pytest.mark.fault("G12")
 def test_a_drives_text_cannot_steer_a_terminal(text: bytes) -> None:
     assert printable(text).isprintable()
     assert len(printable(text)) <= 80

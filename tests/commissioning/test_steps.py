@@ -151,6 +151,7 @@ WRONG: dict[str, tuple[Callable[[DrivePeer], None], str]] = {
 
 
 @pytest.mark.parametrize("what", WRONG)
+@pytest.mark.fault("A17", "E16")
 def test_a_wrong_set_up_is_refused_before_anything_moves(what: str, peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
     spoil, says = WRONG[what]
@@ -194,6 +195,7 @@ class HastyMaster(Master):
         (not_csp, "does not take the mode"),
     ],
 )
+@pytest.mark.fault("E16")
 def test_a_drive_that_takes_offsets_otherwise_is_refused_and_disabled(
     spoil: Callable[[DrivePeer], None], says: str, peer: tuple[DrivePeer, MachineConfig]
 ) -> None:
@@ -207,6 +209,7 @@ def test_a_drive_that_takes_offsets_otherwise_is_refused_and_disabled(
     assert drive.drive.dictionary.number(0x60B0) == 0
 
 
+@pytest.mark.fault("E14")
 def test_a_watchdog_that_does_nothing_is_refused(
     peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -339,6 +342,7 @@ def test_an_nc_on_the_bus_is_left_alone(can_id: int, shown: str, peer: tuple[Dri
     assert drive.heard == [can_id]  # the NC's own
 
 
+@pytest.mark.fault("A29")
 def test_on_a_silent_bus_the_drive_alone_is_asked_what_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """No SYNC, no NMT command, no set-point, and no frame to anybody else."""
     monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.01)  # nothing ever comes
@@ -351,6 +355,7 @@ def test_on_a_silent_bus_the_drive_alone_is_asked_what_it_is(monkeypatch: pytest
         assert sent == {(0x601, read), (0x601, given_up)}
 
 
+@pytest.mark.fault("A29")
 def test_a_bus_of_another_bit_rate_gets_no_frame() -> None:
     settings = config()
     with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as other:

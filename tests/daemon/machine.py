@@ -15,7 +15,7 @@ from fdhil.config import MachineConfig
 from fdhil.daemon.kernel_warmup import nominal_rapid
 from fdhil.errors import ConnectError
 from fdhil.pipeline import Record
-from fdhil.records import AxisSamples, MoveEvent, MoveKind, Notice, TickTimes, frozen, frozen_ints
+from fdhil.records import AxisSamples, MoveEvent, MoveKind, NcState, Notice, TickTimes, frozen, frozen_ints
 from tests.bench import AXIS, bench_axis
 
 NOMINAL = AXIS["nominal"]
@@ -75,14 +75,14 @@ def _blocks(axis: str, signals: dict[str, Any], events: list[MoveEvent], first_t
 class Machine:
     """A source that yields what it is given, and more when ``give`` is called; ``fail`` makes it fail."""
 
-    def __init__(self, records: Sequence[Record | Notice] = ()) -> None:
-        self.queue: asyncio.Queue[Record | Notice | Exception] = asyncio.Queue()
+    def __init__(self, records: Sequence[Record | NcState | Notice] = ()) -> None:
+        self.queue: asyncio.Queue[Record | NcState | Notice | Exception] = asyncio.Queue()
         self.opened = 0
         self.unreachable = 0
         self.taken = 0
         self.give(*records)
 
-    def give(self, *records: Record | Notice | Exception) -> None:
+    def give(self, *records: Record | NcState | Notice | Exception) -> None:
         """Let the source yield these next; an exception is raised in it."""
         for record in records:
             self.queue.put_nowait(record)
@@ -96,7 +96,7 @@ class Machine:
         self.opened += 1
         yield self
 
-    async def run(self, take: Callable[[Record | Notice], None]) -> None:
+    async def run(self, take: Callable[[Record | NcState | Notice], None]) -> None:
         """Hand over what was given."""
         while True:
             record = await self.queue.get()

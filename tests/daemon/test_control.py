@@ -151,6 +151,7 @@ def test_every_outcome_is_one_line() -> None:
     assert line_of(Notice("LoadChanged", "MAJOR", "Jt rose", "X")) == ("X: LoadChanged: Jt rose", "MAJOR")
 
 
+@pytest.mark.fault("G12")
 def test_lines_carry_priorities_in_the_journal_and_no_escapes_anywhere(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -163,6 +164,7 @@ def test_lines_carry_priorities_in_the_journal_and_no_escapes_anywhere(
     assert printable("\u202e") == "\\u202e"
 
 
+@pytest.mark.fault("F12")
 def test_a_flood_of_one_class_holds_no_other_back_and_is_counted() -> None:
     gate = FloodGate()
     admitted = [gate.admit("A", 0.0) for _ in range(1000)]
@@ -173,6 +175,7 @@ def test_a_flood_of_one_class_holds_no_other_back_and_is_counted() -> None:
     assert gate.admit("A", 1.5) is None
 
 
+@pytest.mark.fault("F8")
 def test_the_lock_is_free_again_when_its_owner_is_gone(tmp_path: Path) -> None:
     for _ in range(2):
         with sole_owner(tmp_path / "run"):

@@ -55,6 +55,7 @@ def test_a_drives_window_is_kept_as_integers(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("number", "code"), [(errno.ENOSPC, "DiskFull"), (errno.EROFS, "ReadOnlyStore")])
+@pytest.mark.fault("F3", "F5")
 def test_a_disk_that_refuses_is_told_once_and_recovers(
     number: int, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -76,6 +77,7 @@ def test_a_disk_that_refuses_is_told_once_and_recovers(
     store.close()
 
 
+@pytest.mark.fault("F17")
 def test_a_damaged_history_is_put_aside_and_a_new_one_begun(tmp_path: Path) -> None:
     directory = tmp_path / "fdhil-data"
     directory.mkdir()
@@ -89,6 +91,7 @@ def test_a_damaged_history_is_put_aside_and_a_new_one_begun(tmp_path: Path) -> N
         assert (directory / f"{FILE_NAME}.corrupt-{k}").read_bytes().startswith(b"garbage")
 
 
+@pytest.mark.fault("F19")
 def test_a_newer_schema_is_left_alone_in_shadow(tmp_path: Path) -> None:
     directory = tmp_path / "fdhil-data"
     History.open(directory).close()
@@ -110,6 +113,7 @@ def test_a_store_that_cannot_be_made_is_told(tmp_path: Path) -> None:
     assert store.keep([outcome()]) == []
 
 
+@pytest.mark.fault("F18")
 def test_strays_are_named(tmp_path: Path) -> None:
     folder = tmp_path / "fdhil-data" / "windows"
     folder.mkdir(parents=True)

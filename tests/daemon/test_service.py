@@ -119,6 +119,7 @@ async def test_what_is_not_there_at_the_start_ends_the_daemon(tmp_path: Path) ->
     assert error.group_contains(ConnectError, match="cannot be reached")
 
 
+@pytest.mark.fault("F8")
 async def test_a_second_daemon_of_one_machine_is_refused(tmp_path: Path) -> None:
     config = config_of(tmp_path)
     async with serving(config, Machine()):
@@ -126,6 +127,7 @@ async def test_a_second_daemon_of_one_machine_is_refused(tmp_path: Path) -> None
             await Service(config, Machine().open).run()
 
 
+@pytest.mark.fault("F12", "A21")
 async def test_a_flood_of_notices_is_a_few_lines_and_a_count(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -156,6 +158,7 @@ async def test_nonsense_on_the_socket_is_answered_and_harms_nobody(tmp_path: Pat
             stream.close()
 
 
+@pytest.mark.fault("F20")
 def test_a_fault_of_fdhil_itself_ends_the_daemon_and_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -28,6 +28,7 @@ def test_the_unit_says_what_the_service_relies_on(name: str) -> None:
 
 @pytest.mark.debian
 @pytest.mark.parametrize("name", NAMES)
+@pytest.mark.fault("G13")
 def test_systemd_agrees(name: str, tmp_path: Path) -> None:
     unit = tmp_path / name
     unit.write_text((UNITS / name).read_text().replace("/opt/fdhil/bin/fdhil", sys.executable))

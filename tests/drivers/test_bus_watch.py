@@ -45,6 +45,7 @@ def test_a_simulated_machine_that_was_held_up_misses_nothing() -> None:
     assert grid.missed == 0
 
 
+@pytest.mark.fault("A11", "A12")
 def test_duplicates_and_reordered_syncs_are_put_aside() -> None:
     grid = SyncGrid(0.001)
     rows = syncs([0, 1, 1, 2, 1, 3, 4])
@@ -154,6 +155,7 @@ def test_a_master_without_a_counter_takes_over_from_one_that_counts() -> None:
 
 
 @pytest.mark.parametrize("data", [b"\x11\x86\x01\0\0\0\0\0", b"\x11\x86\x01", b"\x11\x86"])
+@pytest.mark.fault("A20", "A21")
 def test_an_emergency_is_told_whatever_its_length(data: bytes) -> None:
     watch = NodeWatch("X", 1)
     (notice,) = watch.feed(frames_of([(0, 0x81, data)]), 0)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -74,6 +75,7 @@ def without(frames: Frames, dropped: Sequence[int]) -> Frames:
 
 @settings(deadline=None, max_examples=40)
 @given(data=st.data(), cut=st.integers(0, 900))
+@pytest.mark.fault("A10")
 def test_every_lost_frame_is_counted_and_leaves_a_hole(data: st.DataObject, cut: int) -> None:
     wire = Wire(n=120)
     frames = wire.frames()
@@ -126,6 +128,7 @@ def test_a_lost_target_is_a_hole_where_it_mattered() -> None:
     assert decoder.counters()["pdo_lost"] == 1
 
 
+@pytest.mark.fault("A11")
 def test_a_duplicate_is_no_second_sample() -> None:
     wire = Wire(n=60)
     frames = wire.frames()
@@ -137,6 +140,7 @@ def test_a_duplicate_is_no_second_sample() -> None:
     assert got["tick"].tolist() == list(range(2, 58))
 
 
+@pytest.mark.fault("A15", "A16")
 def test_a_short_pdo_is_discarded_and_a_long_one_cut() -> None:
     wire = Wire(n=80)
     rows = wire.rows()

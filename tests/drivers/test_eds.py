@@ -115,6 +115,7 @@ def test_a_file_is_read(tmp_path: Path) -> None:
         ("".join(f"[{i:04X}]\nDataType=7\n" for i in range(MAX_OBJECTS + 1)).encode(), "more than"),
     ],
 )
+@pytest.mark.fault("G5")
 def test_what_cannot_be_read_is_one_error(raw: bytes, says: str) -> None:
     with pytest.raises(EdsError, match=r"bad\.eds") as caught:
         parse_eds(raw, "bad.eds")
@@ -128,6 +129,7 @@ def test_a_missing_file_is_the_same_error(tmp_path: Path) -> None:
 
 @settings(deadline=None, max_examples=60)
 @given(st.data())
+@pytest.mark.fault("G5")
 def test_damage_never_escapes_as_another_error(data: st.DataObject) -> None:
     raw = bytearray(GOOD.encode())
     for _ in range(data.draw(st.integers(1, 6))):

@@ -63,6 +63,7 @@ async def test_a_bus_on_which_nothing_is_heard_is_listened_to_and_gets_no_frame(
         assert drive.recv(0) is None
 
 
+@pytest.mark.fault("A29")
 def test_silence_from_the_start_is_told_and_so_is_its_end() -> None:
     settings = machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex})
     bus = BusSource("can0", settings)

@@ -269,6 +269,7 @@ async def test_nothing_that_is_no_number_gets_through() -> None:
         sensor.link.close()
 
 
+@pytest.mark.fault("B5")
 async def test_an_adapter_that_is_pulled_out_and_put_back_is_used_again(tmp_path: Path) -> None:
     """Without a restart; the pause between tries grows, and both edges are told once."""
     settings = {"source": "modbus", "type": "float32", "device": str(tmp_path / "meter")}

@@ -116,6 +116,7 @@ async def test_nobody_there_is_said() -> None:
         await ModbusLink("voltage sensor X", ModbusPlace(port=port, timeout_s=0.2)).connect()
 
 
+@pytest.mark.fault("B1", "B2", "B8")
 async def test_a_source_survives_and_tells_both_edges(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fdhil.drivers.sensor_source.POLL_S", 0.01)
     out = asyncio.Queue[Record]()

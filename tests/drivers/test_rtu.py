@@ -100,6 +100,7 @@ SPOILT: dict[str, serial_peer.Spoil] = {
 
 
 @pytest.mark.parametrize("what", SPOILT)
+@pytest.mark.fault("B3", "B4", "B8")
 async def test_a_damaged_answer_is_asked_for_again_and_counted(what: str) -> None:
     kind = what if what.startswith("Modbus") else "ModbusShape"
     async with rtu_peer(u1=[7, 8]) as peer:
@@ -125,6 +126,7 @@ async def test_a_damaged_answer_is_asked_for_again_and_counted(what: str) -> Non
         lambda frame: [serial_peer.framed(1, bytes.fromhex("0400000002")), frame],  # an adapter that hears itself
     ],
 )
+@pytest.mark.fault("B4")
 async def test_noise_before_an_answer_and_pieces_of_it_are_got_over(pieces: serial_peer.Spoil) -> None:
     async with rtu_peer(u1=[7, 8]) as peer:
         link = link_to(peer)
@@ -135,6 +137,7 @@ async def test_noise_before_an_answer_and_pieces_of_it_are_got_over(pieces: seri
         link.close()
 
 
+@pytest.mark.fault("B6")
 async def test_the_answer_of_another_unit_is_not_taken_and_ours_is_waited_for() -> None:
     async with rtu_peer(u1=[7, 8]) as peer:
         link = link_to(peer, timeout_s=60.0)
@@ -148,6 +151,7 @@ async def test_the_answer_of_another_unit_is_not_taken_and_ours_is_waited_for() 
         link.close()
 
 
+@pytest.mark.fault("B7")
 async def test_a_late_answer_is_not_taken_for_the_next() -> None:
     async with rtu_peer(u1=[7, 8]) as peer:
         link = link_to(peer, timeout_s=0.4)
@@ -170,6 +174,7 @@ async def test_a_late_answer_is_not_taken_for_the_next() -> None:
         link.close()
 
 
+@pytest.mark.fault("B2")
 async def test_what_a_unit_refuses_names_the_register() -> None:
     async with rtu_peer(u1=[7]) as peer:
         link = link_to(peer)
@@ -181,6 +186,7 @@ async def test_what_a_unit_refuses_names_the_register() -> None:
         link.close()
 
 
+@pytest.mark.fault("B5")
 async def test_an_adapter_that_is_pulled_out_is_gone_until_it_is_back() -> None:
     async with rtu_peer(u1=[7]) as peer:
         link = link_to(peer, timeout_s=5.0)

@@ -9,7 +9,7 @@ import pytest
 
 from fdhil.drivers.can import sdo
 from fdhil.drivers.can.sdo import SdoLink
-from fdhil.errors import DeviceTimeout, ProtocolError
+from fdhil.errors import DeviceTimeout, ProtocolError, SdoAbort
 
 
 class SlowNode:
@@ -38,6 +38,7 @@ class SlowNode:
         self.waiting = []
 
 
+@pytest.mark.fault("A26")
 def test_the_roll_back_is_not_spoilt_by_a_late_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sdo, "RESPONSE_TIMEOUT_S", 0.02)
     node = SlowNode()
@@ -51,6 +52,7 @@ def test_the_roll_back_is_not_spoilt_by_a_late_answer(monkeypatch: pytest.Monkey
     assert link.read_int(0x6041) == 7
 
 
+@pytest.mark.fault("A26")
 def test_an_answer_to_what_another_program_asked_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sdo, "QUIET_S", 0.0)
     node = SlowNode()
@@ -60,3 +62,68 @@ def test_an_answer_to_what_another_program_asked_is_not_taken(monkeypatch: pytes
     link = SdoLink("drive X", 1, lambda can_id, data: link.deliver(b"\x60\x16\x10\x01" + bytes(4)))
     with pytest.raises(ProtocolError, match="answered wrongly"):
         link.read_int(0x1018, 2)
+
+
+class SegmentedNode:
+    """A node that answers an upload in segments without end, or each with a wrong toggle bit."""
+
+    def __init__(self, toggles: bool, declares: int = 0) -> None:
+        self.link: Any = None
+        self.toggles = toggles
+        self.declares = declares
+        self.aborts: list[int] = []
+        self.segments = 0
+
+    def send(self, can_id: int, data: bytes) -> None:
+        if data[0] == 0x80:
+            self.aborts.append(int.from_bytes(data[4:], "little"))
+        elif data[0] == 0x40:
+            self.link.deliver(b"\x41" + data[1:4] + struct.pack("<I", self.declares))
+        else:
+            self.segments += 1
+            self.link.deliver(bytes([data[0] & 0x10 if self.toggles else 0x10 & ~data[0]]) + bytes(7))
+
+
+@pytest.mark.fault("A27")
+@pytest.mark.parametrize(
+    ("node", "says", "code"),
+    [
+        (SegmentedNode(toggles=False), "was answered wrongly .*toggle", 0x05030000),
+        (SegmentedNode(toggles=True), "is longer than 65536 bytes", 0x05040005),
+        (SegmentedNode(toggles=True, declares=1 << 30), "is longer than 65536 bytes", 0x05040005),
+    ],
+    ids=["toggle", "endless", "declares too much"],
+)
+def test_segments_that_are_wrong_or_without_end_are_aborted(
+    node: SegmentedNode, says: str, code: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sdo, "QUIET_S", 0.0)
+    node.link = SdoLink("drive X", 1, node.send, patience=100.0)
+    with pytest.raises(ProtocolError, match=f"(?i){says}"):
+        node.link.read(0x1008)
+    assert set(node.aborts) == {code}
+    assert node.segments <= 65536 // 7 + 2
+
+
+@pytest.mark.fault("A27")
+def test_segments_that_take_too_long_are_aborted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sdo, "DEADLINE_S", 0.0)
+    node = SegmentedNode(toggles=True)
+    node.link = SdoLink("drive X", 1, node.send)
+    with pytest.raises(ProtocolError, match="was not finished after 0 s"):
+        node.link.read(0x1008)
+    assert node.aborts == [0x05040000]
+
+
+@pytest.mark.fault("A25")
+def test_an_abort_of_the_drive_is_told_with_its_code() -> None:
+    for code in (0x06090030, 0x08000022):
+        link = SdoLink("drive X", 1, lambda can_id, data: None)
+        link._send = (
+            lambda can_id, data, to=link, code=code: to.deliver(  # type: ignore[misc] # the loop's own
+                b"\x80" + data[1:4] + struct.pack("<I", code)
+            )
+        )
+        with pytest.raises(SdoAbort, match=f"{code:08X}") as caught:
+            link.write_int(0x6065, 0, 5, 4)
+        assert caught.value.code == code

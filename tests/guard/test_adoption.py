@@ -56,6 +56,7 @@ def codes(refused: tuple[Alarm, ...] | None) -> set[str]:
 # --- at the start ---
 
 
+@pytest.mark.fault("E13")
 def test_a_believed_offset_is_ramped_from_its_value() -> None:
     machine = holding(-500, 819)
     assert may_stand(machine.state, machine.settings) == (None, None)
@@ -90,6 +91,7 @@ def test_what_may_not_be_believed_is_frozen_and_told(machine: Bench, told: str) 
 
 
 @pytest.mark.parametrize("target", [327680, 800])
+@pytest.mark.fault("A17")
 def test_a_remapped_read_back_is_not_believed(target: int) -> None:
     """0x60B0 and 0x6062 at each other's place: within the ceiling or not, nothing is sent."""
     machine = bench()
@@ -102,6 +104,7 @@ def test_a_remapped_read_back_is_not_believed(target: int) -> None:
 
 @pytest.mark.parametrize("at", range(10))
 @pytest.mark.parametrize("times", [1, 2, 3, 9])
+@pytest.mark.fault("G9")
 def test_forged_frames_beside_the_drives_own_move_nothing(at: int, times: int) -> None:
     machine = bench()
     machine.run(at)
@@ -194,6 +197,7 @@ def foreign_sdo(machine: Bench, value: int) -> None:
 
 @pytest.mark.parametrize("write", [foreign_frame, foreign_sdo])
 @pytest.mark.parametrize("value", [-819, 0, 300])
+@pytest.mark.fault("A19")
 def test_after_a_foreign_offset_the_ramp_starts_from_what_is_measured(
     write: Callable[[Bench, int], None], value: int
 ) -> None:
@@ -212,6 +216,7 @@ def test_after_a_foreign_offset_the_ramp_starts_from_what_is_measured(
     assert machine.held[-1] == (0, 0)
 
 
+@pytest.mark.fault("A19")
 def test_a_foreign_offset_beyond_the_ceiling_freezes() -> None:
     machine = active()
     frames = len(machine.frames)
@@ -224,6 +229,7 @@ def test_a_foreign_offset_beyond_the_ceiling_freezes() -> None:
     assert machine.state.cause.detail.startswith("610.4 um may still be applied")
 
 
+@pytest.mark.fault("A19")
 def test_a_foreign_node_that_goes_on_is_not_fought() -> None:
     machine = active()
     frames = len(machine.frames)
@@ -347,6 +353,7 @@ def restart(machine: Bench) -> None:
 
 
 @pytest.mark.parametrize("touch", [write_6065, write_mapping_as_block, restart])
+@pytest.mark.fault("A17")
 def test_a_touched_drive_is_not_armed_until_it_was_compared(touch: Callable[[Bench], None]) -> None:
     machine = bench()
     machine.settle()

@@ -105,6 +105,7 @@ def test_only_a_true_true_is_a_fact(settled: tuple[Bench, Inputs], value: object
 
 
 @pytest.mark.parametrize("digest", ["", "another"])
+@pytest.mark.fault("E5")
 def test_another_program(settled: tuple[Bench, Inputs], digest: str) -> None:
     machine, inputs = settled
     assert digest != DIGEST
@@ -125,6 +126,7 @@ def test_not_before_a_hundred_good_cycles() -> None:
     assert machine.arm() == ()
 
 
+@pytest.mark.fault("F21")
 def test_not_twice_and_not_by_itself() -> None:
     machine = bench()
     machine.settle()

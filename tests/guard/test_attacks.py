@@ -164,6 +164,7 @@ def test_neither_garbage_nor_floods_nor_signals_cost_a_running_correction_one_sy
     rig.peer.wait(lambda: client.status()["ok"] and open_descriptors(rig) <= before + MAX_CLIENTS, "closed descriptors")
 
 
+@pytest.mark.fault("F13")
 def test_what_asks_it_to_stop_has_it_ramp_first(rig: Rig) -> None:
     """A closed terminal, an interrupt, the kernel's warning before its limit: any of them, and all at once."""
     rig.into_the_cut()
@@ -187,6 +188,7 @@ sys.exit(__main__.main())
 
 
 @pytest.mark.parametrize("error", ["RuntimeError('lost')", "MemoryError"])
+@pytest.mark.fault("F20")
 def test_whatever_breaks_the_loop_the_offset_is_ramped_to_zero(tmp_path: Path, error: str) -> None:
     rig = Rig(tmp_path, program=("-c", BROKEN.format(error=error)))
     try:

@@ -118,6 +118,7 @@ def altered(**changes: object) -> str:
 
 
 @pytest.mark.parametrize("name", ["offset", "rate", "acceleration", "variation", "window"])
+@pytest.mark.fault("G11")
 def test_a_settings_file_can_raise_no_limit_above_its_ceiling(name: str) -> None:
     value = getattr(LIMITS, name)
     assert from_json(altered(**{name: value})).axes[0].limits == LIMITS
@@ -141,6 +142,7 @@ def test_the_axis_own_speed_and_the_scale_bound_it_too() -> None:
             from_json(altered(**changes))
 
 
+@pytest.mark.fault("G11")
 def test_no_value_of_any_kind_in_any_field_is_anything_but_a_refusal() -> None:
     """Every key of the file, at every depth, given what does not belong there."""
     clean = json.loads(to_json(made_settings()))

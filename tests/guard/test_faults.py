@@ -119,6 +119,7 @@ def cutting(prepared: Bench) -> Bench:
 
 
 @pytest.mark.parametrize("row", RAMPED)
+@pytest.mark.fault("A2", "A6", "A9", "A10", "A15", "A20", "E6", "E9", "E10", "E11", "E12", "E15", "F8", "F15")
 def test_fault_ramps_down_in_time(cutting: Bench, row: str) -> None:
     fault, code, detected = RAMPED[row]
     limits = cutting.settings.axes[0].limits
@@ -146,6 +147,7 @@ def test_fault_ramps_down_in_time(cutting: Bench, row: str) -> None:
 
 
 @pytest.mark.parametrize("row", FROZEN)
+@pytest.mark.fault("A1", "A3", "A4", "A24")
 def test_fault_freezes_at_once_and_only_the_operator_leads_out(cutting: Bench, row: str) -> None:
     fault, code = FROZEN[row]
     count, held = len(cutting.frames), cutting.offsets
@@ -165,6 +167,7 @@ def test_fault_freezes_at_once_and_only_the_operator_leads_out(cutting: Bench, r
     assert cutting.drives[0].offset == 0
 
 
+@pytest.mark.fault("A23")
 def test_a_reboot_freezes_until_the_drive_was_compared_and_adopted(cutting: Bench) -> None:
     """A23: what the drive holds and how it is set up is unknown; nothing is sent until both are known again."""
     count = len(cutting.frames)
@@ -183,12 +186,14 @@ def test_a_reboot_freezes_until_the_drive_was_compared_and_adopted(cutting: Benc
     assert [drive.offset for drive in cutting.drives] == [0, 0]
 
 
+@pytest.mark.fault("A7")
 def test_silence_freezes_a_synchronous_offset(cutting: Bench) -> None:
     cutting.silence()
     assert cutting.mode is Mode.FROZEN
     assert [alarm.code for alarm in cutting.alarms] == ["SyncLost"]
 
 
+@pytest.mark.fault("A7")
 def test_silence_ramps_an_event_driven_offset() -> None:
     machine = bench(offset_synchronous=False)
     machine.settle()
@@ -227,6 +232,7 @@ def test_lost_targets_are_held_and_then_found_again(cutting: Bench, lost: int) -
     assert cutting.state.mode is Mode.ACTIVE
 
 
+@pytest.mark.fault("A10")
 def test_lost_feedback_is_held_and_then_forgiven(cutting: Bench) -> None:
     cutting.sync(drop=(0x281,))
     cutting.sync()
@@ -235,6 +241,7 @@ def test_lost_feedback_is_held_and_then_forgiven(cutting: Bench) -> None:
     assert cutting.state.mode is Mode.ACTIVE
 
 
+@pytest.mark.fault("E17")
 def test_feed_hold_keeps_the_offset_and_goes_on(cutting: Bench) -> None:
     _hold(cutting)
     cutting.run(12)
@@ -248,6 +255,7 @@ def test_feed_hold_keeps_the_offset_and_goes_on(cutting: Bench) -> None:
     cutting.until(Mode.ACTIVE, 40)
 
 
+@pytest.mark.fault("E17")
 def test_feed_hold_does_not_last_for_ever() -> None:
     cutting = bench(sync_period_s=0.02)
     cutting.settle()
@@ -303,11 +311,14 @@ def test_on_a_real_machine_a_late_loop_is_told_before_it_is_armed() -> None:
 
 
 @pytest.mark.parametrize(("failures", "mode"), [(1, Mode.ACTIVE), (3, Mode.OFF), (6, Mode.FROZEN)])
+@pytest.mark.fault("A5")
 def test_full_transmit_queue(cutting: Bench, failures: int, mode: Mode) -> None:
     for _ in range(failures):
         cutting.sync(transmitted=False)
     cutting.run(80)
     assert cutting.mode is mode
+    assert {alarm.code for alarm in cutting.alarms if alarm.reaction > 1} <= {"TxQueueFull"}
+    assert bool(cutting.alarms) is (mode is not Mode.ACTIVE)
 
 
 def test_late_frame_is_counted_not_feared(cutting: Bench) -> None:
@@ -319,6 +330,7 @@ def test_late_frame_is_counted_not_feared(cutting: Bench) -> None:
     assert cutting.state.axes[0].late_echoes >= 5
 
 
+@pytest.mark.fault("E13")
 def test_adopts_what_the_drive_holds_at_start() -> None:
     machine = bench()
     machine.drives[1].hold(-500)
@@ -355,6 +367,7 @@ def test_wrong_start_of_the_path_is_off() -> None:
 
 
 @pytest.mark.parametrize(("row", "value", "code"), [(300, 240, "OffsetRate"), (300, 5000, "OffsetLimit")])
+@pytest.mark.fault("E1", "E2")
 def test_table_that_breaks_a_limit_at_run_time_is_left(row: int, value: int, code: str) -> None:
     machine = bench()
     assert machine.path is not None
@@ -373,6 +386,7 @@ def test_table_that_breaks_a_limit_at_run_time_is_left(row: int, value: int, cod
     assert max(abs(b - a) for a, b in itertools.pairwise(sent)) <= limits.hard_rate
 
 
+@pytest.mark.fault("E5")
 def test_table_that_is_swapped_for_another_program_is_left(cutting: Bench) -> None:
     assert cutting.path is not None
     cutting.path = CorrectedPath(0, cutting.path.demand, cutting.path.offset, True, "other", 2)
@@ -389,6 +403,7 @@ def test_streamed_table_that_runs_dry_is_left_in_time(cutting: Bench) -> None:
     assert cutting.alarms[-1].code == "TableStarved"
 
 
+@pytest.mark.fault("E2")
 def test_vibrating_table_is_left_by_its_total_variation() -> None:
     machine = bench()
     assert machine.path is not None
@@ -405,6 +420,7 @@ def test_vibrating_table_is_left_by_its_total_variation() -> None:
 
 
 @pytest.mark.parametrize("rate", [0.5, 0.9, 1.2])
+@pytest.mark.fault("E17")
 def test_another_override_is_told_from_another_path(cutting: Bench, rate: float) -> None:
     at = float(cutting.row)
     while cutting.mode is not Mode.RAMP_DOWN:

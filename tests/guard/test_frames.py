@@ -128,6 +128,7 @@ def test_events(cob_id: int, data: bytes, code: str | None) -> None:
     assert heard.alarms() == ()
 
 
+@pytest.mark.fault("A21")
 def test_a_flood_stays_small() -> None:
     heard = listener()
     for _ in range(10_000):
@@ -177,6 +178,7 @@ def test_regular_sync() -> None:
     assert regular([(0.001, 0.001)] * 40) == [False] + [True] * 40
 
 
+@pytest.mark.fault("A28")
 def test_a_late_reader_is_not_the_bus_fault_and_a_set_clock_neither() -> None:
     assert all(regular([(0.001, 0.001)] * 20 + [(0.001, 0.02)] + [(0.001, 1e-5)] * 18)[1:])
     assert all(regular([(0.001, 0.001)] * 20 + [(-3600.0, 0.001)] + [(0.001, 0.001)] * 18)[1:])

@@ -161,6 +161,28 @@ def test_after_a_feed_hold_the_place_is_looked_for_anew() -> None:
     assert state.places[0].row == 131  # time alone moves it, for as long as a hold lasts
 
 
+DWELL = CorrectedPath(
+    FIRST, tuple([*axis[:20], *[axis[19]] * 30, *axis[20:]] for axis in (X, Y)), ([0] * 93, [0] * 93), True, "p"
+)
+
+
+@pytest.mark.parametrize("early", [1, SEARCH, SEARCH + 1])
+def test_a_dwell_may_end_before_the_tables(early: int) -> None:
+    rests = FIRST + 49 - early  # the last row in which the NC still stood
+    left = state_at(rests, at(FIRST + 20), at(FIRST + 19))
+    state, alarm = track(left, DWELL)
+    assert (alarm is None) is (early <= SEARCH)
+    assert (state.anchor == FIRST + 50) is (early <= SEARCH)
+
+
+def test_only_a_rest_may_end_early() -> None:
+    _, alarm = track(state_at(130, at(133), at(130)), PATH)
+    assert alarm is not None
+    _, alarm = track(state_at(FIRST + 40, (at(FIRST + 20)[0], 0), at(FIRST + 19)), DWELL)
+    assert alarm is not None
+    assert alarm.code == "Misaligned"
+
+
 def test_without_targets_time_alone_moves_the_place_and_the_anchor_stays() -> None:
     state, alarm = track(state_at(130, None, at(130)), PATH)
     assert alarm is None

@@ -178,6 +178,7 @@ def test_mute_by_default_then_aligned_to_the_cycle_then_off(rig: Rig) -> None:
     assert {i for _, i, _ in rig.peer.sent} == {0x301, 0x302, 0x764}
 
 
+@pytest.mark.fault("E18")
 def test_disarm_ramps_down(rig: Rig) -> None:
     rig.into_the_cut()
     assert rig.client is not None
@@ -188,6 +189,7 @@ def test_disarm_ramps_down(rig: Rig) -> None:
     check_limits(rig)
 
 
+@pytest.mark.fault("F13")
 def test_sigterm_ramps_down_and_exits_0(rig: Rig) -> None:
     rig.into_the_cut()
     rig.process.send_signal(signal.SIGTERM)
@@ -199,6 +201,7 @@ def test_sigterm_ramps_down_and_exits_0(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("how", ["closes", "falls silent"])
+@pytest.mark.fault("F15")
 def test_lost_daemon_ramps_down(rig: Rig, how: str) -> None:
     rig.into_the_cut()
     assert rig.client is not None
@@ -213,6 +216,7 @@ def test_lost_daemon_ramps_down(rig: Rig, how: str) -> None:
     check_limits(rig)
 
 
+@pytest.mark.fault("A7", "E8")
 def test_lost_sync_freezes_and_adopting_brings_it_to_zero(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
     """Out of FROZEN as the operator goes: ``fdhil adopt``, and 0 only when zero was read back."""
     rig.into_the_cut()
@@ -239,6 +243,7 @@ def test_lost_sync_freezes_and_adopting_brings_it_to_zero(rig: Rig, capsys: pyte
     check_limits(rig)
 
 
+@pytest.mark.fault("F14")
 def test_stopped_process_sends_nothing(rig: Rig) -> None:
     rig.into_the_cut()
     rig.peer.lockstep, rig.peer.slow_from = False, NEVER
@@ -256,6 +261,7 @@ def test_stopped_process_sends_nothing(rig: Rig) -> None:
     check_limits(rig)
 
 
+@pytest.mark.fault("F16", "E13")
 def test_killed_guard_leaves_a_value_that_the_next_one_adopts(rig: Rig) -> None:
     rig.into_the_cut()
     rig.process.kill()
@@ -276,6 +282,7 @@ def test_killed_guard_leaves_a_value_that_the_next_one_adopts(rig: Rig) -> None:
         again.communicate()
 
 
+@pytest.mark.fault("G9", "A19", "F16")
 def test_what_is_forged_foreign_or_silent_makes_no_step(rig: Rig) -> None:
     """Over the hub, as another node would do it: forged and missing read-backs, a foreign offset, a blind restart."""
     client, peer, drive = rig.connect(), rig.peer, rig.peer.drives[0]

@@ -87,6 +87,7 @@ def test_frozen_it_ends_with_3_and_says_what_stands(make: Make) -> None:
 
 
 @pytest.mark.parametrize("where", ["client", "core", "listener"])
+@pytest.mark.fault("F20")
 def test_a_fault_of_the_program_ramps_to_zero_and_ends_with_3(
     make: Make, where: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -290,6 +291,7 @@ def test_a_status_shows_what_would_be_sent(make: Make) -> None:
     assert shop.wire.sent == []
 
 
+@pytest.mark.fault("E4")
 def test_what_the_daemon_no_longer_vouches_for_ends_it(make: Make) -> None:
     shop = make()
     client = shop.into_the_cut()
@@ -318,6 +320,7 @@ def test_who_asks_to_arm_and_goes_ends_nobody_elses_correction(make: Make) -> No
     assert shop.state == "ACTIVE"
 
 
+@pytest.mark.fault("G1")
 def test_refusals_are_answered_with_all_their_reasons(make: Make) -> None:
     shop = make()
     client = shop.connect()
@@ -368,6 +371,7 @@ def test_a_table_waits_for_the_one_before_and_a_long_one_for_the_end(make: Make)
     assert sum(event["event"] == "table_refused" for event in shop.events()) == 5  # the same twice is told once
 
 
+@pytest.mark.fault("E2")
 def test_rows_that_break_a_limit_are_refused_with_its_class(make: Make) -> None:
     shop = make()
     client = shop.connect()
@@ -462,6 +466,7 @@ def test_a_line_without_end_and_a_client_that_went_are_let_go(desk: Control) -> 
     assert desk.clients == []
 
 
+@pytest.mark.fault("F11")
 def test_a_client_that_does_not_take_its_answers_is_not_read(desk: Control) -> None:
     with connected(desk) as client:
         client.send(b'{"n": 1}\n{"n": 2}\n')

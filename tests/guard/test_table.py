@@ -43,6 +43,7 @@ def test_rows_come_back(rows: list[tuple[int, int]], program: str, final: bool) 
     assert path.sequence == 7
 
 
+@pytest.mark.fault("E3")
 def test_numpy_integers_are_taken_and_floats_are_not() -> None:
     whole = table.encode("X", {"X": np.array([1, 2], dtype=np.int64)}, {"X": np.array([0, 0])}, "p")
     assert list(table.decode(whole)[1].demand[0]) == [1, 2]
@@ -131,6 +132,7 @@ HEAD = {"axes": ["X"], "first": 0, "rows": 2, "final": True, "program": "p"}
         *(json.dumps({**HEAD, key: value}) for key in HEAD for value in WRONG),
     ],
 )
+@pytest.mark.fault("E3")
 def test_whatever_the_header_holds_it_is_one_class(head: str) -> None:
     raw = head.encode("utf-8", "surrogatepass")
     assert decoded(struct.pack("<I", len(raw)) + raw + bytes(16)) in ("CorruptFile", (("X",), 2))
@@ -153,6 +155,7 @@ def test_a_program_named_by_no_text_is_told_in_plain_letters() -> None:
 
 
 @given(st.binary(max_size=200))
+@pytest.mark.fault("F17")
 def test_garbage_is_refused_by_one_class(garbage: bytes) -> None:
     with pytest.raises(TableRefused) as refusal:
         table.decode(garbage)
@@ -205,6 +208,7 @@ def test_a_stream_begins_with_row_0() -> None:
 
 
 @pytest.mark.parametrize(("row", "value", "code"), [(30, 9, "OffsetRate"), (39, 820, "OffsetLimit")])
+@pytest.mark.fault("E1", "E2")
 def test_rows_beyond_a_limit_are_refused_wherever_they_are(row: int, value: int, code: str) -> None:
     offsets = [0] * 40
     offsets[row] = value

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from fdhil.config import Maintenance
 from fdhil.identification.drift import DriftTracker, Point
@@ -53,6 +54,7 @@ def test_a_step_is_believed_after_two_further_episodes() -> None:
     assert tracker.points[-1].values[0] == 0.7
 
 
+@pytest.mark.fault("D4")
 def test_a_changed_load_is_told_at_once_and_used_from_the_second() -> None:
     tracker = _tracker()
     loaded = replace(BENCH, Jt=0.085)
@@ -65,6 +67,7 @@ def test_a_changed_load_is_told_at_once_and_used_from_the_second() -> None:
     assert tracker.update(loaded, COVARIANCE, 11) == []
 
 
+@pytest.mark.fault("D4")
 def test_values_that_disagree_never_settle() -> None:
     tracker = _tracker()
     for k in range(6):

@@ -20,6 +20,7 @@ def _estimate(values: list[float], shares: list[float]) -> Estimate:
     return Estimate("least_squares", PARAMETERS, np.array(values), np.diag(deviations**2), {}, Result.OK)
 
 
+@pytest.mark.fault("D2")
 def test_each_wide_interval_is_a_null_with_its_reason() -> None:
     told = judge(_estimate(list(VALUES), [0.01, 0.3, 0.01, 0.01, 0.01, 0.01]), 10.0, 157.0)
     assert told.result is Result.UNDER_EXCITED
@@ -37,6 +38,7 @@ def test_nil_viscous_friction_is_a_value() -> None:
 
 
 @pytest.mark.parametrize("condition", [1e7, np.inf, np.nan])
+@pytest.mark.fault("D1")
 def test_rank_deficiency_publishes_nothing(condition: float) -> None:
     told = judge(_estimate(list(VALUES), [0.01] * 6), condition, 157.0)
     assert told.result is Result.ILL_CONDITIONED
@@ -44,6 +46,7 @@ def test_rank_deficiency_publishes_nothing(condition: float) -> None:
     assert all(reason.code == "RankDeficient" for reason in told.missing.values())
 
 
+@pytest.mark.fault("D3")
 def test_what_no_drive_can_be_is_named_with_its_value() -> None:
     (reason,) = unphysical(_estimate([-0.5, *VALUES[1:]], [0.01] * 6))
     assert reason.code == "Unphysical"

@@ -7,16 +7,18 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from fdhil.arming.passes import FINISHED
 from fdhil.prediction import contour_error_um
 from fdhil.records import Trajectory
 
 PATIENCE_S = 300.0
+TRIES = 5  # on an overloaded computer LinuxCNC's task feeds its planner too late now and then: another demand
 SHUTTLE = "G21 G90\n" + "G0 X400 Y400\nG4 P0.3\nG0 X0 Y0\nG4 P0.3\n" * 3 + "M2\n"
 PART = """G21 G90 G17 G64 P0.01
 F9000
@@ -65,6 +67,11 @@ def record(config: Path, out: Path, cut: Callable[[], None]) -> None:
         cut()
         told, _ = recording.communicate(timeout=PATIENCE_S)
     assert json.loads(told)["complete"], told
+
+
+def repeated(status: Mapping[str, Any]) -> bool:
+    """Whether the last pass was the armed demand to its end; else the guard saw another one and ramped to zero."""
+    return bool(status["passes"][-1]["ended_by"] == FINISHED)
 
 
 def contour_of_each_cut(trace: Path, part: Trajectory) -> list[float]:

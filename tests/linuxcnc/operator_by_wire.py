@@ -84,9 +84,9 @@ class Operator:
             case "rest":
                 self.rest()
             case "override":
-                self.command.feedrate(order["value"])
+                self.order(self.command.feedrate, order["value"])
             case "rapid_override":
-                self.command.rapidrate(order["value"])
+                self.order(self.command.rapidrate, order["value"])
             case "pause":
                 self.command.auto(linuxcnc.AUTO_PAUSE)
             case "resume":

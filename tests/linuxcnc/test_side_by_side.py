@@ -17,7 +17,7 @@ from fdhil.cli.demo.processes import Process
 from fdhil.cli.demo.toml import to_toml
 from fdhil.daemon.control import SOCKET_NAME
 from fdhil.program import load_trajectory
-from tests.linuxcnc.beside import PART, SHUTTLE, contour_of_each_cut, fdhil, free_port, record, until
+from tests.linuxcnc.beside import PART, SHUTTLE, TRIES, contour_of_each_cut, fdhil, free_port, record, repeated, until
 from tests.linuxcnc.machine import LinuxCnc
 from tests.sim.twin_process import TwinProcess
 
@@ -72,12 +72,15 @@ def test_the_second_cut_of_a_program_is_corrected(shop: Shop) -> None:
     with LinuxCnc(hal=loads, axes="XY") as nc, nc.driving(shop.twin):
         nc.run(SHUTTLE)
         until(lambda: all(axis["accepted"] >= 4 for axis in shop.status()["axes"].values()))
-        record(shop.file, part, lambda: nc.run(PART))
-        promised = fdhil("correct", part, "--config", shop.file, "--from-history")
-        fdhil("arm", shop.file, part)
-        nc.run(PART)
-        until(lambda: bool(shop.status()["passes"]))
+        for tried in range(1, TRIES + 1):
+            record(shop.file, part, lambda: nc.run(PART))
+            promised = fdhil("correct", part, "--config", shop.file, "--from-history")
+            fdhil("arm", shop.file, part)
+            nc.run(PART)
+            until(lambda: len(shop.status()["passes"]) == tried)  # noqa: B023 - called at once
+            if repeated(shop.status()):
+                break
     shop.twin.event("finished")
-    before, after = contour_of_each_cut(shop.trace, load_trajectory(part, machine_config.load(shop.file)))
+    before, *_, after = contour_of_each_cut(shop.trace, load_trajectory(part, machine_config.load(shop.file)))
     assert promised["contour"]["rms_um"] == pytest.approx(before, rel=0.05)
     assert after < before / 50

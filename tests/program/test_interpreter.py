@@ -124,6 +124,7 @@ def test_values_are_computed_before_the_line_sets_parameters() -> None:
     ]
 
 
+@pytest.mark.fault("G6")
 def test_budgets_end_in_an_error_with_its_line() -> None:
     with pytest.raises(ProgramError, match="raise max_blocks") as caught:
         list(interpret((f"G0 X{i}" for i in range(100)), Budget(max_blocks=10)))

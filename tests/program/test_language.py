@@ -114,6 +114,7 @@ def test_probes_rotary_axes_and_block_delete() -> None:
         "#1=10|o1 repeat [99]|#1=[#1*#1]|o1 endrepeat", "G0 X[10**300]", "F1 G2 I1 P99999999",
     ],
 )  # fmt: skip
+@pytest.mark.fault("G6")
 def test_hostile_programs_end_in_an_error_with_its_line(text: str) -> None:
     small = Budget(max_blocks=5000, max_repeated_blocks=1000, max_motions_per_block=500)
     with pytest.raises(ProgramError) as caught:
@@ -121,6 +122,7 @@ def test_hostile_programs_end_in_an_error_with_its_line(text: str) -> None:
     assert caught.value.line >= 1
 
 
+@pytest.mark.fault("G6")
 def test_a_file_of_one_endless_line_is_refused_at_once(tmp_path: Path) -> None:
     path = tmp_path / "long.ngc"
     with path.open("wb") as file:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fdhil.records import Float
-from fdhil.sim.nc.stream import LEAD_S, DemandStream, StreamError
+from fdhil.sim.nc.stream import LEAD_S, LONG_REST_S, DemandStream, StreamError
 from tests.sim.bench_twin import PERIOD_S, TwinInHand, corner, trajectory, twin_config
 from tests.sim.twin_process import TwinProcess, write_config
 
@@ -63,6 +63,18 @@ def test_a_hole_in_a_rest_is_none() -> None:
     stream = stream_with(lines_of(np.zeros((LEAD, 2))))
     played(stream, LEAD + 500)
     assert stream.starved == 0
+
+
+def test_a_machine_that_is_behind_makes_up_for_it_in_long_rests_alone() -> None:
+    rest = round(LONG_REST_S / PERIOD_S)
+    ways = np.vstack([moving(10), np.repeat(moving(10)[-1:], 4 * rest, axis=0), moving(10)])
+    stream = stream_with(lines_of(ways))
+    stream.close()
+    way_mm = np.array(played(stream, len(ways)))[:, 0]
+    moves = (np.flatnonzero(np.diff(way_mm)) + 1).tolist()
+    again = moves[9]
+    assert moves == [*range(1, 10), *range(again, again + 10)]
+    assert again - 9 == pytest.approx(rest + LEAD, abs=LEAD / 10)
 
 
 def test_the_end_plays_what_is_left() -> None:

@@ -55,6 +55,7 @@ def test_each_state_and_error_of_the_controller_is_told(adapter: SerialAdapter) 
     assert watch.count == len(SAID)
 
 
+@pytest.mark.fault("A4")
 def test_a_controller_that_is_unplugged_ends_the_bus(adapter: SerialAdapter) -> None:
     with CanBus("can0", settings_of(adapter)) as bus:
         adapter.say("t1812AABB")

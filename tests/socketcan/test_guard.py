@@ -105,6 +105,7 @@ def events(shop: Shop, name: str) -> int:
     return sum(event["event"] == name for event in shop.events())
 
 
+@pytest.mark.fault("A4")
 def test_an_interface_that_goes_down_freezes_and_what_stands_is_adopted_when_it_is_back(
     make: Callable[[type[Wire]], Shop],
 ) -> None:
@@ -128,6 +129,7 @@ def test_an_interface_that_goes_down_freezes_and_what_stands_is_adopted_when_it_
     assert shop.offsets()[-1] == 0
 
 
+@pytest.mark.fault("A1")
 def test_bus_off_freezes(make: Callable[[type[Wire]], Shop]) -> None:
     shop = make(OnAdapter)
     shop.into_the_cut()
@@ -142,6 +144,7 @@ def test_bus_off_freezes(make: Callable[[type[Wire]], Shop]) -> None:
     assert len(wire.sent) == sent
 
 
+@pytest.mark.fault("A5")
 def test_a_full_queue_ramps_down_and_freezes_what_cannot_leave(make: Callable[[type[Wire]], Shop]) -> None:
     shop = make(OnAdapter)
     shop.into_the_cut()

@@ -125,6 +125,7 @@ def test_of_a_full_bus_no_frame_is_lost(tmp_path: Path) -> None:
     assert numbers == list(range(MANY))
 
 
+@pytest.mark.fault("A6")
 def test_what_the_kernel_dropped_is_counted_exactly(sender: socket.socket) -> None:
     """At once, and not only when another frame finds room."""
     port = SocketCanPort("can0", SETTINGS)
@@ -182,6 +183,7 @@ def test_an_interface_that_is_down_or_missing_cannot_be_opened() -> None:
         CanBus("can0", BusSettings(interface="socketcan", channel="nocan9"))
 
 
+@pytest.mark.fault("A4")
 async def test_an_interface_that_goes_down_and_up_again_is_heard_again(tmp_path: Path) -> None:
     source = BusSource("can0", machine(tmp_path, bus={"interface": "socketcan", "channel": "vcan0"}))
     source.open()

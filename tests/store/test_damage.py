@@ -73,6 +73,7 @@ def places(size: int, page: int, seed: int) -> list[tuple[int, int]]:
     return found
 
 
+@pytest.mark.fault("F17")
 def test_no_flipped_bit_of_a_history_changes_what_is_read(tmp_path: Path) -> None:
     whole = filled(tmp_path)
     with History.read(tmp_path) as history:
@@ -189,6 +190,7 @@ def test_a_row_of_an_older_schema_that_cannot_be_read_is_left_out(tmp_path: Path
 
 
 @pytest.mark.parametrize("raw", [True, False])
+@pytest.mark.fault("F17")
 def test_no_flipped_bit_of_a_window_changes_what_is_read(raw: bool) -> None:
     made = window(raw=raw)
     whole = encode_window(made, "0123456789abcdef")
@@ -238,6 +240,7 @@ ZEROS = np.zeros(400_000)
     ],
     ids=["rows", "columns", "dictionary", "texts", "lists", "page"],
 )
+@pytest.mark.fault("G8")
 def test_a_file_that_would_take_more_than_a_window_is_refused_before_it_is_read(
     content: bytes, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -90,6 +90,7 @@ def _refused(path: Path) -> bool:
 
 
 @pytest.mark.parametrize("name", tables.RECORDING_FORMATS)
+@pytest.mark.fault("G8")
 def test_a_damaged_file_is_refused_in_one_sentence_or_read_as_numbers(name: str, tmp_path: Path) -> None:
     path = tmp_path / f"r{SUFFIX[name]}"
     export_table(_table(), path, name)
@@ -107,6 +108,7 @@ def test_a_damaged_file_is_refused_in_one_sentence_or_read_as_numbers(name: str,
         read_recording(path)
 
 
+@pytest.mark.fault("G8")
 def test_a_file_that_declares_more_than_a_recording_has_is_refused_before_it_is_read(tmp_path: Path) -> None:
     import h5py
 

@@ -35,6 +35,7 @@ def test_a_revision_comes_back_bit_by_bit(tmp_path: Path) -> None:
     assert (stored.temperature_c, stored.config_digest) == (21.5, "0123456789abcdef")
 
 
+@pytest.mark.fault("F9")
 def test_the_newest_parameters_are_the_last_written_whatever_the_clock_says(tmp_path: Path) -> None:
     assert latest_parameters(tmp_path) == {}
     with History.open(tmp_path) as history:
@@ -92,6 +93,7 @@ def test_nothing_recorded_yet(tmp_path: Path) -> None:
     assert error.value.code == "NoHistory"
 
 
+@pytest.mark.fault("F19")
 def test_another_schema_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
     History.open(tmp_path).close()
     db = sqlite3.connect(tmp_path / FILE_NAME)
@@ -117,6 +119,7 @@ def first_schema(folder: Path) -> None:
     db.close()
 
 
+@pytest.mark.fault("F19")
 def test_an_older_schema_is_brought_up_by_the_writer_and_read_as_it_is(tmp_path: Path) -> None:
     """Nothing of it is lost; a reader changes nothing and misses what was not kept then."""
     first_schema(tmp_path)

@@ -144,6 +144,7 @@ def test_the_store_numbers_its_files_and_lets_the_oldest_go(tmp_path: Path) -> N
     assert again.append(window(n=60), at_least=41).number == 42
 
 
+@pytest.mark.fault("F18")
 def test_strays_are_listed_and_left_alone(tmp_path: Path) -> None:
     names = [
         "notes.txt",
@@ -175,6 +176,7 @@ def test_what_a_power_cut_left_is_overwritten(tmp_path: Path) -> None:
     [(errno.ENOSPC, "DiskFull"), (errno.EROFS, "ReadOnlyStore"), (errno.EIO, "StoreFault")],
 )
 @pytest.mark.parametrize("step", ["open", "write", "fsync"])
+@pytest.mark.fault("F3", "F4", "F5")
 def test_a_refusing_disk_loses_no_old_window_and_leaves_no_half_one(
     step: str, number: int, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -193,6 +195,7 @@ def test_a_refusing_disk_loses_no_old_window_and_leaves_no_half_one(
     assert store.append(window(n=60, seed=3)).number == 2
 
 
+@pytest.mark.fault("F6")
 def test_a_short_write_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write = os.write
     monkeypatch.setattr("fdhil.store.atomic.os.write", lambda fd, data: write(fd, bytes(data[:1000])))

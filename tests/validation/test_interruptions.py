@@ -70,6 +70,7 @@ def test_a_slower_rapid_at_a_constant_override_is_as_good_as_any() -> None:
         (lambda t: 1 - 0.7 * np.clip(np.minimum((t - 0.3) / 0.1, (0.7 - t) / 0.1), 0, 1), "and rises again"),
     ],
 )
+@pytest.mark.fault("C7")
 def test_an_override_that_changes_on_the_way_is_refused_with_the_speed(rate: object, words: str) -> None:
     assert callable(rate)
     (reason,) = _reasons(_rows(drives.rates(MOVE, rate)))
@@ -93,6 +94,7 @@ def test_what_the_nc_says_was_no_rapid_as_planned_is_refused(nc: NcMove, words: 
     assert list(interruptions(good)) == []
 
 
+@pytest.mark.fault("C7")
 def test_a_quick_stop_is_refused_with_both_ramps() -> None:
     rates = drives.rates(MOVE)[:450]
     stop = np.maximum(rates[-1] - 16.0 * 1e-3 * np.arange(1, 60), 0.0)

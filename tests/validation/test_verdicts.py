@@ -73,12 +73,14 @@ def _gain_step(values: Float) -> Float:
         ("current_a", _gain_step, "CalibrationSuspect"),
     ],
 )
+@pytest.mark.fault("B11", "B12", "C1", "C8")
 def test_sensor_faults_are_named(field: str, change: Callable[[Float], Float], code: str) -> None:
     outcome = analyse(_changed(windows(0.003)[0], **{field: change}), SETTINGS)
     assert not outcome.verdict.accepted
     assert code in _codes(outcome)
 
 
+@pytest.mark.fault("C6")
 def test_a_load_torque_is_named_with_its_amount() -> None:
     demand = bench.shuttle()
     load = np.zeros(demand.size)
@@ -117,6 +119,7 @@ def test_a_counted_gap_is_refused_when_long_and_left_out_when_short() -> None:
         assert accepted or "StaleData" in _codes(outcome)
 
 
+@pytest.mark.fault("C5")
 def test_a_short_rapid_lacks_its_cruise() -> None:
     signals = bench.run(bench.Plant(), bench.shuttle(distance=0.05))
     outcome = analyse(find_windows(parse_recording(bench.as_csv(signals, 0.003)))[0], SETTINGS)
@@ -125,6 +128,7 @@ def test_a_short_rapid_lacks_its_cruise() -> None:
     assert outcome.estimate is not None
 
 
+@pytest.mark.fault("D3")
 def test_swapped_columns_are_unphysical() -> None:
     window = windows(0.003)[0]
     assert window.voltage_v is not None
@@ -132,6 +136,7 @@ def test_swapped_columns_are_unphysical() -> None:
     assert "Unphysical" in _codes(analyse(swapped, SETTINGS))
 
 
+@pytest.mark.fault("C2")
 def test_not_finite_values_never_enter_a_fit() -> None:
     outcome = analyse(_changed(windows()[0], current_a=lambda v: np.where(v > 50, np.inf, v)), SETTINGS)
     assert _codes(outcome) == {"NotFinite"}
@@ -167,6 +172,7 @@ def test_a_sensor_with_its_own_clock_is_aligned_by_the_data() -> None:
     assert abs(estimate.value("L") / 0.005 - 1) < 0.01
 
 
+@pytest.mark.fault("C3")
 def test_coarse_steps_are_told_and_widen_the_intervals() -> None:
     window = windows(0.001)[0]
     coarse = _changed(window, current_a=lambda values: np.round(values / 8.0) * 8.0)
@@ -197,3 +203,36 @@ def test_a_load_that_changed_between_the_windows_is_seen() -> None:
     _, verdict = pool([analyse(light, SETTINGS), analyse(heavy, SETTINGS)], SETTINGS)
     assert not verdict.accepted
     assert [reason.code for reason in verdict.reasons] == ["LoadChanged"]
+
+
+@pytest.mark.fault("D6")
+@pytest.mark.parametrize(
+    "error", [np.linalg.LinAlgError("singular"), FloatingPointError("overflow"), ValueError("infs or NaNs")]
+)
+def test_a_solver_that_raises_costs_the_window_alone(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    good, bad = windows(0.003, moves=2)[:2]
+
+    def fail(*_: object) -> None:
+        raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr("fdhil.pipeline.analysis.maximum_likelihood.fit_windows", fail)
+        outcome = analyse(bad, SETTINGS)
+    assert not outcome.verdict.accepted
+    assert "SolverFailed" in _codes(outcome)
+    assert outcome.estimate is not None
+    assert np.isnan(outcome.estimate.values).all()
+    assert analyse(good, SETTINGS).verdict.accepted
+
+
+@pytest.mark.fault("C4")
+def test_a_rapid_whose_beginning_was_missed_lacks_its_acceleration() -> None:
+    signals = bench.run(bench.Plant(), bench.shuttle())
+    rows = bench.as_csv(signals, 0.003).splitlines(keepends=True)
+    head = next(k for k, line in enumerate(rows) if line.startswith("time_s")) + 1
+    speed = np.abs(np.asarray(signals.speed))
+    late = int(np.argmax(speed > 0.95 * speed.max()))
+    windows_found = find_windows(parse_recording("".join(rows[:head] + rows[head + late :])))
+    outcome = analyse(windows_found[0], SETTINGS)
+    assert not outcome.verdict.accepted
+    assert "MissingStage(accel)" in _codes(outcome)

@@ -115,6 +115,7 @@ def _coarse(window: Window) -> Window:
     ],
     ids=lambda value: getattr(value, "__name__", value),
 )
+@pytest.mark.fault("D5", "B11", "B12", "C1", "C6")
 def test_each_fault_refuses(fault: Callable[[Window], Window], code: str) -> None:
     outcome = analyse(fault(screw_windows()[0]), SETTINGS)
     assert code in [reason.code for reason in outcome.verdict.reasons]

@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Sequence
 
 LEAD_S = 0.25  # rows kept before the first is played, and again after a hole
+LONG_REST_S = 0.5  # what is left of a longer rest is left out while rows pile up
 FULL_ROWS = 20_000  # no more is read while so many wait
 _STEP_TOLERANCE = 0.01  # of the SYNC period, between two rows
 _ROUNDING_S = 1.1e-6  # times may be written with 6 decimals
@@ -36,6 +37,7 @@ class DemandStream:
         self._time_s: float | None = None
         self._here: list[float] = []
         self._flows = self._moving = self._closed = False
+        self._long_rest, self._rested = math.ceil(LONG_REST_S / period_s), 0
 
     def take(self, line: str) -> None:
         """Take one line: first the names of the columns, then rows; StreamError when it cannot be played.
@@ -131,8 +133,11 @@ class DemandStream:
         if self._flows:
             row = self._waiting.popleft()
             self._moving = bool(self._here) and row != self._here
+            self._rested = 0 if self._moving else self._rested + 1
             self._here = row
             self.rows += 1
+            while self._rested > self._long_rest and self.late and self._waiting[0] == row:
+                self._waiting.popleft()
         elif self._moving:
             self.starved += 1
         return self._here, False

@@ -1,0 +1,46 @@
+"""The daemon beside an NC that tells its moves: what it says of a rapid goes with the window to history and status."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from fdhil.pipeline import Record
+from fdhil.records import MoveEvent, MoveKind, NcMove, NcState, Notice
+from fdhil.store.history import History
+from fdhil.store.windows import list_windows, read_window
+from tests.daemon.machine import Machine, config_of, rapids
+from tests.daemon.test_service import serving, status_when
+
+
+def said(records: Sequence[Record], moves: Sequence[NcMove]) -> list[Record]:
+    """The records, with what the NC said of each rapid."""
+    told = iter(moves)
+    return [
+        replace(record, nc=next(told)) if isinstance(record, MoveEvent) and record.kind is MoveKind.RAPID else record
+        for record in records
+    ]
+
+
+async def test_what_the_nc_says_of_a_rapid_goes_with_its_window(tmp_path: Path) -> None:
+    config = config_of(tmp_path)
+    moves = [NcMove(12, "part.ngc", (1.0, 1.0), False), NcMove(14, "part.ngc", (0.7, 0.7), False)]
+    state = NcState(time.monotonic_ns(), 1000, MoveKind.RAPID, 14, rapid_override=0.7, program="/nc/part.ngc")
+    machine = Machine(said(rapids(config, count=2), moves))
+    machine.give(state, Notice("BusSilent", "MAJOR", "nothing is heard"))
+    async with serving(config, machine) as path:
+        status = await status_when(path, lambda s: s["axes"]["X"]["accepted"] and s["axes"]["X"]["refused"])
+    assert status["nc"]["line"] == 14
+    assert status["axes"]["X"]["refused_by"] == {"EpisodeAborted": 1}
+    assert status["axes"]["X"]["last_window"]["nc"]["override"] == [0.7, 0.7]
+    texts = {notice["code"]: notice["text"] for notice in status["notices"]}
+    assert texts["BusSilent"] == "nothing is heard (the NC is at line 14 of part.ngc)"
+    assert "rapid override is 70 %" in texts["OverrideChanged"]
+    with History.read(config.store.directory) as history:
+        first, second = history.windows("X")
+    assert [window.nc and window.nc["line"] for window in (first, second)] == [12, 14]
+    assert second.reasons[0] == "EpisodeAborted: the NC says that its override was 70 % in line 14"
+    stored = [read_window(file.path).nc for file in list_windows(config.store.directory / "windows").windows]
+    assert moves[0] in stored

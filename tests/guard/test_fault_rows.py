@@ -1,0 +1,157 @@
+"""Faults of the matrix that the guard's other tests show without their class or without the whole reaction."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from fdhil.guard.protocol import Mode
+from fdhil.guard.settings import to_json
+from tests.guard.machine import FACTS_GIVEN, Bench, arm_request, bench
+from tests.guard.shop import TOKEN, Shop
+
+
+def cutting(machine: Bench) -> Bench:
+    """Return the machine in the cut, with an offset that is well away from zero."""
+    machine.settle()
+    assert machine.arm() == ()
+    machine.run(30)
+    machine.play()
+    while machine.offsets[0] < 150:
+        machine.sync()
+    machine.alarms.clear()
+    return machine
+
+
+def ends_at_zero_by(machine: Bench, code: str) -> None:
+    """Check the class of what ended it, and that it went to zero by ramp and stays off."""
+    assert machine.alarms[-1].code == code
+    machine.until(Mode.OFF)
+    assert [drive.offset for drive in machine.drives] == [0, 0]
+    sent = [offsets[0] for _, offsets in machine.frames]
+    assert max(abs(b - a) for a, b in itertools.pairwise(sent)) <= machine.settings.axes[0].limits.hard_rate
+    machine.settle()
+    assert machine.mode is Mode.OFF
+
+
+@pytest.mark.fault("A18")
+def test_a_foreign_node_with_the_drives_id_ends_it() -> None:
+    machine = cutting(bench())
+    while machine.mode is Mode.ACTIVE:
+        machine.hear(0x281, struct.pack("<Hhh", 0x1237, 0, 7))
+        machine.sync()
+    ends_at_zero_by(machine, "ForeignProducer")
+
+
+@pytest.mark.fault("A22")
+def test_a_heartbeat_that_stops_ends_it() -> None:
+    machine = bench()
+    watched = tuple(replace(axis, heartbeat_timeout_s=0.1) for axis in machine.settings.axes)
+    machine.settings = machine.listener.settings = replace(machine.settings, axes=watched)
+
+    def beat() -> None:
+        for drive in machine.drives:
+            machine.hear(0x700 + drive.node_id, b"\x05")
+
+    for _ in range(130):
+        beat()
+        machine.sync()
+    assert machine.arm() == ()
+    machine.play()
+    while machine.offsets[0] < 150:
+        beat()
+        machine.sync()
+    machine.alarms.clear()
+    for _ in range(110):
+        machine.sync()
+    assert machine.alarms[0].code == "HeartbeatLost"
+    machine.until(Mode.OFF)
+    assert [drive.offset for drive in machine.drives] == [0, 0]
+
+
+@pytest.mark.fault("E4", "E7", "E14", "E19", "F5")
+@pytest.mark.parametrize(
+    ("fact", "code"),
+    [
+        pytest.param("model_fresh", "ModelStale", id="E4"),
+        pytest.param("gain_positive", "HarmPredicted", id="E7"),
+        pytest.param("watchdog_proven", "WatchdogNotArmed", id="E14"),
+        pytest.param("skill_enough", "PoorSkill", id="E19"),
+        pytest.param("journal_writable", "ReadOnlyStore", id="F5"),
+    ],
+)
+def test_what_is_not_vouched_for_arms_nothing(fact: str, code: str) -> None:
+    machine = bench()
+    machine.settle()
+    refused = machine.sync(arm_request(facts={**FACTS_GIVEN, fact: False})).refused
+    assert refused is not None
+    assert [alarm.code for alarm in refused] == [code]
+    machine.run(50)
+    assert machine.frames == []
+    assert machine.heartbeats == []
+
+
+@pytest.mark.fault("A16")
+def test_a_pdo_longer_than_its_mapping_arms_nothing() -> None:
+    machine = bench()
+    machine.settle()
+    machine.hear(0x281, struct.pack("<Hhh", 0x1237, 0, 0) + b"\0")
+    machine.sync()
+    assert "PdoMapping" in {alarm.code for alarm in machine.arm()}
+    assert machine.frames == []
+
+
+class LateSync(Bench):
+    """A machine of the host's clock, whose SYNC comes ``late_s`` after its time."""
+
+    late_s = 0.0
+
+    def delay(self) -> None:
+        """Put the delay between the SYNC and the listener."""
+        hear = self.listener.at_sync
+        self.listener.at_sync = lambda data, stamp_s, now_s: hear(  # type: ignore[method-assign]
+            data, stamp_s + self.late_s, now_s + self.late_s
+        )
+
+
+@pytest.mark.fault("A8")
+def test_a_sync_that_is_late_once_is_held_and_another_period_ends_it() -> None:
+    made = bench(clock="monotonic")
+    machine = LateSync(made.settings, made.path, made.demand)
+    machine.delay()
+    cutting(machine)
+    machine.late_s += 0.0025
+    machine.sync()
+    assert machine.mode is Mode.HOLD
+    machine.until(Mode.ACTIVE, 40)
+    for _ in range(60):
+        machine.late_s += 0.00005  # 5 percent of the period with each
+        machine.sync()
+    assert machine.state.cause is not None
+    assert machine.state.cause.code == "SyncJitter"
+    ends_at_zero_by(machine, "SyncJitter")
+
+
+@pytest.mark.fault("G10")
+def test_the_operators_token_is_in_nothing_that_is_written(tmp_path: Path) -> None:
+    """Neither in the settings, the journal, the status, nor in any answer, right or wrong."""
+    shop = Shop(tmp_path)
+    try:
+        client = shop.into_the_cut()
+        answers = [
+            shop.ask(client, {"request": "arm", "token": TOKEN}),
+            shop.ask(client, {"request": "adopt", "token": TOKEN, TOKEN: 1}),
+            shop.ask(client, {"request": "status", "token": TOKEN}),
+        ]
+        written = json.dumps([answers, shop.events()]) + to_json(shop.settings)
+        assert TOKEN not in written
+        assert repr(TOKEN)[1:-1] not in written
+        assert hashlib.sha256(TOKEN.encode()).hexdigest() in to_json(shop.settings)
+    finally:
+        shop.close()
