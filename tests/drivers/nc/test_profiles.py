@@ -143,7 +143,8 @@ def test_a_profile_of_another_interface_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "text"), [(None, "cannot be read"), (b"\xff", "no TOML"), (b"#" * 300_000, "larger"), (b"a = [", "TOML")]
+    ("content", "text"),
+    [(None, "cannot be read"), (b"\xff", "no TOML"), (b"#" * 300_000, "larger"), (b"a = [", "TOML")],
 )
 def test_a_file_that_cannot_be_used_is_told(tmp_path: Path, content: bytes | None, text: str) -> None:
     path = tmp_path / "own.toml"
