@@ -26,6 +26,7 @@ HALF_WIDTH_MM = 7.0
 WIDTHS = {"wide": 1200, "narrow": 480}
 TOP_OF_PAGE = 800  # px, of the prediction's page: its map and error
 TALLEST = 14_000  # px, of what the browser draws
+SHOWN = {"paper": 5_000}  # px, of a page that goes on in the same way
 COLOURS = 160  # of a screenshot, by how often they are; the maps' scale is added, whose colours are seldom
 OF_SCALE = 64
 CONFIG = str(OUT / "machine.toml")
@@ -48,6 +49,10 @@ def main() -> None:
         for page, command in PAGES.items():
             pages[page] = folder / f"{page}.html"
             subprocess.run([sys.executable, "-m", "fdhil.cli.main", *command, pages[page]], check=True, stdout=2)
+        subprocess.run(
+            [sys.executable, "-m", "fdhil.cli.main", "paper", "--out", folder / "paper"], check=True, stdout=2
+        )
+        pages["paper"] = folder / "paper" / "paper.html"
         for page, path in pages.items():
             for label, width in WIDTHS.items():
                 screenshot(browser, folder, path, IMAGES / f"{page}-{label}.png", width)
@@ -84,7 +89,7 @@ def screenshot(browser: str, folder: Path, page: Path, picture: Path, width: int
     empty = Image.new("RGB", image.size, image.getpixel((0, TALLEST - 1)))
     used = ImageChops.difference(image, empty).getbbox()
     assert used is not None
-    cropped = image.crop((0, 0, width, min(TALLEST, used[3] + 20)))
+    cropped = image.crop((0, 0, width, min(SHOWN.get(page.stem, TALLEST), used[3] + 20)))
     often = (cropped.quantize(COLOURS).getpalette() or [])[: 3 * COLOURS]
     scale = 255 * colormaps["viridis"](np.linspace(0, 1, OF_SCALE))[:, :3]
     palette = Image.new("P", (1, 1))
