@@ -46,7 +46,9 @@ class Operator:
             if ready(self.status):
                 return
             time.sleep(0.005)
-        raise Failed(f"the machine did not get there; {self._words()}")
+        now = self.status
+        state = f"interpreter {now.interp_state}, task {now.exec_state}, queue {now.queue}, paused {now.paused}"
+        raise Failed(f"the machine did not get there ({state}); {self._words()}")
 
     def _words(self) -> str:
         said = []
@@ -84,9 +86,11 @@ class Operator:
             case "rest":
                 self.rest()
             case "override":
-                self.order(self.command.feedrate, order["value"])
+                self.command.feedrate(order["value"])  # done at once, complete only with the program that runs
+                self.wait(lambda status: abs(status.feedrate - order["value"]) < 1e-6)
             case "rapid_override":
-                self.order(self.command.rapidrate, order["value"])
+                self.command.rapidrate(order["value"])
+                self.wait(lambda status: abs(status.rapidrate - order["value"]) < 1e-6)
             case "pause":
                 self.command.auto(linuxcnc.AUTO_PAUSE)
             case "resume":

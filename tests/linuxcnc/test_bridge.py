@@ -39,6 +39,13 @@ G1 X5 F2000
 G1 X0
 M2
 """
+RAPIDS = """G21 G90
+G0 X450
+G4 P0.6
+G0 X0
+G4 P0.6
+M2
+"""
 TRUTH = """
 net x sampler.2.pin.0
 net y sampler.2.pin.1
@@ -91,10 +98,14 @@ class Heard:
                 return False
             if len([event for event in self.events("X") if event.kind is MoveKind.RAPID]) < rapids:
                 return False
-            demand = {axis: self.of(axis, 100)[1][-1500:] for axis in "XY"}
-            return all(np.ptp(demand[axis]) == 0 and abs(demand[axis][-1] - self.place(axis)) < 0.001 for axis in "XY")
+            return self.stands(1500)
 
         await self.until(stands)
+
+    def stands(self, ticks: int) -> bool:
+        """Whether the bus has stood for so long where the NC says that it is."""
+        demand = {axis: self.of(axis, 100)[1][-ticks:] for axis in "XY"}
+        return all(np.ptp(demand[axis]) == 0 and abs(demand[axis][-1] - self.place(axis)) < 0.001 for axis in "XY")
 
 
 @asynccontextmanager
@@ -174,3 +185,34 @@ def check_sequence(heard: Heard, axis: str, demand: Float, types: Sequence[int])
     wrong = [k for k in np.flatnonzero(moves & (told != true)).tolist() if np.abs(edges - k).min() > 5]
     assert wrong == [], [(k, told[k], true[k]) for k in wrong[:5]]
     assert set(told[moves]) == {MoveKind.RAPID, MoveKind.FEED, MoveKind.ARC}
+
+
+async def test_overrides_and_holds_are_told_and_their_rapids_refused(tmp_path: Path) -> None:
+    port, path = free_port(), write_config(tmp_path, 'pace = "lockstep"\nmodbus = false')
+    with TwinProcess(path, "--demand", "-") as twin, LinuxCnc(hal=hal_of(port)) as nc:
+        config = beside(path, twin, port)
+        async with listening(config) as heard:
+            with nc.driving(twin):
+                for value in (0.8, 1.0):
+                    await asyncio.to_thread(nc.order, "override", value=value)
+                    await heard.until(lambda value=value: heard.state.feed_override == value)  # type: ignore[misc]
+                for run, value in enumerate((1.0, 0.9, 1.0), 1):
+                    if value != heard.state.rapid_override:
+                        await asyncio.to_thread(nc.order, "rapid_override", value=value)
+                    await heard.until(lambda value=value: heard.state.rapid_override == value)  # type: ignore[misc]
+                    await asyncio.to_thread(nc.run, RAPIDS)
+                    await heard.rest(2 * run)
+                await asyncio.to_thread(nc.start, RAPIDS)
+                await heard.until(lambda: heard.state.motion is MoveKind.RAPID and heard.place("X") > 20.0)
+                await asyncio.to_thread(nc.order, "pause")
+                await heard.until(lambda: heard.state.motion is MoveKind.HOLD and heard.stands(300))
+                await asyncio.to_thread(nc.order, "resume")
+                await asyncio.to_thread(nc.order, "rest")
+                await heard.rest(9)  # after a hold that the bus has shown, what is left is a rapid of its own
+    outcomes = windows_of(heard, config)
+    texts = [str(o.verdict.reasons[0]) for o in outcomes if not o.verdict.accepted]
+    accepted = [o.window.nc for o in outcomes if o.verdict.accepted]
+    assert {nc and (nc.override, nc.held) for nc in accepted} == {((1.0, 1.0), False)}, texts
+    assert len(accepted) >= 4, [(o.window.start_tick, o.window.nc, str(o.verdict.reasons)) for o in outcomes]
+    assert [t for t in texts if "override was 90 % in line" in t and t.startswith("EpisodeAborted")], texts
+    assert [t for t in texts if "feed was held in line 2" in t], texts
