@@ -176,9 +176,8 @@ def test_without_settings_or_descriptor_it_says_what_is_wrong(
     told = capsys.readouterr().err.splitlines()
     assert "run fdhil-guard" in told[0]
     assert "start the guard with fdhil-guard" in told[1]
-    monkeypatch.delitem(sys.modules, "fdhil.guard.__main__")
     with pytest.raises(SystemExit, match="3"):
-        runpy.run_module("fdhil.guard", run_name="__main__")
+        runpy.run_path(str(entry.__file__), run_name="__main__")
 
 
 def test_a_machine_whose_numbers_are_unknown_leaves_two_signals_alone(

@@ -105,8 +105,8 @@ def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
         load_profile(Drive(profile=str(tmp_path / "none.toml")))
     with pytest.raises(EdsError, match="cannot be read"):
         load_profile(Drive(profile="cia402", eds=tmp_path / "none.eds"))
-    (tmp_path / "long.toml").write_bytes(b" " * 70_000)
-    with pytest.raises(ConfigError, match="larger than 64 KiB"):
+    (tmp_path / "long.toml").write_bytes(b" " * 300_000)
+    with pytest.raises(ConfigError, match="larger than 256 KiB"):
         load_profile(Drive(profile=str(tmp_path / "long.toml")))
 
 
