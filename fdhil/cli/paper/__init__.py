@@ -24,8 +24,9 @@ RUNS = 50
               help="Folder for paper.html, paper.json and the pictures.")  # fmt: skip
 @click.option("--runs", type=click.IntRange(2, 10_000), default=RUNS, show_default=True,
               help="Noisy recordings behind each error of an estimator.")  # fmt: skip
+@click.option("--pdf", is_flag=True, help="Print the page as paper.pdf, too (needs chromium).")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of a table.")
-def paper(out: Path, runs: int, as_json: bool) -> int:
+def paper(out: Path, runs: int, pdf: bool, as_json: bool) -> int:
     """Reproduce the paper that fdhil goes back to, claim by claim.
 
     Each claim is put to trials in simulated scenarios, which are configs/paper.toml with a few keys changed: it holds,
@@ -34,15 +35,17 @@ def paper(out: Path, runs: int, as_json: bool) -> int:
     from importlib.metadata import version
 
     from fdhil.cli.paper.page import document, page, write_pictures
-    from fdhil.report import require, write
+    from fdhil.report import deliver, find_browser, require
     from fdhil.store.output import open_output
 
     require()
+    if pdf:
+        find_browser()  # before the work
     _make(out)
     claims = gather(runs, lambda text: click.echo(text, err=True) if sys.stderr.isatty() or not as_json else None)
     files = write_pictures(claims, out)
     told = document(claims, runs, version("fdhil"), files)
-    write(page(claims), out / "paper.html")
+    deliver(page(claims), out / "paper.html", out / "paper.pdf" if pdf else None)
     with open_output(out / "paper.json") as file:
         file.write(json.dumps(told, indent=1, ensure_ascii=False).encode())
     if as_json:
