@@ -20,6 +20,7 @@ from fdhil.pipeline import analyse, pool
 from fdhil.pipeline.own_loops import explained
 from fdhil.records import Estimate, LoopEstimate, Reason, Recording, Verdict, Window, WindowOutcome
 from fdhil.store.accelerometer_csv import with_accelerometer
+from fdhil.store.column_map import ColumnMap
 from fdhil.store.recording_table import SOURCES
 from fdhil.store.recordings import read_recording
 
@@ -55,7 +56,7 @@ def analyse_files(
     machine: MachineConfig | None = None,
     progress: Progress = unseen,
     accelerometer: Path | None = None,
-    columns: Path | None = None,
+    columns: ColumnMap | None = None,
 ) -> Iterator[FileResult]:
     """Yield the result of each recording in order, also of those that cannot be read.
 
@@ -81,7 +82,7 @@ def analyse_file(
     machine: MachineConfig | None = None,
     progress: Progress = unseen,
     accelerometer: Path | None = None,
-    columns: Path | None = None,
+    columns: ColumnMap | None = None,
 ) -> FileResult:
     """Return the windows of one recording analysed, and their pool, or why it cannot be read."""
     try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -92,7 +91,7 @@ def _stopped_like_ctrl_c() -> Iterator[None]:
 
     Only the first of them counts: a second one must not end what brings the axis to a stand.
     """
-    from fdhil.commissioning.moving import ENDING_SIGNALS
+    from fdhil.commissioning.moving import handling
 
     stopping = False
 
@@ -102,12 +101,8 @@ def _stopped_like_ctrl_c() -> Iterator[None]:
             stopping = True
             raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, stop) for number in ENDING_SIGNALS}
-    try:
+    with handling(stop):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _progress_of(machine: MachineConfig, axis: str) -> Progress:

@@ -9,6 +9,7 @@ import click
 
 from fdhil import tables
 from fdhil.store import suffixes
+from fdhil.store.column_map import read_column_map
 from fdhil.store.export import export_table
 from fdhil.store.output import open_output
 from fdhil.store.recordings import read_table
@@ -31,6 +32,6 @@ def export_file(recording: Path, out: Path, format_name: str | None, columns: Pa
         with open_output(out) as file:
             file.write(content)
         return {"format": name, "frames": frames}
-    table = read_table(recording, columns)
+    table = read_table(recording, None if columns is None else read_column_map(columns))
     export_table(table, out, name)
     return {"format": name, "axis": table.headers.get("axis"), "rows": next(iter(table.columns.values())).size}

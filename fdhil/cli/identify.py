@@ -125,13 +125,15 @@ def _analyse(
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
     from fdhil.cli.batch import analyse_files
+    from fdhil.store.column_map import read_column_map
 
+    told = None if columns is None else read_column_map(columns)
     if not sys.stderr.isatty():
-        return list(analyse_files(paths, settings, machine, accelerometer=accelerometer, columns=columns))
+        return list(analyse_files(paths, settings, machine, accelerometer=accelerometer, columns=told))
     shown = (TextColumn("identifying"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with Progress(*shown, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("identifying", total=len(paths))
-        return list(analyse_files(paths, settings, machine, partial(progress.advance, task), accelerometer, columns))
+        return list(analyse_files(paths, settings, machine, partial(progress.advance, task), accelerometer, told))
 
 
 def _file_document(result: FileResult, axes: Mapping[str, Axis], with_loops: bool) -> dict[str, Any]:

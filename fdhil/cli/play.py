@@ -7,7 +7,7 @@ import select
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -140,25 +140,19 @@ def _say(text: str) -> None:
 @contextmanager
 def _raised() -> Iterator[None]:
     """SIGTERM and a terminal that closes are raised like Ctrl-C while the axes stand."""
-    with _handled(lambda number, _frame: signal.default_int_handler(number, _frame)):
+    from fdhil.commissioning.moving import handling
+
+    with handling(signal.default_int_handler):
         yield
 
 
 @contextmanager
 def _stopping(path: SetPoints) -> Iterator[None]:
     """While the axes move they are braked instead, whatever is pressed how often."""
-    with _handled(lambda number, _frame: path.stop(SIGNALS[number])):
-        yield
+    from fdhil.commissioning.moving import handling
 
-
-@contextmanager
-def _handled(handler: Callable[[int, Any], None]) -> Iterator[None]:
-    before = {number: signal.signal(number, handler) for number in SIGNALS}
-    try:
+    with handling(lambda number, _frame: path.stop(SIGNALS[number])):
         yield
-    finally:
-        for number, old in before.items():
-            signal.signal(number, old)
 
 
 def _told(plan: Plan, program: Path) -> str:

@@ -12,6 +12,7 @@ from click.testing import CliRunner, Result
 from fdhil import tables
 from fdhil.cli.identify import identify
 from fdhil.cli.main import cli, run_safely
+from fdhil.errors import ConfigError
 from fdhil.store import suffixes
 from fdhil.store.export import export_table, table_of
 from studies import bench
@@ -174,3 +175,11 @@ def test_every_file_format_gives_the_same_answer(tmp_path: Path) -> None:
         answers.append(told_document(invoke("--json", path))["files"][0]["pooled"])
     assert answers[0]["validated"]
     assert answers == [answers[0]] * len(answers)
+
+
+def test_a_wrong_column_map_is_told_as_configuration(shuttle: Path, tmp_path: Path) -> None:
+    wrong = tmp_path / "map.toml"
+    wrong.write_text("[columns]\n")
+    refused = invoke(shuttle, "--columns", wrong).exception
+    assert isinstance(refused, ConfigError)
+    assert "headers.axis" in str(refused)

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
 
-from tests.guard import shop as guard_shop
 from tests.guard.machine import Drive
 from tests.guard.shop import Shop
-from tests.socketcan.interface import set_up
 from tests.socketcan.test_guard import OnAdapter, OnVcan, Wire
 
 pytestmark = pytest.mark.socketcan
@@ -70,21 +67,6 @@ FROZEN: dict[str, tuple[Fault, str]] = {
 }
 
 
-@pytest.fixture
-def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[type[Wire]], Shop]]:
-    made: list[Shop] = []
-
-    def build(wire: type[Wire]) -> Shop:
-        monkeypatch.setattr(guard_shop, "Wire", wire)
-        made.append(Shop(tmp_path))
-        return made[-1]
-
-    yield build
-    set_up("vcan0", True)
-    for shop in made:
-        shop.close()
-
-
 def suffer(shop: Shop, fault: Fault) -> list[str]:
     """Let the fault happen until the guard reacts, mend it and let it end; the classes that were told."""
     for _ in range(200):
@@ -101,6 +83,13 @@ def suffer(shop: Shop, fault: Fault) -> list[str]:
     return [str(event["code"]) for event in shop.events() if event["event"] == "state" and event.get("code")]
 
 
+def sends_nothing_more(shop: Shop) -> None:
+    """Check that no frame leaves the guard any more."""
+    sent = len(shop.wire.sent)
+    shop.run(50)
+    assert len(shop.wire.sent) == sent
+
+
 @pytest.mark.fault("A9", "A10", "A15", "A18", "A19", "A20", "E6", "E9", "E10", "E11", "E12", "E15", "E18", "F8", "F15")
 @pytest.mark.parametrize("row", RAMPED)
 def test_it_ends_at_zero(make: Callable[[type[Wire]], Shop], row: str) -> None:
@@ -110,9 +99,7 @@ def test_it_ends_at_zero(make: Callable[[type[Wire]], Shop], row: str) -> None:
     assert code in suffer(shop, fault)
     assert shop.state == "OFF"
     assert shop.offsets()[-1] == 0
-    sent = len(shop.wire.sent)
-    shop.run(50)
-    assert len(shop.wire.sent) == sent
+    sends_nothing_more(shop)
 
 
 @pytest.mark.fault("A23", "A24")
@@ -123,9 +110,7 @@ def test_it_freezes_and_sends_nothing_more(make: Callable[[type[Wire]], Shop], r
     fault, code = FROZEN[row]
     assert code in suffer(shop, fault)
     assert shop.state == "FROZEN"
-    sent = len(shop.wire.sent)
-    shop.run(50)
-    assert len(shop.wire.sent) == sent
+    sends_nothing_more(shop)
 
 
 @pytest.mark.fault("A21")

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 
 import pytest
 
 from fdhil.guard.can_socket import Frame, RawCan
 from fdhil.guard.frames import Listener
-from tests.guard import shop as guard_shop
 from tests.guard.machine import commissioned, settings
 from tests.guard.shop import TOKEN, Shop
 from tests.socketcan.interface import CAN_FRAME, SerialAdapter, raw_socket, set_up
@@ -76,21 +74,6 @@ class OnAdapter(Wire):
         super().close()
         self._ear.close()
         self.adapter.unplug()
-
-
-@pytest.fixture
-def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[type[Wire]], Shop]]:
-    made: list[Shop] = []
-
-    def build(wire: type[Wire]) -> Shop:
-        monkeypatch.setattr(guard_shop, "Wire", wire)
-        made.append(Shop(tmp_path))
-        return made[-1]
-
-    yield build
-    set_up("vcan0", True)
-    for shop in made:
-        shop.close()
 
 
 def until(shop: Shop, condition: Callable[[], bool], act: Callable[[], None]) -> None:

@@ -81,7 +81,7 @@ def test_a_makers_text_file_becomes_a_recording(case: str, tmp_path: Path) -> No
     trace, told = tmp_path / "trace.csv", tmp_path / "map.toml"
     trace.write_bytes(write(_columns()))
     told.write_text(HEADERS + MAP % time)
-    read = read_recording(trace, told)
+    read = read_recording(trace, read_column_map(told))
     assert (read.axis, read.dt_s, read.voltage_v, read.torque_constant_nm_per_a) == ("X", 0.001, None, 0.3)
     np.testing.assert_allclose(read.current_a, CURRENT, rtol=1e-7)
     np.testing.assert_allclose(read.speed_rad_s, SPEED, rtol=1e-7, atol=1e-9)
@@ -94,7 +94,7 @@ def test_without_a_speed_it_is_the_difference_of_positions(tmp_path: Path) -> No
     told.write_text(
         HEADERS + MAP.replace('speed_rad_per_s = { name = "Drehzahl", unit = "rpm" }\n', "") % CASES["semicolon"][1]
     )
-    read = read_recording(trace, told)
+    read = read_recording(trace, read_column_map(told))
     assert read.headers["speed_source"] == "difference"
     np.testing.assert_allclose(read.speed_rad_s[1:], SPEED[1:], rtol=1e-5, atol=1e-4)
 
@@ -103,7 +103,7 @@ def test_a_speed_of_the_table_needs_the_pitch_alone(tmp_path: Path) -> None:
     trace, told = tmp_path / "trace.csv", tmp_path / "map.toml"
     trace.write_bytes(_semicolon(_columns() | {"Drehzahl": SPEED * PITCH_M / (2 * math.pi) * 60e3}))
     told.write_text(HEADERS + MAP.replace('"rpm"', '"mm/min"') % CASES["semicolon"][1])
-    np.testing.assert_allclose(read_recording(trace, told).speed_rad_s, SPEED, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(read_recording(trace, read_column_map(told)).speed_rad_s, SPEED, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -139,4 +139,4 @@ def test_a_trace_that_is_not_what_the_map_says_is_one_sentence(content: bytes, w
     trace.write_bytes(content)
     told.write_text(HEADERS + MAP % CASES["quoted"][1])
     with pytest.raises(RecordingError, match=words):
-        read_recording(trace, told)
+        read_recording(trace, read_column_map(told))
