@@ -6,10 +6,17 @@ KERNELS := $(shell grep -rlE --include='*.py' 'njit|^@(compiled|inlined)' fdhil)
 # the tests marked socketcan stand in these folders; the machine in which they run has little memory for others
 VCAN   := bash tests/integration/vcan-vm.sh -t 900 -M 2048
 
+# tests against LinuxCNC stand in these folders; of it a computer runs one at a time
+LINUXCNC := tests/linuxcnc tests/program
+
+# of make fuzz: inputs to each way in, and when to go on to the next one before that
+N       ?= 2000
+SECONDS ?= 100000
+
 # a child process need not translate fdhil anew
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup docs demo test test-vcan test-full faults loaded lint bench study lock clean
+.PHONY: help setup docs demo test test-vcan test-full faults fuzz guard mutants audit loaded lint bench study lock clean
 
 help:            ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -45,15 +52,38 @@ test: setup      ## the default tests: in-process bus and loopback hub, no Debia
 test-vcan: setup ## the integration suite and the socket tests on a real SocketCAN interface
 	@$(VCAN) $(BIN)/python -m pytest -q -p no:cacheprovider -m socketcan tests/socketcan tests/integration tests/foreign
 
-test-full: test  ## adds the tests against programs of others: LinuxCNC (linuxcnc-uspace), a CANopen stack (nodejs, npm), a browser (chromium)
+test-full: test  ## adds the tests against programs of others: LinuxCNC (linuxcnc-uspace), a CANopen stack (nodejs, npm), a browser (chromium), mosquitto, prometheus, strace, faketime, nats-server, postgresql
 	@command -v rs274 >/dev/null || { echo "make test-full needs rs274: apt-get install linuxcnc-uspace" >&2; exit 1; }
 	@command -v npm >/dev/null || { echo "make test-full needs npm: apt-get install nodejs npm" >&2; exit 1; }
 	@command -v chromium >/dev/null || { echo "make test-full needs chromium: apt-get install chromium" >&2; exit 1; }
+	@PATH="$$PATH:/usr/sbin"; command -v mosquitto >/dev/null || { echo "make test-full needs mosquitto: apt-get install mosquitto" >&2; exit 1; }
+	@command -v promtool >/dev/null || { echo "make test-full needs promtool: apt-get install prometheus" >&2; exit 1; }
+	@command -v strace >/dev/null && command -v faketime >/dev/null || { echo "make test-full needs strace and faketime: apt-get install strace faketime" >&2; exit 1; }
+	@PATH="$$PATH:/usr/sbin"; command -v nats-server >/dev/null && ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 || { echo "make test-full needs nats-server and PostgreSQL: apt-get install nats-server postgresql" >&2; exit 1; }
 	@npm ci --prefix tests/foreign --ignore-scripts --no-audit --no-fund --silent
-	@$(BIN)/python -m pytest -q -m debian
+	@$(BIN)/python -m pytest -q -m debian $(LINUXCNC)
+	@$(BIN)/python -m pytest -q -m debian $(LINUXCNC:%=--ignore %) -n 2 --dist loadfile
 
-faults: setup    ## the fault matrix: each fault, its tests, survived or not; the table goes to docs/studies/faults.md
-	@$(BIN)/python -m pytest -q -p tests.fault_table --fault-table docs/studies/faults.md -m "fault and not socketcan and not debian"
+faults: setup    ## the fault matrix, row by row, and the goals R1 to R20: to docs/studies/faults.md; needs what make test-full needs
+	@$(BIN)/python -m pytest -q -p tests.fault_table --fault-table docs/studies/faults.md -m "(fault or goal) and not socketcan"
+	@$(VCAN) -w docs/studies $(BIN)/python -m pytest -q -p no:cacheprovider -p tests.fault_table --fault-table docs/studies/faults.md --on-socketcan -m "fault and socketcan" tests/socketcan tests/integration tests/foreign
+
+fuzz: setup      ## any bytes at every way in, N for each (make fuzz N=1000000); what hurts is kept in out/fuzz/found
+	@mkdir -p out/fuzz
+	@$(BIN)/python -m studies.fuzz --out out/fuzz --inputs $(N) --seconds $(SECONDS)
+
+guard: setup     ## the guard's own tests, in its processes too; a branch of it that none of them takes is an error
+	@$(BIN)/python -m coverage erase
+	@$(BIN)/python -m coverage run -m pytest -q -m "not socketcan and not debian" tests/guard
+	@$(BIN)/python -m coverage combine -q
+	@$(BIN)/python -m coverage report --include 'fdhil/guard/*' --show-missing --skip-covered --fail-under 100
+	@$(BIN)/python -m coverage erase
+
+mutants: setup   ## what the guard's tests notice of mistakes put into it, one at a time (hours); the page is docs/studies/mutants.md
+	@$(BIN)/python -m studies mutants
+
+audit: setup     ## the bill of materials in out/sbom.json, and what is known against the packages of requirements.lock
+	@$(BIN)/python .ci/audit out/sbom.json
 
 loaded: setup    ## make demo and make test, five times each beside four busy loops
 	@.ci/loaded "$(MAKE) -s demo" "$(MAKE) -s test"

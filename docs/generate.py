@@ -1,5 +1,5 @@
 """Generate what can be generated: configs/machine-template.toml and docs/reference/ (config, commands, errors,
-faults, guard).
+faults, guard, notices).
 
 ``python docs/generate.py`` writes them; a test fails when they are not what the code says.
 """
@@ -15,8 +15,9 @@ from typing import Any
 import click
 
 from fdhil import errors
-from fdhil.cli.main import cli
+from fdhil.cli.main import cli, leaves
 from fdhil.config.template import default, sections, template, toml
+from fdhil.daemon.notice_words import WORDS
 from fdhil.guard.core import FEED_HOLD_S, SETTLED_CYCLES
 from fdhil.guard.interlocks import CATALOGUE, EFFECT
 from fdhil.guard.protocol import HOLD_CYCLES
@@ -45,9 +46,7 @@ def command_reference() -> str:
     """Return every command's help as Markdown."""
     lines = ["# Commands", "", "Generated from the command line's own help.", ""]
     top = click.Context(cli, info_name="fdhil", help_option_names=["-h", "--help"])
-    for name in cli.list_commands(top):
-        command = cli.get_command(top, name)
-        assert command is not None
+    for name, command in leaves(cli):
         help_text = command.get_help(click.Context(command, info_name=name, parent=top))
         lines += [f"## fdhil {name}", "", "```text", help_text, "```", ""]
     return "\n".join(lines)
@@ -75,7 +74,12 @@ def fault_reference() -> str:
     lines = [
         "# Faults of the simulated machine",
         "",
-        "Generated from `fdhil/sim/fault_kinds.py`. How to use them is in [the how-to](../how-to/simulate.md).",
+        "Generated from `fdhil/sim/fault_kinds.py`. How to use them is in [the how-to](../how-to/rehearse-a-fault.md).",
+        "",
+        "An entry has one of `at_s`, `at_sync`, `at_row`, or none for at once, and `duration_s`, or none for good.",
+        "Those of the bus (`bus_...`) meet the frames of `can_id`, else those of the drive of `axis`, else all, that",
+        'the machine `way = "sent"` or `"received"`, else both; `bus_inject` and `frame` need `can_id` and `data`',
+        "(hexadecimal). `percent` is the share of the frames, or of a sensor's answers, that is met.",
         "",
         "| fault | value | axis |",
         "|---|---|---|",
@@ -109,6 +113,23 @@ def guard_reference() -> str:
     return "\n".join(lines) + "\n"
 
 
+def notice_reference() -> str:
+    """Return what each class of notice means and what to do, as Markdown."""
+    lines = [
+        "# Notices",
+        "",
+        "Generated from `fdhil/daemon/notice_words.py`. A notice of severity minor or MAJOR waits until somebody",
+        "acknowledges it; its own text tells the cause. What the guard watches has its words in",
+        "[the guard's table](guard.md).",
+        "",
+        "| class | what it means for the machine | what to do |",
+        "|---|---|---|",
+    ]
+    return (
+        "\n".join([*lines, *(f"| `{code}` | {effect} | {action} |" for code, (effect, action) in WORDS.items())]) + "\n"
+    )
+
+
 def _states(
     title: str, sent: Mapping[Any, str], transitions: Iterable[tuple[Event, Collection[Any], Any]]
 ) -> Iterator[str]:
@@ -127,6 +148,7 @@ GENERATED = {
     ROOT / "docs" / "reference" / "errors.md": error_reference,
     ROOT / "docs" / "reference" / "faults.md": fault_reference,
     ROOT / "docs" / "reference" / "guard.md": guard_reference,
+    ROOT / "docs" / "reference" / "notices.md": notice_reference,
 }
 
 

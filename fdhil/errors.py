@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+MOST_TOLD, MOST_CHARACTERS = 51, 2000  # no file makes a message without end
+
 
 class FdhilError(Exception):
     """Base of all errors that fdhil raises on purpose; ``str(error)`` is a sentence for the operator."""
@@ -37,7 +39,10 @@ class ConfigError(FdhilError):
     def __init__(self, source: str, faults: Sequence[ConfigFault]) -> None:
         self.source = source
         self.faults = tuple(faults)
-        super().__init__(f"{source}: " + "; ".join(str(fault) for fault in self.faults))
+        told = [str(fault)[:MOST_CHARACTERS] for fault in self.faults[:MOST_TOLD]]
+        if len(self.faults) > MOST_TOLD:
+            told.append(f"and {len(self.faults) - MOST_TOLD} more faults; mend these first")
+        super().__init__(f"{source}: " + "; ".join(told))
 
 
 class DeviceError(FdhilError):
@@ -56,8 +61,20 @@ class DeviceTimeout(DeviceError):
     """A device did not answer within its deadline."""
 
 
+class SdoTimeout(DeviceTimeout):
+    """A drive did not answer an SDO request in time; its late answer is not taken for another one's."""
+
+
 class ProtocolError(DeviceError):
     """A device answered something that its protocol does not allow."""
+
+
+class SdoToggle(ProtocolError):
+    """A drive's segments of an SDO transfer do not alternate: one was lost, or two masters ask."""
+
+
+class SdoTooLarge(ProtocolError):
+    """An object is longer than a healthy drive's, or takes longer than it may."""
 
 
 class SdoAbort(ProtocolError):
@@ -101,3 +118,7 @@ class ProgramError(FdhilError):
         self.word = word
         place = ", ".join(part for part in (f"line {line}" if line else "", repr(word) if word else "") if part)
         super().__init__(f"{place}: {message}" if place else message)
+
+
+class GcodeBudget(ProgramError):
+    """An NC program asks for more than one may: blocks, repetitions, depth, names, motions or characters of a line."""

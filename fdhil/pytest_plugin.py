@@ -18,7 +18,7 @@ import itertools
 import json
 import queue
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +27,7 @@ import pytest
 if TYPE_CHECKING:
     import can
 
+    from fdhil.sim.frame_faults import FrameFault
     from fdhil.sim.service import SimService
 
 BUSES = ("virtual", "hub")  # any other name is that of a CAN interface, as vcan0
@@ -111,13 +112,19 @@ class FeedDriveBench:
         """The arguments with which ``can.Bus`` and ``canopen.Network.connect`` join the machine's bus."""
         return {key: value for key, value in self.ready["buses"]["can0"].items() if value is not None}
 
-    def join(self) -> can.BusABC:
-        """Join the bus as a party of its own; it is shut down with the bench."""
+    def join(self, plan: Sequence[FrameFault] = (), seed: int = 0) -> can.BusABC:
+        """Join the bus as a party of its own; it is shut down with the bench.
+
+        With a ``plan`` of faults it is a :class:`fdhil.sim.wire.fault_bus.FaultBus`: they meet what this party sends
+        and receives, and nobody else.
+        """
         import can
 
+        from fdhil.sim.wire.fault_bus import FaultBus
+
         bus = can.Bus(**self.bus_arguments)
-        self._joined.append(bus)
-        return bus
+        self._joined.append(FaultBus(bus, plan, seed) if plan else bus)
+        return self._joined[-1]
 
     def drive(self, axis: str = "X") -> Mapping[str, Any]:
         """Return what the machine says of a drive: ``node_id``, ``eds``, ``increments_per_mm``, ``tpdo``, ``rpdo``."""

@@ -72,6 +72,12 @@ DRIVE_PROFILES: Mapping[str, str] = {
     "infranor": "fdhil.drivers.cia402.profiles:infranor.toml",
     "roboteq": "fdhil.drivers.cia402.profiles:roboteq.toml",
 }
+PUBLISHERS: Mapping[str, str] = {
+    "opcua": "fdhil.shopfloor.opcua:publish",
+    "mqtt": "fdhil.shopfloor.mqtt:publish",
+    "mtconnect": "fdhil.shopfloor.mtconnect:publish",
+    "prometheus": "fdhil.shopfloor.prometheus:publish",
+}
 
 
 def load(table: Mapping[str, str], name: str) -> Any:

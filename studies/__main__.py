@@ -11,7 +11,23 @@ from importlib import import_module
 
 from studies.pages import FOLDER, write_page
 
-STUDIES = ("estimators", "comparison", "drift", "verdicts", "slow_sensor", "reality", "guard_invariants")
+STUDIES = (
+    "estimators",
+    "comparison",
+    "drift",
+    "sisters",
+    "verdicts",
+    "slow_sensor",
+    "reality",
+    "guard_invariants",
+    "wires",
+    "crash",
+    "kills",
+    "fuzz",
+    "soak",
+    "fleet",
+    "mutants",
+)
 
 
 def main() -> None:

@@ -17,63 +17,126 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from fdhil.guard.protocol import SENDING, Mode
-from fdhil.guard.state import Request
+from fdhil.guard.feedforward import Pair
+from fdhil.guard.protocol import SENDING, FeedMode, Mode
+from fdhil.guard.state import Output, Request
 from studies import pages
+from tests.guard.fed import LIMITS as FED
+from tests.guard.fed import fed_settings
+from tests.guard.fed import request as feed_request
 from tests.guard.machine import ENABLED, RECORD, Bench, arm_request, bench
 from tests.guard.wire import Wire
 
 EPISODE = 5000
-COMPARED = Request("compared", True, compared={"X": RECORD})
+AXES = ("X", "Y")
+COMPARED = Request("compared", True, compared=dict.fromkeys(AXES, RECORD))
 ADOPT = Request("adopt", True)
+FORGETS: Pair = (0, 0)
+
+
+class FedWire:
+    """Judges the speed and torque offsets to one drive by the frames on the wire: ``ours`` says what is wrong."""
+
+    def __init__(self) -> None:
+        self.last = self.before = FORGETS
+
+    def lost(self) -> None:
+        """The last frame did not leave."""
+        self.last = self.before
+
+    def ours(self, pair: Pair) -> str | None:
+        """A frame of the guard: inside the limits, and each value zero or no more than its rate from the last."""
+        before = self.before = self.last
+        self.last = pair
+        bounds = ((FED.speed, FED.speed_rate), (FED.torque, FED.torque_rate))
+        for value, last, (largest, rate) in zip(pair, before, bounds, strict=True):
+            if type(value) is not int or not abs(value) <= largest:
+                return f"speed or torque offset {value!r}: beyond the largest"
+            if value != 0 and not abs(value - last) <= rate:
+                return f"speed or torque offset {last} -> {value}: a step"
+        return None
 
 
 @dataclass
 class Walk:
-    """One machine from the guard's start on, ``EPISODE`` SYNC of it; ``wrong`` are frames that broke a limit."""
+    """One machine of two axes from the guard's start on, ``EPISODE`` SYNC of it; ``wrong`` broke a limit.
+
+    Half of them may send speed and torque offsets as well, a fifth have drives that take offsets without SYNC.
+    """
 
     rng: random.Random
     machine: Bench = field(init=False)
-    wire: Wire = field(init=False)
+    wires: list[Wire] = field(init=False)
+    fed: bool = field(init=False)
+    fed_wires: list[FedWire] = field(init=False)
     seen: Counter[str] = field(default_factory=Counter)
     wrong: list[str] = field(default_factory=list)
     drop: dict[int, int] = field(default_factory=dict)
     mode: Mode = Mode.OFF
 
     def __post_init__(self) -> None:
-        rng, made = self.rng, bench(amplitude=self.rng.choice((100, 300, 800)), axes=("X",))
-        own = made.settings.axes[0]
-        record = {"record": rng.choice((RECORD, RECORD, RECORD, "")), "record_void": rng.random() < 0.1}
-        settings = replace(made.settings, axes=(replace(own, **record),))
-        self.machine = Bench(settings, made.path, made.demand, made.drives)
-        held = rng.choice((0, rng.randint(-819, 819), rng.randint(-819, 819), rng.randint(-(2**24), 2**24)))
-        self.machine.drives[0].hold(held)
-        self.wire = Wire(own.limits, held)
+        rng = self.rng
+        made = bench(amplitude=rng.choice((100, 300, 800)), offset_synchronous=rng.random() < 0.8)
+        self.fed, shown = rng.random() < 0.5, rng.random() < 0.5
+        own = fed_settings(shown).axes if self.fed else made.settings.axes
+        axes = [replace(axis, record=rng.choice((*[RECORD] * 5, "")), record_void=rng.random() < 0.05) for axis in own]
+        self.machine = Bench(replace(made.settings, axes=tuple(axes)), made.path, made.demand, made.drives)
+        self.wires, self.fed_wires = [], [FedWire() for _ in axes]
+        for axis, drive in zip(axes, self.machine.drives, strict=True):
+            held = rng.choice((0, 0, rng.randint(-819, 819), rng.randint(-819, 819), rng.randint(-(2**24), 2**24)))
+            drive.hold(held)
+            drive.shows_fed = self.fed and shown
+            self.wires.append(Wire(axis.limits, held))
+
+    @property
+    def node(self) -> int:
+        """One of the drives, 0 or 1."""
+        return self.rng.randrange(len(AXES))
 
     def cycle(self, request: Request | None = None, late: bool = False, left: bool = True, nc: bool = True) -> None:
-        """One SYNC; its frame is judged."""
+        """One SYNC; its frames are judged."""
         machine = self.machine
-        if not left and machine.outputs and machine.outputs[-1].offsets is not None:
-            self.wire.lost()
+        if not left and machine.outputs:
+            self._not_left(machine.outputs[-1])
         machine.outputs, machine.frames, machine.held = machine.outputs[-1:], machine.frames[-1:], []
         dropped = tuple([cob_id for cob_id, until in self.drop.items() if machine.tick < until])
         output = machine.sync(request, late=late, transmitted=left, nc=nc, drop=dropped)
-        self._judge(output.offsets, late)
-
-    def _judge(self, offsets: tuple[int, ...] | None, late: bool) -> None:
-        machine, before, self.mode = self.machine, self.mode, self.machine.mode
         self.seen["sync"] += 1
+        self.judge(output, late)
+
+    def _not_left(self, output: Output) -> None:
+        for wire in self.wires if output.offsets is not None else ():
+            wire.lost()
+        for fed_wire, drive in zip(self.fed_wires, self.machine.drives, strict=True):
+            if output.feed is not None:
+                drive.received_fed = None
+                fed_wire.lost()
+
+    def judge(self, output: Output, late: bool) -> None:
+        """Judge what left at a SYNC, or at the local timer without one."""
+        machine, before, self.mode = self.machine, self.mode, self.machine.mode
         if self.mode is not before:
             self.seen[f"{before.value} to {self.mode.value}"] += 1
-        if offsets is None:
-            self.wire.nothing()
-            return
-        self.seen["frames"] += 1
-        wrong = self.wire.ours(offsets[0], machine.drives[0].offset)
-        if late or not {before, self.mode} & SENDING:
-            wrong = f"a frame in {before.value}, {self.mode.value}"
-        if wrong is not None:
-            self.wrong.append(f"SYNC {machine.tick}, {before.value} to {self.mode.value}: {wrong}")
+        wrong: list[str | None] = []
+        if output.feed is not None:
+            self.seen["fed frames"] += len(AXES)
+            self.seen["fed frames that are not zero"] += sum(map(any, output.feed))
+            wrong += [wire.ours(pair) for wire, pair in zip(self.fed_wires, output.feed, strict=True)]
+            if output.offsets is not None and any(map(any, output.feed)):
+                wrong.append("speed or torque offsets beside a position offset")
+        if output.offsets is None:
+            for wire in self.wires:
+                wire.nothing()
+        else:
+            self.seen["frames"] += len(AXES)
+            frames = zip(self.wires, output.offsets, machine.drives, strict=True)
+            wrong += [wire.ours(offset, drive.offset) for wire, offset, drive in frames]
+            if not {before, self.mode} & SENDING:
+                wrong.append("a frame that nobody armed")
+        if late and (output.offsets is not None or output.feed is not None):
+            wrong.append("a frame that is too late")
+        where = f"SYNC {machine.tick}, {before.value} to {self.mode.value}"
+        self.wrong += [f"{where}: {each}" for each in wrong if each is not None]
 
     def run(self) -> None:
         """Let things happen, with quiet between them and every now and then all that it takes to be armed."""
@@ -84,28 +147,32 @@ class Walk:
             for _ in range(self.rng.choice((0, 1, 5, 20, 60))):
                 self.cycle()
 
-    def foreign(self, value: int, cob_id: int = 0x301) -> None:
-        """Another node writes the offset, by our COB-ID or by SDO."""
-        data = struct.pack("<i", value) if cob_id == 0x301 else struct.pack("<BHBi", 0x23, 0x60B0, 0, value)
-        self.machine.inject(cob_id, data)
-        self.wire.foreign(value)
+    def foreign(self, value: int, service: int = 0x301) -> None:
+        """Another node writes the offset of a drive, by our COB-ID or by SDO."""
+        node = self.node
+        data = struct.pack("<i", value) if service == 0x301 else struct.pack("<BHBi", 0x23, 0x60B0, 0, value)
+        self.machine.inject(service + node, data)
+        self.wires[node].foreign(value)
 
 
 def armed(walk: Walk) -> None:
     """All good again: compared, adopted where something stands, armed and into the path."""
-    machine, drive = walk.machine, walk.machine.drives[0]
-    drive.statusword, drive.mode, drive.answers, drive.scale, drive.position_error = ENABLED, 8, True, 1.0, 0
-    drive.remapped = False
+    machine = walk.machine
+    for drive in machine.drives:
+        drive.statusword, drive.mode, drive.answers, drive.scale, drive.position_error = ENABLED, 8, True, 1.0, 0
+        drive.remapped, drive.takes_fed = False, lambda pair: pair
+        machine.hear(0x700 + drive.node_id, b"\x05")
     walk.drop.clear()
     machine.listener.error("active")
-    machine.hear(0x701, b"\x05")
     machine.main_alive, machine.rest, machine.playing, machine.row = True, None, False, 0
-    for request in (COMPARED, None, ADOPT, None, arm_request()):
+    arm = feed_request() if walk.fed and walk.rng.random() < 0.6 else arm_request()
+    for request in (COMPARED, None, ADOPT, None, arm):
         walk.cycle(request)
         for _ in range(45):
             walk.cycle()
     for _ in range(20):
-        walk.cycle(arm_request() if machine.mode is Mode.OFF else None)
+        off = machine.mode is Mode.OFF and machine.state.feed.mode is FeedMode.OFF
+        walk.cycle(arm if off else None)
     machine.playing = True
     for _ in range(walk.rng.randint(20, 400)):
         walk.cycle()
@@ -117,6 +184,8 @@ def restarted(walk: Walk) -> None:
     again = Bench(machine.settings, machine.path, machine.demand, machine.drives)
     again.tick, again.counter, again.row = machine.tick, machine.counter, machine.row
     walk.machine, walk.mode = again, Mode.OFF
+    for wire in walk.fed_wires:
+        wire.last = FORGETS  # where none is shown it begins at zero, whatever the drive holds
 
 
 def cycles(**how: bool) -> Callable[[Walk], None]:
@@ -134,7 +203,7 @@ def drive(**values: tuple[object, ...]) -> Callable[[Walk], None]:
 
     def happen(walk: Walk) -> None:
         for name, among in values.items():
-            setattr(walk.machine.drives[0], name, walk.rng.choice(among))
+            setattr(walk.machine.drives[walk.node], name, walk.rng.choice(among))
 
     return happen
 
@@ -142,39 +211,47 @@ def drive(**values: tuple[object, ...]) -> Callable[[Walk], None]:
 def forged(walk: Walk) -> None:
     """TPDO3 as another node would make it, once or some times, now and then right behind the drive's own."""
     value = walk.rng.choice((walk.rng.randint(-819, 819), walk.rng.randint(-(2**31), 2**31 - 1)))
+    node = walk.node
     for _ in range(walk.rng.choice((1, 1, 2, 3, 12))):
-        walk.machine.hear(0x381, struct.pack("<ii", walk.rng.choice((value, 0)), value))
+        walk.machine.hear(0x381 + node, struct.pack("<ii", walk.rng.choice((value, 0)), value))
         for _ in range(walk.rng.choice((0, 1, 1, 9, 10))):
             walk.cycle()
 
 
 def garbage(walk: Walk) -> None:
     """Any bytes under a COB-ID that the guard listens to."""
-    cob_id = walk.rng.choice((0x181, 0x281, 0x381, 0x481, 0x201, 0x000, 0x081, 0x701, 0x601, 0x764))
-    if cob_id != 0x601:
-        walk.machine.hear(cob_id, walk.rng.randbytes(walk.rng.randint(0, 8)))
+    cob_id = walk.rng.choice((0x181, 0x281, 0x381, 0x481, 0x1A1, 0x201, 0x000, 0x081, 0x701, 0x401, 0x764))
+    walk.machine.hear(cob_id, walk.rng.randbytes(walk.rng.randint(0, 8)))
 
 
 def lost_tpdo(walk: Walk) -> None:
-    cob_id = walk.rng.choice((0x181, 0x281, 0x381, 0x381, 0x481))
+    cob_id = walk.node + walk.rng.choice((0x181, 0x281, 0x381, 0x381, 0x481, 0x1A1))
     walk.drop[cob_id] = walk.machine.tick + walk.rng.choice((1, 12, 25, 200))
 
 
 def rebooted(walk: Walk) -> None:
-    walk.machine.reboot(0)
-    walk.wire.foreign(0)
+    node = walk.node
+    walk.machine.reboot(node)
+    walk.wires[node].foreign(0)
 
 
 def requested(walk: Walk) -> None:
-    kind = walk.rng.choice(("disarm", "adopt", "adopt", "stop", "compared"))
-    walk.cycle(Request(kind, walk.rng.random() < 0.8, compared={"X": RECORD}))
+    """Any request at any time, one to arm what must not be on beside what is on included."""
+    valid = walk.rng.random() < 0.8
+    kind = walk.rng.choice(("arm", "feedforward", "disarm", "adopt", "adopt", "stop", "compared"))
+    if kind in ("arm", "feedforward"):
+        walk.cycle((arm_request if kind == "arm" else feed_request)(token_valid=valid))
+    else:
+        walk.cycle(Request(kind, valid, compared=COMPARED.compared))
 
 
 def no_sync(walk: Walk) -> None:
-    output = walk.machine.silence()
-    if output.offsets is not None:
-        walk.wrong.append("a frame without SYNC")
-    walk.mode = walk.machine.mode
+    """The local timer, again and again; nothing leaves but zeros where the drives wait for SYNC."""
+    for _ in range(walk.rng.choice((1, 1, 10, 100))):
+        output = walk.machine.silence()
+        if output.offsets is not None and walk.machine.settings.offset_synchronous:
+            walk.wrong.append("a frame without SYNC")
+        walk.judge(output, late=False)
 
 
 def error_state(walk: Walk) -> None:
@@ -182,7 +259,7 @@ def error_state(walk: Walk) -> None:
 
 
 def written(walk: Walk) -> None:
-    walk.machine.hear(0x601, struct.pack("<BHBI", 0x23, walk.rng.choice((0x6065, 0x1A02, 0x6060)), 0, 0))
+    walk.machine.hear(0x601 + walk.node, struct.pack("<BHBI", 0x23, walk.rng.choice((0x6065, 0x1A02, 0x6060)), 0, 0))
 
 
 def jumped(walk: Walk) -> None:
@@ -225,6 +302,7 @@ HAPPENINGS: tuple[tuple[str, Callable[[Walk], None]], ...] = (
     ("SYNC counter jumped", counter_jumped),
     ("drive's state", drive(statusword=(ENABLED, 0x0237, 0x1A37, 0x3237, 0x0008), mode=(8, 8, 1))),
     ("drive silent", drive(answers=(True, False))),
+    ("drive ignores speed offsets", drive(takes_fed=(lambda pair: pair, lambda _pair: (0, 0)))),
     ("drive scales its offset", drive(scale=(0.0, 0.5, 1.0))),
     ("following error", drive(position_error=(0, 100, 20000))),
     ("drive rebooted", rebooted),
@@ -258,7 +336,12 @@ def walks(sync: int, seed: int, processes: int) -> tuple[Counter[str], list[str]
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """Return what happened how often, and the frames that broke a limit."""
     seen, wrong = walks(options.sync, options.seed, options.processes)
-    return {"counts": dict(sorted(seen.items())), "violations": wrong}
+    met = not wrong and seen["sync"] >= 10_000_000
+    told = (
+        f"{len(wrong)} in {seen['sync']:,} SYNC of two axes at random ({seen['frames'] + seen['fed frames']:,} frames)"
+    )
+    goals = {"R3": {"met": met, "figure": told}}
+    return {"counts": dict(sorted(seen.items())), "violations": wrong, "goals": goals}
 
 
 def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
@@ -267,14 +350,19 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
     count = f"{len(wrong)} frames broke a limit" if wrong else "no frame broke a limit"
     lines = pages.head("The guard's invariants on random buses", "guard_invariants", run)
     lines += pages.paragraph(
-        f"{seen['sync']:,} SYNC of one axis at random, {seen['frames']:,} offset frames sent: **{count}**."
+        f"""{seen["sync"]:,} SYNC of two axes at random, {seen["frames"]:,} frames with position offsets and
+        {seen["fed frames"]:,} with speed and torque offsets sent ({seen["fed frames that are not zero"]:,} of them not
+        zero): **{count}**."""
     )
     lines += pages.paragraph(
         f"""Each episode of some {EPISODE:,} SYNC begins with a guard that starts beside a drive that holds nothing, an
         offset within 250 um, or anything, with a commissioning record that holds, is void or is missing. Every frame is
         judged by the wire and by what the drive held, not by the guard's own state: it must be within 250 um, go on
         from the last frame on the wire (anybody's) or from the value in the drive within rate and acceleration, and
-        travel no more in a second than allowed, two ramps apart. Nothing may be sent in OFF or FROZEN."""
+        travel no more in a second than allowed, two ramps apart. Nothing may be sent in OFF or FROZEN, and nothing at
+        a SYNC that is past. Half of the guards may send speed and torque offsets (0x60B1, 0x60B2): these must be
+        within their own limits, zero or within their rate of the last, and zero beside a position offset. A fifth have
+        drives that take an offset without SYNC; there the ramp on the local timer is judged in the same way."""
     )
     happened = [[name, f"{seen.get(name, 0):,}"] for name in dict(HAPPENINGS)]
     moves = [[name, f"{times:,}"] for name, times in seen.items() if " to " in name]

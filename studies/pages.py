@@ -41,9 +41,9 @@ def conduct(
     parser.add_argument("--out", type=Path, default=FOLDER)
     options = parser.parse_args()
     changed = [
-        f" --{key.replace('_', '-')} {' '.join(map(str, value)) if isinstance(value, list) else value}"
+        f" --{key.replace('_', '-')}{_given(value)}"
         for key, value in vars(options).items()
-        if key not in ("processes", "out", "folder") and value != parser.get_default(key)
+        if key not in ("processes", "out", "folder", "done") and value != parser.get_default(key)
     ]
     run = provenance(f"python -m studies.{name}{''.join(changed)}") | {"seeds": seeds(options)}
     document = {"study": name, "run": run, "figures": plain(measure(options))}
@@ -51,6 +51,11 @@ def conduct(
     (options.out / f"{name}.json").write_text(json.dumps(document, separators=(",", ":")) + "\n", "utf-8")
     print(write_page(options.out / f"{name}.json"))
     return document["figures"]
+
+
+def _given(value: Any) -> str:
+    """Return what follows an option on the command line; nothing follows a switch."""
+    return "" if value is True else f" {' '.join(map(str, value)) if isinstance(value, list) else value}"
 
 
 def provenance(command: str) -> dict[str, str]:

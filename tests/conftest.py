@@ -9,14 +9,16 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from hypothesis import settings
+from hypothesis import Phase, settings
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported; as the command line does
 gc.disable()  # until all tests are collected
 
-# the same examples in every run; --hypothesis-profile=thorough looks for others, and for more of them
+# the same examples in every run; --hypothesis-profile=thorough looks for others, and for more of them;
+# quick (make mutants) does not ask which is the smallest example that fails
 settings.register_profile("fixed", derandomize=True, deadline=None)
 settings.register_profile("thorough", derandomize=False, deadline=None, max_examples=1000, print_blob=True)
+settings.register_profile("quick", derandomize=True, deadline=None, phases=(Phase.explicit, Phase.generate))
 settings.load_profile("fixed")
 
 
@@ -39,4 +41,5 @@ def no_thread_left() -> Iterator[None]:
 
 
 def _ours(threads: set[threading.Thread]) -> list[threading.Thread]:
-    return [t for t in threads if t.is_alive() and not t.name.startswith(("asyncio_", "ThreadPoolExecutor", "pyarrow"))]
+    pools = ("asyncio_", "ThreadPoolExecutor", "pyarrow", "Dask-Offload")
+    return [t for t in threads if t.is_alive() and not t.name.startswith(pools)]

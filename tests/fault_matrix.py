@@ -121,7 +121,7 @@ F20 | exception in any thread or callback | InternalError
 F21 | restart loop |
 G1 | API write without credentials | AuthRequired
 G2 | CSRF | BadOrigin
-G3 | DNS rebinding |
+G3 | DNS rebinding | BadHost
 G4 | path traversal in recording names | BadName
 G5 | hostile EDS | EdsError
 G6 | hostile G-code | GcodeBudget
@@ -136,32 +136,17 @@ G14 | dependency tampering |
 """
 
 # No test proves these yet. A row leaves this list with its first test and never comes back.
-UNTESTED: dict[str, str] = {
-    "A13": "a frame that is a period late counts for the SYNC it follows; nothing tells it yet",
-    "B9": "a block is read in one request; a counter that wraps between two readings has no test",
-    "F2": "no virtual machine is switched off yet; a damaged log alone is tested",
-    "F10": "single buffers are tested to be bounded, a week of running is not",
-    "G2": "there is no web interface yet",
-    "G3": "there is no web interface yet",
-    "G4": "no name of a recording is taken from outside yet",
-    "G14": "hashes are pinned; the bill of materials and the search for advisories are not there yet",
-}
+UNTESTED: dict[str, str] = {}
 
 # The product tells these by another class than the matrix, or in another way.
 TOLD_OTHERWISE: dict[str, str] = {
     "A12": "counted as out of order",
     "A17": "the operator reads `RecordVoid`, or at commissioning the mapping that was found",
-    "A25": "the object and the drive's reason in a sentence",
-    "A26": "by `DeviceTimeout`",
-    "A27": "by `ProtocolError`, with the object and the bound",
-    "A28": "nothing depends on it, so nothing is told",
     "E3": "refused before it is written, or as `CorruptFile`",
     "E16": "the object, its value and the configured one in a sentence",
     "F1": "nothing is told: a half-written file is never looked at and the next one takes its place",
-    "F9": "nothing depends on it, so nothing is told",
     "F11": "its answers wait, then it is let go",
     "F16": "adopted by the next guard",
-    "G6": "by `ProgramError`, with the budget's name and the line",
     "G8": "by `RecordingError`",
     "G11": "by `ConfigError`",
 }

@@ -1,80 +1,110 @@
-"""Pytest plugin behind ``make faults``: runs what carries the marker ``fault`` and tells it row by row.
+"""Pytest plugin behind ``make faults``: runs what carries the markers ``fault`` and ``goal`` and tells it row by row.
 
-``--fault-table PATH`` prints the table at the end and writes PATH (a page) with its figures beside it (.json).
+``--fault-table PATH`` prints the tables at the end and writes PATH (a page) with its figures beside it (.json);
+``--on-socketcan`` adds what runs on a real SocketCAN interface to figures that are there. A test tells what it saw by
+``record_property``: ``sync_to_zero``, SYNC from the fault to the first frames with zero; ``goal``, a goal's figure.
+
+``python -m tests.fault_table`` gathers the goals of the studies anew, runs nothing, and writes the page.
 """
 
 from __future__ import annotations
 
 import json
 import subprocess
+import sys
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import pytest
 
-from tests.fault_matrix import ROWS, TESTS, TOLD_OTHERWISE, UNTESTED
+from tests import goals
+from tests.fault_matrix import ROWS, TESTS, TOLD_OTHERWISE
 
-ELSEWHERE = ("socketcan", "debian")
-HEAD = """# The fault matrix, row by row
+PAGE = TESTS.parent / "docs" / "studies" / "faults.md"
+LEAST_REAL = 25
+Told = dict[str, Any]
+HEAD = """# The fault matrix, row by row, and the goals
 
 Written by `make faults`: each fault that may happen to the machine, the bus, the sensors, the disk, the operator or the
 network, the class that tells it, and whether fdhil survived it, that is, whether every test of the row passed. A row
-counts as tested only where a test sees the safe reaction. What runs on a real SocketCAN interface (`make test-vcan`) or
-with programs of others (`make test-full`) is counted beside and not run here.
+counts as tested only where a test sees the safe reaction. "SYNC to zero" counts on the frames of the bus, from the
+fault to the first offset of zero on every axis: by the row's tests, or by the study of kills (`kills.json`) where it
+has that row. A row without a figure freezes, refuses, or is none of a correction that runs.
+"""
+GOALS = """## The goals
+
+What was measured last of each, by which command, on which day and commit. What was not measured has no figure.
 """
 
 
 class FaultTable:
-    """What became of each row's tests."""
+    """What became of each row's tests and of each goal's."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.rows: dict[str, dict[str, Any]] = {
-            row: {"passed": 0, "failed": [], **dict.fromkeys(ELSEWHERE, 0)} for row in ROWS
-        }
+    def __init__(self, path: Path, real: bool) -> None:
+        self.path, self.figures = path, path.with_suffix(".json")
+        self._passed, self._failed = ("real_passed", "real_failed") if real else ("passed", "failed")
+        if real:
+            self.document: dict[str, Any] = json.loads(self.figures.read_text("utf-8"))
+        else:
+            self.document = {"run": provenance(), "rows": {row: blank() for row in ROWS}, "goals": {}}
+        for told in self.document["rows"].values():
+            told |= {self._passed: 0, self._failed: []}
         self._rows_of: dict[str, tuple[str, ...]] = {}
+        self._goals_of: dict[str, tuple[str, ...]] = {}
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        """Note which rows each test proves, before those of other places are put aside."""
+        """Note what each test proves."""
         for item in items:
-            rows = rows_proven(item)
-            place = next((name for name in ELSEWHERE if item.get_closest_marker(name)), None)
-            if place is None:
-                self._rows_of[item.nodeid] = rows
-            else:
-                for row in rows:
-                    self.rows[row][place] += 1
+            self._rows_of[item.nodeid] = rows_proven(item)
+            self._goals_of[item.nodeid] = goals_proven(item)
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Count a test that ran, and one that failed before or after it did."""
+        seen = dict(report.user_properties)
         for row in self._rows_of.get(report.nodeid, ()):
+            told = self.document["rows"][row]
             if report.failed:
-                self.rows[row]["failed"].append(report.nodeid)
+                told[self._failed].append(report.nodeid)
             elif report.passed and report.when == "call":
-                self.rows[row]["passed"] += 1
+                told[self._passed] += 1
+                told["sync_to_zero"] += [seen["sync_to_zero"]] if "sync_to_zero" in seen else []
+        for goal in self._goals_of.get(report.nodeid, ()):
+            if report.failed:
+                self._tell(goal, False, f"{report.nodeid} failed")
+            elif report.passed and report.when == "call" and "goal" in seen:
+                self._tell(goal, True, str(seen["goal"]))
+
+    def _tell(self, goal: str, met: bool, figure: str) -> None:
+        run = self.document["run"]
+        entry = {"met": met, "figure": figure, "by": goals.SOURCE, "date": run["date"], "commit": run["commit"]}
+        self.document["goals"].setdefault(goal, []).append(entry)
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
-        """Print the table and write the page."""
+        """Print the tables and write the page."""
+        gather(self.document, self.path.parent)
+        write(self.document, self.path)
         terminalreporter.section("fault matrix")
-        for line in table(self.rows):
+        for line in (*table(self.document), summary(self.document["rows"])):
             terminalreporter.write_line(line)
-        terminalreporter.write_line(summary(self.rows))
-        document = {"run": provenance(), "rows": self.rows}
-        self.path.with_suffix(".json").write_text(json.dumps(document, separators=(",", ":")) + "\n", "utf-8")
-        self.path.write_text(page(document), "utf-8")
+        terminalreporter.section("goals")
+        for line in (*goals.lines(self.document["goals"]), goals.summary(self.document["goals"])):
+            terminalreporter.write_line(line)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the option that asks for the table."""
-    parser.addoption("--fault-table", type=Path, help="run nothing else, but tell each row of the fault matrix in PATH")
+    """Add the options that ask for the tables."""
+    parser.addoption("--fault-table", type=Path, help="tell each row of the fault matrix and each goal in PATH")
+    parser.addoption("--on-socketcan", action="store_true", help="add this run to what --fault-table wrote before")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Tell the rows where it was asked for."""
     if path := config.getoption("--fault-table"):
-        config.pluginmanager.register(FaultTable(path), "fault-table-rows")
+        config.pluginmanager.register(FaultTable(path, config.getoption("--on-socketcan")), "fault-table-rows")
 
 
 def rows_proven(item: pytest.Item) -> tuple[str, ...]:
@@ -86,42 +116,93 @@ def rows_proven(item: pytest.Item) -> tuple[str, ...]:
     return (case,) if case in rows else tuple(sorted(rows))
 
 
-def survived(row: str, told: dict[str, Any]) -> str:
-    """Return yes, no, or where the row is tested instead."""
-    if told["failed"]:
+def goals_proven(item: pytest.Item) -> tuple[str, ...]:
+    """Return the goals of a test."""
+    proven = {goal for mark in item.iter_markers("goal") for goal in mark.args}
+    if unknown := proven - goals.GOALS.keys():
+        raise pytest.UsageError(f"{item.nodeid} names {sorted(unknown)}, which are no goals")
+    return tuple(sorted(proven))
+
+
+def blank() -> Told:
+    """Return what is told of a row without any test."""
+    return {"passed": 0, "failed": [], "real_passed": 0, "real_failed": [], "sync_to_zero": []}
+
+
+def gather(document: dict[str, Any], folder: Path) -> None:
+    """Lay what the studies in ``folder`` measured, and R1 of the rows, beside the goals that tests proved."""
+    run, proven = document["run"], document["goals"]
+    own = {goal: [each for each in told if each["by"] == goals.SOURCE] for goal, told in proven.items() if goal != "R1"}
+    figure, met = summary(document["rows"]), everything_survived(document["rows"])
+    own["R1"] = [{"met": met, "figure": figure.rstrip("."), "by": goals.SOURCE, **run}]
+    studied = goals.of_studies(folder)
+    document["goals"] = {goal: told for goal in goals.GOALS if (told := [*own.get(goal, ()), *studied.get(goal, ())])}
+    kills = folder / "kills.json"
+    measured = json.loads(kills.read_text("utf-8"))["figures"] if kills.exists() else {}
+    document["kills"] = {row: told for row, told in measured.get("sync_to_zero", {}).items() if row in ROWS}
+
+
+def everything_survived(rows: Mapping[str, Told]) -> bool:
+    """Whether every row was tested and none failed, enough of them on a real interface."""
+    real = sum(told["real_passed"] > 0 for told in rows.values())
+    return all(survived(told) == "yes" for told in rows.values()) and real >= LEAST_REAL
+
+
+def survived(told: Told) -> str:
+    """Return yes, no, or that the row was tested on a real interface alone, or not at all."""
+    if told["failed"] or told["real_failed"]:
         return "**no**"
     if told["passed"]:
         return "yes"
-    return next((f"on {place} only" for place in ELSEWHERE if told[place]), f"no test: {UNTESTED.get(row, 'lost')}")
+    return "on SocketCAN only" if told["real_passed"] else "not tested"
 
 
-def table(rows: dict[str, dict[str, Any]]) -> list[str]:
-    """Return the table in Markdown."""
-    lines = ["| row | fault | class | tests | on SocketCAN | survived |", "|---|---|---|--:|--:|---|"]
-    for row, told in rows.items():
-        classes = ", ".join(f"`{name}`" for name in ROWS[row].classes)
-        note = f"{classes} ({TOLD_OTHERWISE[row]})" if row in TOLD_OTHERWISE else classes
-        tests = told["passed"] + len(told["failed"]) + told["debian"]
-        cells = (row, ROWS[row].fault, note, tests or "", told["socketcan"] or "", survived(row, told))
-        lines.append("| " + " | ".join(map(str, cells)) + " |")
-    return lines
+def to_zero(own: Sequence[int], studied: Mapping[str, float] | None) -> str:
+    """Return the median and the worst count of SYNC from fault to zero, empty where nobody counted."""
+    if studied is not None:
+        return f"{studied['median']:g}, at worst {studied['worst']:g} of {studied['trials']:,}"
+    if not own:
+        return ""
+    return f"{own[0]}" if len(set(own)) == 1 else f"{median(own):g}, at worst {max(own)} of {len(own)}"
 
 
-def summary(rows: dict[str, dict[str, Any]]) -> str:
+def table(document: Mapping[str, Any]) -> list[str]:
+    """Return the table of the rows in Markdown."""
+    head = ["| row | fault | class | tests | on SocketCAN | SYNC to zero | survived |", "|---|---|---|--:|--:|---|---|"]
+    return [*head, *(_line(row, told, document["kills"].get(row)) for row, told in document["rows"].items())]
+
+
+def _line(row: str, told: Told, studied: Mapping[str, float] | None) -> str:
+    classes = ", ".join(f"`{name}`" for name in ROWS[row].classes)
+    note = f"{classes} ({TOLD_OTHERWISE[row]})" if row in TOLD_OTHERWISE else classes
+    tests = told["passed"] + len(told["failed"])
+    real = told["real_passed"] + len(told["real_failed"])
+    zero = to_zero(told["sync_to_zero"], studied)
+    cells = (row, ROWS[row].fault, note, tests or "", real or "", zero, survived(told))
+    return "| " + " | ".join(map(str, cells)) + " |"
+
+
+def summary(rows: Mapping[str, Told]) -> str:
     """Return the figures in one sentence."""
-    good = sum(survived(row, told) == "yes" for row, told in rows.items())
-    bad = sum(bool(told["failed"]) for told in rows.values())
-    real = sum(bool(told["socketcan"]) for told in rows.values())
-    left = len(rows) - good - bad
-    told = f"{good} of {len(rows)} rows survived, {bad} not, {left} without a test here"
-    return f"{told}; {real} have a test on a real SocketCAN interface."
+    good = sum(survived(told) == "yes" for told in rows.values())
+    bad = sum(survived(told) == "**no**" for told in rows.values())
+    real = sum(told["real_passed"] > 0 for told in rows.values())
+    told = f"{good} of {len(rows)} rows survived, {bad} not, {len(rows) - good - bad} were not tested"
+    return f"{told}; {real} were tested on a real SocketCAN interface too."
 
 
-def page(document: dict[str, Any]) -> str:
+def page(document: Mapping[str, Any]) -> str:
     """Return the page that the figures make."""
-    rows, run = document["rows"], document["run"]
-    told = f"{summary(rows)} Measured on {run['date']} at commit {run['commit']}."
-    return "\n".join((HEAD, told, "", *table(rows), ""))
+    run, found = document["run"], document["goals"]
+    told = f"{summary(document['rows'])} Measured on {run['date']} at commit {run['commit']}."
+    reached = (goals.summary(found), "", *goals.lines(found))
+    return "\n".join((HEAD, told, "", *table(document), "", GOALS, *reached, ""))
+
+
+def write(document: Mapping[str, Any], path: Path) -> None:
+    """Write the figures and their page."""
+    path.with_suffix(".json").write_text(json.dumps(document, separators=(",", ":")) + "\n", "utf-8")
+    path.write_text(page(document), "utf-8")
 
 
 def provenance() -> dict[str, str]:
@@ -129,3 +210,15 @@ def provenance() -> dict[str, str]:
     command = ["git", "-C", str(TESTS), "rev-parse", "--short", "HEAD"]
     asked = subprocess.run(command, capture_output=True, text=True, check=False)
     return {"date": datetime.now(UTC).strftime("%Y-%m-%d"), "commit": asked.stdout.strip() or "unknown"}
+
+
+def main() -> None:
+    """Gather the goals anew."""
+    document = json.loads(PAGE.with_suffix(".json").read_text("utf-8"))
+    gather(document, PAGE.parent)
+    write(document, PAGE)
+    sys.stdout.write(goals.summary(document["goals"]) + "\n")
+
+
+if __name__ == "__main__":
+    main()

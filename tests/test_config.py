@@ -50,7 +50,10 @@ def test_all_faults_are_told_at_once() -> None:
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        ({"speed_period_s": 0.0003}, "axis.X.regulators.speed_period_s: 0.0003 s does not divide 0.001 s"),
+        (
+            {"speed_period_s": 0.0003},
+            "axis.X.regulators.speed_period_s: 0.0003 s does not divide sync_period_s of its bus, 0.001 s",
+        ),
         ({"current_kp": -1.0}, "axis.X.regulators.current_kp"),
         ({"structure": "p_pi"}, "did you mean 'p_pi_pi'?"),
         ({"voltage_limit_v": "300"}, ""),

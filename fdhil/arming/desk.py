@@ -121,7 +121,7 @@ class ArmingDesk:
                 return refusal("OffsetStands", text, f"{way_out}, then arm again")
             if feeding:
                 return await self._feed_forward(token)
-            return await self._arm(Path(str(program)), method, token, request.get("whole") is True)
+            return await self._arm(Path(str(program)), method, token, request)
 
     async def _landed(self) -> bool:
         """Wait a moment for the end of what ramps down; return whether the guard is at rest, or absent."""
@@ -164,11 +164,14 @@ class ArmingDesk:
         self._armed = (prepared, summary)
         return dict(answer)
 
-    async def _arm(self, program: Path, method: str | None, token: str, whole: bool) -> Answer:
+    async def _arm(self, program: Path, method: str | None, token: str, asked: Mapping[str, Any]) -> Answer:
         request = await asyncio.to_thread(prepare, program, method, self._config, self.knowledge.now())
         if isinstance(request, Refused):
             return _refused(request)
-        checked = await self._checked(request, whole)
+        if asked.get("program_digest") not in (None, request.program_digest):
+            text = f"{program} is not the program that was meant: its content has another digest"
+            return refusal("ProgramMismatch", text, "see who changed it, then arm again")
+        checked = await self._checked(request, asked.get("whole") is True)
         if isinstance(checked, Refused):
             return _refused(checked)
         if (broken := self._passes.broken(request.program_digest, request.models)) is not None:

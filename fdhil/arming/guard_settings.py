@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import pwd
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +61,7 @@ def settings_of(machine: MachineConfig, bus: str, run_directory: Path, token_sha
         run_directory=str(run_directory),
         axes=tuple(axes),
         daemon_uid=_user_id(machine.guard.daemon_user),
+        watching=tuple(_known_ids((*machine.access.watch, *machine.access.operate))),
     )
 
 
@@ -70,6 +73,13 @@ def _user_id(name: str | None) -> int | None:
     except KeyError:
         fault = ConfigFault("guard.daemon_user", f"there is no user {name!r}", "the user of fdhil.service")
         raise ConfigError("config", [fault]) from None
+
+
+def _known_ids(names: Iterable[str]) -> Iterator[int]:
+    """Yield the users of [access] that this computer has: they may look at the guard and disarm, no more."""
+    for name in sorted(set(names)):
+        with contextlib.suppress(KeyError):
+            yield pwd.getpwnam(name).pw_uid
 
 
 def limits_of(axis: Axis, sync_period_s: float) -> OffsetLimits:

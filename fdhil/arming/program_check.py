@@ -33,7 +33,7 @@ from fdhil.program import Budget, planner, program_digest
 from fdhil.program.demand_csv import read_demand_csv
 from fdhil.program.interpreter import Interpreter
 from fdhil.records import Float, Parameters, Reason, Trajectory
-from fdhil.store.atomic import store_error, sync_folder, write_file
+from fdhil.store.atomic import keep_newest, make_folder, store_error, sync_folder, write_file
 
 SCHEMA = "fdhil-check-4"
 ROWS = ".rows"
@@ -244,7 +244,7 @@ def keep(folder: Path, key: str, request: Callable[[BinaryIO], dict[str, Any]]) 
     """
     part = part_file(folder, key)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         for left in folder.glob(".*.part"):  # by a check that was ended
             if left != part:
                 left.unlink()
@@ -256,10 +256,11 @@ def keep(folder: Path, key: str, request: Callable[[BinaryIO], dict[str, Any]]) 
             return header
         part.rename(folder / (key + ROWS))
         write_file(folder / (key + HEADER), json.dumps(header | {"digest": header_digest(header)}).encode())
-        newest = sorted(folder.glob("*" + HEADER), key=lambda file: file.stat().st_mtime, reverse=True)
-        for file in newest[KEPT:]:
-            file.unlink()
-            file.with_suffix(ROWS).unlink(missing_ok=True)
+        others = [file for file in folder.glob("*" + HEADER) if file.stem != key]
+        keep_newest(folder / (key + HEADER), others, KEPT)
+        for rows in folder.glob("*" + ROWS):
+            if not rows.with_suffix(HEADER).exists():
+                rows.unlink()
         sync_folder(folder)
     except OSError as error:
         raise store_error(part, error) from None
@@ -269,8 +270,9 @@ def keep(folder: Path, key: str, request: Callable[[BinaryIO], dict[str, Any]]) 
     return header
 
 
-def _end_with_the_daemon() -> None:
-    # the daemon's end of the pipe is closed when it is gone; unbuffered: a lock that is held here would spoil the exit
+def end_with_who_asked() -> None:
+    """End this process when the one that asked is gone: for a thread that waits for nothing else."""
+    # the other end of the pipe is closed then; unbuffered: a lock that is held here would spoil the exit
     while os.read(0, 1):
         pass
     os._exit(1)
@@ -281,7 +283,7 @@ def main() -> None:
     with contextlib.suppress(OSError):  # a sandbox may forbid even this; then the check competes
         os.nice(NICENESS)
     request = json.loads(sys.stdin.buffer.readline())
-    threading.Thread(target=_end_with_the_daemon, daemon=True).start()
+    threading.Thread(target=end_with_who_asked, daemon=True).start()
 
     def say(answer: Mapping[str, Any]) -> None:
         sys.stdout.write(json.dumps(answer) + "\n")

@@ -9,15 +9,15 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 
 from fdhil import correction
-from fdhil.cli.history_course import AxisHistory
-from fdhil.cli.history_reading import by_axis, read_history
 from fdhil.cli.prediction import inputs
 from fdhil.commissioning.progress import Progress
 from fdhil.commissioning.record import CommissioningRecord, holds, load_record
@@ -27,6 +27,8 @@ from fdhil.errors import RecordingError, StoreError
 from fdhil.prediction.circular import Circular, circle_program, evaluate
 from fdhil.program import program_digest
 from fdhil.records import PARAMETERS, UNITS, Correction, Float, Prediction
+from fdhil.report.history_course import AxisHistory
+from fdhil.report.history_reading import by_axis, read_history
 
 SCHEMA = "fdhil-acceptance-1"
 
@@ -73,7 +75,7 @@ def find(machine: MachineConfig, config: Path, asked: Asked) -> Findings:
     """Gather everything; ConfigError, StoreError, ProgramError, RecordingError where something cannot be read."""
     proofs = {axis: _proof(machine, axis) for axis in machine.axis}
     try:
-        histories = by_axis(machine, *read_history(machine))
+        histories = by_axis(machine, *read_history(machine, tell=partial(click.echo, err=True)))
     except StoreError as error:
         if error.code != "NoHistory":
             raise

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from fdhil.cli.acceptance_findings import AxisProof, Findings
-from fdhil.cli.history_verdict import LATEST_HEAD, latest_rows
-from fdhil.cli.parameter_view import MEANING
 from fdhil.prediction.circular import Circular
 from fdhil.report import Page, Section, Table
 from fdhil.report.circular import polar
+from fdhil.report.history_verdict import LATEST_HEAD, latest_rows
+from fdhil.report.parameter_view import MEANING
 from fdhil.report.path import correction_page
 
 CIRCLE_ROWS = (

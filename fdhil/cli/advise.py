@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import itertools
 import json
-import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -19,9 +18,9 @@ from fdhil.cli.prediction import FILE, inputs
 
 if TYPE_CHECKING:
     from fdhil.config import MachineConfig
-    from fdhil.prediction.advise import Advice, Held
+    from fdhil.prediction.advise import Advice
     from fdhil.prediction.feeds import Source
-    from fdhil.records import Float, Parameters, Trajectory
+    from fdhil.records import Parameters, Trajectory
 
 
 @click.command(cls=Writing)
@@ -59,17 +58,13 @@ def advise(
     if out is not None and program.suffix.lower() == ".csv":
         raise click.UsageError("--out writes an NC program, and a demand has no F words; give the program")
     reference, models, config = inputs(program, config_path, model_path, from_history)
-    from fdhil.prediction import advise as advising
+    from fdhil.correction.advised import advised, entry
 
     corrects = all(config.axis[axis].correction is not None for axis in reference.axes)
     forewarn("predict", *(["correct"] if corrects else []))
     sure, hopeful = _sources(program, reference, models, config, tolerance_um)
     sure, hopeful = _telling(sure), hopeful and _telling(hopeful)
-    judge = (lambda slower: _corrected(slower, models, config)) if corrects else None
-    advice = advising.advise(sure, models, config, tolerance_um, judge)
-    most: dict[float, Advice] | None = None
-    if hopeful:
-        most = {a.start_s: a for a in advising.advise(hopeful, models, config, tolerance_um, judge)}
+    advice, most = advised(sure, hopeful, models, config, tolerance_um)
     if sys.stderr.isatty():
         click.echo(err=True)
     if not as_json:
@@ -80,7 +75,7 @@ def advise(
         _write(program, advice, config, out)
     if as_json:
         document = {"schema": "fdhil-advise-1", "program": str(program), "tolerance_um": tolerance_um}
-        lines = [_entry(a, most) for a in advice]
+        lines = [entry(a, most) for a in advice]
         written = None if out is None else str(out)
         click.echo(json.dumps(document | {"lines": lines, "written": written}, allow_nan=False))
     elif out is not None:
@@ -106,13 +101,11 @@ def _sources(
     config: MachineConfig,
     tolerance_um: float,
 ) -> tuple[Source, Source | None]:
-    from fdhil.prediction.feeds import program_source
-    from fdhil.prediction.retime import demand_sources
+    from fdhil.correction.advised import sources
     from fdhil.program import Budget, interpret
 
-    if program.suffix.lower() == ".csv":
-        return demand_sources(reference, models, config, tolerance_um)
-    return program_source(list(interpret(program, Budget.of(config.nc))), config), None
+    motions = None if program.suffix.lower() == ".csv" else list(interpret(program, Budget.of(config.nc)))
+    return sources(motions, reference, models, config, tolerance_um)
 
 
 def _telling(source: Source) -> Source:
@@ -127,63 +120,3 @@ def _telling(source: Source) -> Source:
         return reference
 
     return replace(source, at=told)
-
-
-def _corrected(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> Float:
-    """Contour error (n,) with the correction; where it is refused, inf in the rows at fault, the others unknown."""
-    import numpy as np
-
-    from fdhil import correction
-    from fdhil.prediction.inverse_dynamics import required
-
-    planned = correction.plan(reference, models, config)
-    if not planned.refused:
-        return planned.after.contour_um
-    before, fault = planned.before, np.zeros(reference.time_s.size, dtype=np.bool_)
-    for zone in before.zones:
-        if zone.cause == "saturation":
-            fault |= (reference.time_s >= zone.start_s) & (reference.time_s < zone.end_s)
-    for axis in reference.axes:
-        asked = required(reference.position_mm[axis], models[axis], config.axis[axis], reference.dt_s)
-        limits = config.axis[axis].correction
-        room_um = limits.max_offset_um if limits else 0.0
-        fault |= (np.maximum(*asked) > 1.0) | (np.abs(before.error_um[axis]) > room_um)
-    return np.where(fault, np.inf, np.nan) if fault.any() else before.contour_um
-
-
-def _entry(advice: Advice, most: Mapping[float, Advice] | None) -> dict[str, Any]:
-    axis, what, share = advice.load
-    asked = {"axis": axis, "what": what, "share": share}
-    entry = {
-        "line": advice.line,
-        "start_s": round(advice.start_s, 6),
-        "end_s": round(advice.end_s, 6),
-        "where": advice.where,
-        "cause": advice.cause,
-        "axis": advice.axis,
-        "error_um": advice.error_um,
-        "load": asked,
-        "beyond": asked if share > 1.0 else None,
-        "feed_mm_min": advice.feed_mm_min,
-        **_held("", advice.plain, advice.feed_mm_min),
-        **_held("corrected_", advice.corrected, advice.feed_mm_min),
-    }
-    if most is not None:
-        other = most.get(advice.start_s, advice)
-        entry["hopeful_feed_mm_min"] = _feed(other.plain, advice.feed_mm_min)
-        entry["corrected_hopeful_feed_mm_min"] = _feed(other.corrected, advice.feed_mm_min)
-    return entry
-
-
-def _held(name: str, held: Held | None, feed_mm_min: float) -> dict[str, float | None]:
-    return {
-        f"{name}feed_share": None if held is None else held.share,
-        f"{name or 'advised_'}feed_mm_min": _feed(held, feed_mm_min),
-        f"{name}tried_feed_mm_min": None if held is None else held.tried * feed_mm_min,
-        f"{name}run_feed_mm_min": None if held is None else held.run * feed_mm_min,
-        f"{name}left_um": None if held is None or not math.isfinite(held.left_um) else held.left_um,
-    }
-
-
-def _feed(held: Held | None, feed_mm_min: float) -> float | None:
-    return None if held is None or held.share is None else held.share * feed_mm_min

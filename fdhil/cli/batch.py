@@ -6,6 +6,7 @@ import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,14 +14,15 @@ from typing import Any
 
 from fdhil.cli.compiling import forewarn
 from fdhil.cli.failing import error_document
-from fdhil.config import Identification, MachineConfig
+from fdhil.config import Axis, Identification, MachineConfig
 from fdhil.errors import FdhilError
+from fdhil.fleet.spread import Crew
 from fdhil.identification.windows import find_windows
-from fdhil.pipeline import analyse, pool
-from fdhil.pipeline.own_loops import explained
+from fdhil.pipeline import analyse_windows, pool
 from fdhil.records import Estimate, LoopEstimate, Reason, Recording, Verdict, Window, WindowOutcome
 from fdhil.store.accelerometer_csv import with_accelerometer
 from fdhil.store.column_map import ColumnMap
+from fdhil.store.recording_parquet import stored_window
 from fdhil.store.recording_table import SOURCES
 from fdhil.store.recordings import read_recording
 
@@ -28,6 +30,7 @@ MANY_FILES = 16  # from here on further processes pay for their start
 MANY_WINDOWS = 48
 CHUNK = 8
 Progress = Callable[[float], None]
+_Numbered = tuple[int, Path]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,11 +72,27 @@ def analyse_files(
             yield analyse_file(path, settings, machine, progress, accelerometer, columns)
         return
     forewarn("identify")
-    work = partial(analyse_file, settings=settings, machine=machine, columns=columns)
-    with _processes() as executor:
-        for result in executor.map(work, paths, chunksize=CHUNK):
-            progress(1.0)
-            yield result
+    work = partial(_analyse_some, settings=settings, machine=machine, columns=columns)
+    ready: dict[int, FileResult] = {}
+    first = 0
+    try:
+        with _processes() as executor:
+            crew = Crew[_Numbered, FileResult](executor, CHUNK, 2 * _cores())
+            for task, results in crew.spread(work, enumerate(paths)):
+                progress(len(task))
+                ready |= {number: result for (number, _), result in zip(task, results, strict=True)}
+                while first in ready:
+                    yield ready.pop(first)
+                    first += 1
+    except BrokenProcessPool:
+        text = "a process that analysed recordings was ended from outside, as when the memory is used up"
+        raise FdhilError(f"{text}; nothing is told of any: give fewer at once, or free memory") from None
+
+
+def _analyse_some(
+    numbered: Sequence[_Numbered], settings: Identification, machine: MachineConfig | None, columns: ColumnMap | None
+) -> list[FileResult]:
+    return [analyse_file(path, settings, machine, columns=columns) for _, path in numbered]
 
 
 def analyse_file(
@@ -86,39 +105,45 @@ def analyse_file(
 ) -> FileResult:
     """Return the windows of one recording analysed, and their pool, or why it cannot be read."""
     try:
-        recording = read_recording(path, columns)
-        if accelerometer is not None:
-            recording = with_accelerometer(recording, accelerometer)
+        recorded = _read(path, accelerometer, columns)
     except FdhilError as error:
         progress(1.0)
         reason = Reason(type(error).__name__, str(error))
         return FileResult(str(path), None, (), None, Verdict(False, None, (reason,)), error_document(error))
     if multiprocessing.parent_process() is None:
         forewarn("identify")
-    first = []
-    axis = None if machine is None else machine.axis.get(recording.axis)
-    settings = told_by(recording, settings)
-    windows = find_windows(recording, None if axis is None else axis.rapid_speed_rad_s)
+    axis = None if machine is None else machine.axis.get(recorded.axis)
+    windows, settings = _windows(recorded, axis), _told_by(recorded, settings)
     period_s = None if machine is None else machine.machine.sync_period_s
-    work = partial(analyse, settings=settings, axis=axis, sync_period_s=period_s)
-    for outcome in _outcomes(windows, work):
-        first.append(outcome)
-        progress(1.0 / (len(windows) + 1))
-    outcomes, loops = explained(
-        first, axis, settings, period_s, lambda own: list(_outcomes(windows, partial(work, axis=own)))
-    )
+    step = partial(progress, 1.0 / (len(windows) + 1))
+    outcomes, loops = analyse_windows(windows, settings, axis, period_s, _outcomes, step)
     estimate, verdict = pool(outcomes, settings)
-    progress(1.0 / (len(windows) + 1))
-    return FileResult(str(path), recording.axis, tuple(outcomes), estimate, verdict, loops=loops)
+    step()
+    return FileResult(str(path), recorded.axis, tuple(outcomes), estimate, verdict, loops=loops)
 
 
-def told_by(recording: Recording, settings: Identification) -> Identification:
+def _read(path: Path, accelerometer: Path | None, columns: ColumnMap | None) -> Recording | Window:
+    """Read a recording; a stored window is one rapid already, and is taken as it is, to the bit."""
+    if accelerometer is None and columns is None and (stored := stored_window(path)) is not None:
+        return stored
+    recording = read_recording(path, columns)
+    return recording if accelerometer is None else with_accelerometer(recording, accelerometer)
+
+
+def _windows(recorded: Recording | Window, axis: Axis | None) -> list[Window]:
+    if isinstance(recorded, Window):
+        return [recorded]
+    return find_windows(recorded, None if axis is None else axis.rapid_speed_rad_s)
+
+
+def _told_by(recorded: Recording | Window, settings: Identification) -> Identification:
     """Return the settings with what a recording itself says of where its speed and its voltage come from."""
-    told = {key: recording.headers[key] for key in SOURCES if key in recording.headers}
+    headers = {} if isinstance(recorded, Window) else recorded.headers
+    told = {key: headers[key] for key in SOURCES if key in headers}
     return settings.model_copy(update=told) if told else settings
 
 
-def _outcomes(windows: Sequence[Window], work: Callable[[Window], WindowOutcome]) -> Iterator[WindowOutcome]:
+def _outcomes(work: Callable[[Window], WindowOutcome], windows: Sequence[Window]) -> Iterator[WindowOutcome]:
     if len(windows) < MANY_WINDOWS or _cores() < 2 or multiprocessing.parent_process() is not None:
         yield from map(work, windows)
         return

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import config as machine_config
+from fdhil.cli.audited import audited
 from fdhil.cli.commission_guide import Asked, Guide, confirm, room_of, told
 from fdhil.cli.commission_steps import FEEDFORWARD, STEPS, moves_of, planned, trial_moves
 from fdhil.cli.commission_trial import try_commissioned
@@ -146,9 +147,11 @@ def _commission_axis(machine: MachineConfig, axis: str, asked: Asked) -> dict[st
         progress.forget()
     if asked.room is not None:
         trial_moves(machine, axis, asked.room)  # a room that is too small is told before anything is sent
-    with lock_bus(machine.bus[machine.axis[axis].drive.bus]):  # the guard reads the record when it starts
+    bus = machine.bus[machine.axis[axis].drive.bus]
+    with lock_bus(bus), audited(machine, "commission", axis=axis) as ended:  # the guard reads the record when it starts
         record = steps.commission(machine, axis, _commissioning_guide(machine, axis, asked, progress), progress)
         path = save_record(record, machine.store.directory, machine.store.commissioning_key)
+        ended["text"] = f"record {record.digest[:16]}"
         asked.say(
             f"axis {axis} is commissioned: moved {record.sign_test_um:+.1f} um, "
             f"{FEEDFORWARD[record.offset_in_feedforward]}, watchdog {record.watchdog}; record {path}"
@@ -182,7 +185,8 @@ def _set_pdos(machine: MachineConfig, axis: str, asked: Asked) -> dict[str, Any]
             f"The PDOs of drive {axis} are written as profile {profile.name} has them, and saved in it. May they?"
         )
         confirm(axis, question, "nothing was written; start again with --yes where nobody can be asked")
-    with lock_bus(machine.bus[machine.axis[axis].drive.bus]), Master(machine, axis) as master:
+    bus = machine.bus[machine.axis[axis].drive.bus]
+    with lock_bus(bus), audited(machine, "set the PDOs up", axis=axis), Master(machine, axis) as master:
         done = set_up_pdos(master)
     written = ", ".join(done.written) or "none, all were right"
     kept = {True: ", saved in the drive", False: ", NOT saved: lost when the drive is off", None: ""}[done.saved]

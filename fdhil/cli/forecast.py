@@ -17,14 +17,12 @@ if TYPE_CHECKING:
 
     from fdhil.config import MachineConfig
     from fdhil.prediction.forecast import Step, ZoneChange
-    from fdhil.prediction.gain import Gain
-    from fdhil.records import Correction, Float, Parameters, Prediction
+    from fdhil.records import Float, Parameters, Prediction
     from fdhil.store.rows import Comparison, Revision, Stamp
 
 DAY_S = 86400.0
 FAR_DAYS = 36500.0
 RECENT = 64  # revisions of an axis, or comparisons of a program, that are looked at
-RECENT_MOVES = 3  # whose skill bounds what a correction can reach
 BEYOND_CHANCE = 2.0  # standard deviations
 TOLD_UM = 0.1  # a smaller change is listed by --json only
 MANY_CHANGES = 12
@@ -47,22 +45,6 @@ class Past:
         with History.read(config.store.directory, partial(click.echo, err=True)) as history:
             revisions = {axis: history.revisions(axis, RECENT) for axis in config.axis}
             return Past(revisions, history.comparisons(program_digest, RECENT))
-
-
-def predicted_gain(
-    planned: Correction, models: Mapping[str, Parameters], config: MachineConfig, from_history: bool
-) -> Gain:
-    """Return what a correction is predicted to gain, with the uncertainty that the history knows; StoreError."""
-    from fdhil.prediction.gain import gain
-    from fdhil.store.history import History
-
-    if not from_history:
-        return gain(planned, models, config, {}, {})
-    with History.read(config.store.directory) as history:
-        newest = {axis: history.revisions(axis, limit=1) for axis in config.axis}
-        skills = {axis: history.skills(axis, limit=RECENT_MOVES) for axis in config.axis}
-    covariances = {axis: found[0].set.covariance for axis, found in newest.items() if found}
-    return gain(planned, models, config, covariances, skills)
 
 
 def comparison(

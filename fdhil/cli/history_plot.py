@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fdhil.cli.history_course import AxisHistory, over_time
 from fdhil.errors import FdhilError
+from fdhil.report.history_course import AxisHistory, over_time
 from fdhil.report.typography import typeset
 from fdhil.store.output import open_output
 

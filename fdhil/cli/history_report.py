@@ -6,28 +6,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from fdhil.cli.history_course import BAND, MANY, AxisHistory, over_temperature, over_time
-from fdhil.cli.history_trends import moved, slope_rows
-from fdhil.cli.history_verdict import IN_ORDER, LATEST_HEAD, Refusals, latest_rows, sentences
-from fdhil.cli.parameter_view import DISPLAY, MEANING, cell, half_of
 from fdhil.config import MachineConfig
 from fdhil.report import Page, Section, Table, deliver
 from fdhil.report.chart import svg
+from fdhil.report.history_course import BAND, MANY, AxisHistory, over_temperature, over_time
+from fdhil.report.history_trends import moved, slope_rows
+from fdhil.report.history_verdict import IN_ORDER, LATEST_HEAD, Refusals, latest_rows, sentences
+from fdhil.report.parameter_view import DISPLAY, MEANING, MEANINGS, cell, half_of
 
 MOST_REVISIONS = 50
+MOST_NOTICES = 30
 WIDTH, HEIGHT = 4.8, 2.6  # of a course, inches
-MEANINGS: Mapping[str, str] = {
-    "R": "resistance of the winding",
-    "L": "inductance of the winding",
-    "K": "torque per ampere",
-    "Jt": "inertia at the motor's shaft",
-    "ft": "friction that grows with speed",
-    "Cd": "dry friction",
-    "friction_at_rapid": "all friction at the rapid speed",
-    "Jt/K": "inertia, in amperes",
-    "ft/K": "friction that grows with speed, in amperes",
-    "Cd/K": "dry friction, in amperes",
-}
 
 
 def write_report(
@@ -36,10 +25,12 @@ def write_report(
     refused: Mapping[str, Refusals],
     path: Path,
     pdf: Path | None = None,
+    notices: Sequence[Mapping[str, Any]] = (),
 ) -> None:
-    """Write the report of every axis that was ever seen. FdhilError without the extra ``report``."""
+    """Write the report of every axis that was ever seen, and its notices. FdhilError without the extra ``report``."""
     sections = [_verdict(machine, histories, refused)]
     sections += [_axis_section(history, refused.get(history.axis, Refusals())) for history in histories]
+    sections += [_notices(notices)] if notices else []
     page = Page(
         f"{machine.machine.name}: how its drives are",
         f"Identified from rapid moves; {_span(histories)}. {MEANING.capitalize()}.",
@@ -150,6 +141,26 @@ def _revision_tables(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
     more = f"; {left_out} older ones are left out (fdhil history --json lists them)" if left_out else ""
     caption = f"Published parameter sets, newest first{more}; {MEANING}"
     return [Table(head, cells, caption, folded=f"{len(rows)} published parameter sets")]
+
+
+def _notices(notices: Sequence[Mapping[str, Any]]) -> Section:
+    """Return what an operator was told, what waits to be acknowledged in front, and who acknowledged the rest."""
+    waiting = sum(notice["acknowledged"] is None for notice in notices)
+    shown = sorted(notices, key=lambda notice: (notice["acknowledged"] is not None, -notice["number"]))[:MOST_NOTICES]
+    rows = [
+        [_minute(n["time"]), n["severity"], n["axis"] or "-", f"{n['code']}: {n['text']}", _answered(n["acknowledged"])]
+        for n in shown
+    ]
+    caption = f"{waiting} wait to be acknowledged; {len(shown)} of {len(notices)} are shown"
+    return Section(
+        "Notices", "", [Table(("time (UTC)", "severity", "axis", "what happened", "acknowledged"), rows, caption)]
+    )
+
+
+def _answered(given: Mapping[str, Any] | None) -> str:
+    if given is None:
+        return "waits"
+    return f"{given['who']}, {_minute(given['time'])}" + (f": {given['note']}" if given["note"] else "")
 
 
 def _minute(time: str) -> str:

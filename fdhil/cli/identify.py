@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -15,8 +15,10 @@ import click
 
 from fdhil import tables
 from fdhil.cli.options import COLUMNS, OutputFile, Writing
-from fdhil.cli.parameter_view import MEANING, cell, head
+from fdhil.errors import RecordingError
 from fdhil.records import INTERVAL_95, unit_of
+from fdhil.report.parameter_view import MEANING, cell, head
+from fdhil.store import suffixes
 
 if TYPE_CHECKING:
     from fdhil.cli.batch import FileResult
@@ -63,9 +65,11 @@ def identify(
     K is the one in its header torque_constant_nm_per_a, else the nominal one of --config. Where the configured
     regulators do not explain the rapids, and with --loops always, the drive's own are identified; those that explain
     more are used. A RECORDING is CSV, Parquet, MATLAB, MDF 4 or HDF5; with --columns it is what another program wrote.
+    Of a folder all recordings are taken, those of its folders too; many are spread over processes.
     Exit codes: 0 every file's pool is validated, 1 some pool is not, 2 wrong option or configuration, 3 a recording
     cannot be read (the others are identified all the same).
     """
+    recordings = tuple(_files(recordings))
     if accelerometer is not None and len(recordings) > 1:
         raise click.UsageError("--accelerometer belongs to one recording: give each with its own")
     settings, machine = _settings(config_path, method)
@@ -87,6 +91,21 @@ def identify(
     if any(result.error for result in results):
         return UNREADABLE
     return 0 if all(r.verdict.accepted for r in results) else 1
+
+
+def _files(recordings: Sequence[Path]) -> Iterator[Path]:
+    """Yield the files, of a folder all that are named as recordings are; RecordingError where it has none."""
+    for path in recordings:
+        if not path.is_dir():
+            yield path
+            continue
+        found = sorted(
+            file for file in path.rglob("[!.]*") if file.suffix.lower() in suffixes.RECORDINGS and file.is_file()
+        )
+        if not found:
+            known = ", ".join(suffixes.RECORDINGS)
+            raise RecordingError(f"{path} has no recordings ({known}); give the folder that has them")
+        yield from found
 
 
 def _settings(path: Path | None, method: str | None) -> tuple[Identification, MachineConfig | None]:

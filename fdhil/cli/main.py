@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib import import_module
 
 import click
@@ -27,10 +27,17 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "arm": ("fdhil.cli.service:arm", "Arm the correction of one program."),
     "disarm": ("fdhil.cli.service:disarm", "Ramp the correction to zero and disarm."),
     "adopt": ("fdhil.cli.service:adopt", "Ramp to zero what an earlier correction may have left in the drives."),
+    "web": ("fdhil.cli.web:web", "Show the machine in a browser: a process of its own, a client of the daemon."),
+    "web-user": ("fdhil.cli.web:web_user", "Say who may log in to the pages in the browser, and may do what."),
+    "acknowledge": ("fdhil.cli.service:acknowledge", "Tell that somebody has seen notices, who and when."),
     "doctor": ("fdhil.cli.doctor:doctor", "Tell what is wrong with this PC, bus, drives, sensors, store, clock."),
     "eds": ("fdhil.cli.eds:eds", "Tell from a drive's EDS or DCF file what fdhil can and cannot do with it."),
     "play": ("fdhil.cli.play:play", "Stream a program to the drives of a test bench that has no NC."),
     "sim": ("fdhil.cli.sim:sim", "Run the simulated machine: drives, sensors, NC."),
+    "publish": ("fdhil.cli.publish:publish", "Tell OPC UA, MQTT, MTConnect or Prometheus what the daemon knows."),
+    "uplink": ("fdhil.cli.fleet:uplink", "Send what this machine records to the history of many machines."),
+    "fleet": ("fdhil.cli.fleet:fleet", "Gather what many machines tell, and ask all of them."),
+    "offers": ("fdhil.cli.offers:offers", "Look at the changes that the works offers; accept or reject them."),
     "record": ("fdhil.cli.record:record", "Record the demand of an air cut from the bus, by listening."),
     "identify": ("fdhil.cli.identify:identify", "Identify a drive from recordings."),
     "interpret": ("fdhil.cli.program:interpret", "List the motions of an NC program."),
@@ -39,6 +46,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "advise": ("fdhil.cli.advise:advise", "Tell the highest feed of each line within a tolerance."),
     "replay": ("fdhil.cli.records:replay", "Analyse a recorded window again, bit by bit as the daemon did."),
     "history": ("fdhil.cli.records:history", "Show how the parameters moved."),
+    "audit": ("fdhil.cli.audit:audit", "Show who asked the machine for what, and what he was answered."),
     "report": ("fdhil.cli.records:report", "Write an HTML report of the stored history."),
     "acceptance": ("fdhil.cli.acceptance:acceptance", "Write the acceptance report of a machine, to be signed."),
     "export": ("fdhil.cli.records:export", "Write a recording, or a log of the bus, in another file format."),
@@ -68,6 +76,17 @@ class LazyGroup(click.Group):
         """Write the list of commands without importing any of them."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+
+
+def leaves(group: click.Group, before: str = "") -> Iterator[tuple[str, click.Command]]:
+    """Yield every command that does something, by its words, as "fleet collect"; this imports all of them."""
+    context = click.Context(group)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        if isinstance(command, click.Group):
+            yield from leaves(command, f"{before}{name} ")
+        elif command is not None:
+            yield f"{before}{name}", command
 
 
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import config as machine_config
+from fdhil.cli.audited import audited
 from fdhil.errors import DeviceError, DriveFault
 from fdhil.guard.protocol import SOCKET_NAME
 
@@ -91,14 +92,16 @@ def _play(machine: MachineConfig, plan: Plan, program: Path, go_to_start: bool, 
         bench.require_start(here, go_to_start)
         if not yes:
             _ask(bench, program, here)
+        ended = held.enter_context(audited(machine, "play", program=str(program)))
         with bench.led(lambda: _tell_guard(machine, records)):
             stopped = bench.go_to_start(_stopping, go_to_start)
             if stopped is not None:
                 raise DriveFault("the way to the start", f"{stopped}; nothing was played")
-            if not hold:
-                return bench.play(_stopping)
-            click.echo("held at the start: press Enter to begin", err=True)
-            return bench.play(_stopping, _entered)
+            if hold:
+                click.echo("held at the start: press Enter to begin", err=True)
+            played = bench.play(_stopping, _entered) if hold else bench.play(_stopping)
+        ended["text"] = played.stopped or f"{played.rows} set-points, to the end"
+        return played
 
 
 def _entered() -> bool:

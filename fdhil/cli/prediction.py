@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,15 +14,15 @@ import click
 from fdhil import tables
 from fdhil.cli.compiling import forewarn
 from fdhil.cli.options import OutputFile, Positive, Writing
-from fdhil.cli.parameter_view import MEANING
-from fdhil.records import INTERVAL_95, rms
+from fdhil.records import INTERVAL_95
+from fdhil.report.parameter_view import MEANING
 
 if TYPE_CHECKING:
     from fdhil.cli.forecast import Past
     from fdhil.config import MachineConfig
     from fdhil.prediction.forecast import Step
     from fdhil.prediction.gain import Gain
-    from fdhil.records import Correction, Float, Parameters, Prediction, Reason, Trajectory
+    from fdhil.records import Correction, Float, Parameters, Prediction, Trajectory
 
 FILE = click.Path(path_type=Path)
 MANY_ZONES = 12
@@ -95,11 +95,12 @@ def predict(asked: Asked, sensitivity: bool, tolerance_um: float | None, since: 
         raise click.UsageError("--tolerance-um and --since look at the history: give --from-history too")
     reference, models, config = inputs(asked.program, asked.config_path, asked.model_path, asked.from_history)
     from fdhil import prediction
+    from fdhil.correction.document import prediction_document
 
     forewarn("predict")
     predicted = prediction.predict(reference, models, config)
     columns = _prediction_columns(predicted)
-    document = {"schema": "fdhil-predict-1", "program": str(asked.program), **_prediction_document(predicted, models)}
+    document = {"schema": "fdhil-predict-1", "program": str(asked.program), **prediction_document(predicted, models)}
     told = None
     if sensitivity or tolerance_um is not None:
         told = prediction.sensitivity_um(predicted, models, config)
@@ -171,16 +172,17 @@ def correct(asked: Asked, method: str | None) -> int:
     """
     reference, models, config = inputs(asked.program, asked.config_path, asked.model_path, asked.from_history)
     from fdhil import correction
-    from fdhil.cli import forecast
+    from fdhil.correction.document import correction_document
+    from fdhil.store.known_gain import known_gain
 
     forewarn("predict", "correct")
     planned = correction.plan(reference, models, config, method)
-    predicted = forecast.predicted_gain(planned, models, config, asked.from_history)
+    predicted = known_gain(planned, models, config, asked.from_history)
     if asked.out is not None:
         _write(asked.out, _correction_columns(planned))
     _report(asked, config, planned, predicted)
     if asked.as_json:
-        click.echo(json.dumps(_correction_document(str(asked.program), planned, predicted, models), allow_nan=False))
+        click.echo(json.dumps(correction_document(str(asked.program), planned, predicted, models), allow_nan=False))
     else:
         _show_correction(planned, predicted, models)
     return 1 if planned.refused else 0
@@ -279,78 +281,19 @@ def _write(path: Path, columns: Mapping[str, tuple[Float, int]]) -> None:
         np.savetxt(file, values, fmt=formats, delimiter=",", header=",".join(columns), comments="")
 
 
-def _contour(predicted: Prediction) -> dict[str, float]:
-    return {"rms_um": predicted.rms_um, "max_um": float(predicted.contour_um.max())}
-
-
-def _seen_at(models: Mapping[str, Parameters]) -> dict[str, str]:
-    """Return per axis where it is predicted: what a table does behind its motor only a known resonance tells."""
-    return {axis: "table" if model.term("resonance") else "encoder" for axis, model in models.items()}
-
-
-def _prediction_document(predicted: Prediction, models: Mapping[str, Parameters]) -> dict[str, Any]:
-    return {
-        "duration_s": round(float(predicted.reference.time_s[-1] - predicted.reference.time_s[0]), 6),
-        "axes": {
-            axis: {"rms_error_um": rms(error), "max_error_um": float(abs(error).max())}
-            for axis, error in predicted.error_um.items()
-        },
-        "seen_at": _seen_at(models),
-        "contour": _contour(predicted),
-        "zones": _zones(predicted),
-    }
-
-
-def _zones(predicted: Prediction) -> list[dict[str, Any]]:
-    return [
-        {
-            "start_s": z.start_s,
-            "end_s": z.end_s,
-            "where": z.where,
-            "line": int(predicted.reference.line[predicted.worst_row(z)]),
-            "max_um": z.max_um,
-            "cause": z.cause,
-        }
-        for z in predicted.zones
-    ]
-
-
-def _reasons(reasons: Sequence[Reason]) -> list[dict[str, str]]:
-    return [asdict(reason) for reason in reasons]
-
-
-def _correction_document(
-    program: str, planned: Correction, predicted: Gain, models: Mapping[str, Parameters]
-) -> dict[str, Any]:
-    before, after = _contour(planned.before), _contour(planned.after)
-    return {
-        "schema": "fdhil-correct-1",
-        "program": program,
-        "method": planned.method,
-        **_prediction_document(planned.before, models),
-        "before": before,
-        "after": {**after, "uncertainty_um": predicted.half_um},
-        "gain": before["rms_um"] / after["rms_um"] if after["rms_um"] > 0 else 1.0,
-        "gain_at_least": predicted.at_least,
-        "delay_s": planned.delay_s,
-        "max_offset_um": {axis: float(abs(offset).max()) for axis, offset in planned.offset_um.items()},
-        "refused": _reasons(planned.refused),
-        "warnings": _reasons(planned.warnings),
-    }
-
-
 def _show_prediction(
     predicted: Prediction, told: Sequence[Mapping[str, Any]] | None = None, tolerance_um: float | None = None
 ) -> None:
     from fdhil.cli.forecast import crossing_text
+    from fdhil.correction import document
     from fdhil.prediction.gain import plus_minus
 
-    contour = _contour(predicted)
+    contour = document.contour(predicted)
     click.echo(
         f"{predicted.reference.time_s[-1]:.2f} s of path: contour error {contour['rms_um']:.1f} um RMS,"
         f" {contour['max_um']:.1f} um at most" + (f"; {MEANING}" if told and "std_um" in told[0] else "")
     )
-    entries = _zones(predicted) if told is None else told
+    entries = document.zones(predicted) if told is None else told
     shown = sorted(sorted(entries, key=lambda zone: -zone["max_um"])[:MANY_ZONES], key=lambda zone: zone["start_s"])
     for zone in shown:
         std = f" {plus_minus(INTERVAL_95 * zone['std_um'])}" if "std_um" in zone else ""
@@ -377,6 +320,8 @@ def _driver(per_axis: Mapping[str, Mapping[str, float]]) -> str:
 
 
 def _show_correction(planned: Correction, predicted: Gain, models: Mapping[str, Parameters]) -> None:
+    from fdhil.correction import document
+
     _show_prediction(planned.before)
     for reason in planned.warnings:
         click.echo(f"warning, {reason}; {reason.advice}", err=True)
@@ -384,9 +329,9 @@ def _show_correction(planned: Correction, predicted: Gain, models: Mapping[str, 
         click.echo(f"refused, {reason}; {reason.advice}")
     if not planned.refused:
         sure = "" if predicted.at_least is None else f", at least {predicted.at_least:.1f} times better"
-        most = f"{_contour(planned.after)['max_um']:.1f} um at most"
+        most = f"{document.contour(planned.after)['max_um']:.1f} um at most"
         click.echo(f"predicted with the {planned.method} correction: {predicted}; {most}{sure}")
-        blind = [axis for axis, where in _seen_at(models).items() if where == "encoder"]
+        blind = [axis for axis, where in document.seen_at(models).items() if where == "encoder"]
         if blind:
             told = f"that is where the encoders of {', '.join(blind)} are: what a table swings behind its motor they"
             click.echo(f"{told} do not see; where it does, tell resonance_hz of the axis")

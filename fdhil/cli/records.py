@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -116,11 +117,12 @@ def _config_of(window: Window) -> machine_config.MachineConfig:
 )
 @AS_JSON
 def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) -> None:
-    """Show how the identified parameters of CONFIG's machine moved: revisions, slopes, changes, maintenance dates."""
+    """Show how the parameters of CONFIG's machine moved: revisions, slopes, changes, maintenance dates, notices."""
     machine = machine_config.load(config)
-    from fdhil.cli.history_reading import by_axis, read_history
+    from fdhil.report.history_reading import by_axis, read_history, read_notices
 
-    rows, told = read_history(machine, axis)
+    rows, told = read_history(machine, axis, partial(click.echo, err=True))
+    notices = read_notices(machine, axis)
     if axis is not None and axis not in machine.axis and not rows:
         raise click.BadParameter(
             f"{axis} is no axis of {config}; it has {', '.join(machine.axis)}", param_hint="--axis"
@@ -131,17 +133,18 @@ def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) ->
         write_plot(by_axis(machine, rows, told), plot)
     if as_json:
         parts = {key: {name: of_axis[key] for name, of_axis in told.items()} for key in HEALTH}
-        click.echo(json.dumps({"schema": "fdhil-history-1", "revisions": rows} | parts))
+        click.echo(json.dumps({"schema": "fdhil-history-1", "revisions": rows, "notices": notices} | parts))
         return
-    if not rows and not told:
+    if not rows and not told and not notices:
         click.echo("no parameters were published yet")
         return
-    from fdhil.cli.history_trends import show_health
+    from fdhil.cli.history_view import show_health, show_notices
     from fdhil.cli.status_view import show_history
 
     if rows:
         show_history(rows)
     show_health(told)
+    show_notices(notices)
 
 
 @click.command(cls=Writing)
@@ -177,11 +180,11 @@ def export(recording: Path, out: Path, format_name: str | None, columns: Path | 
 def report(config: Path, out: Path, pdf: Path | None, as_json: bool) -> None:
     """Write an HTML report of the stored history of CONFIG's machine."""
     machine = machine_config.load(config)
-    from fdhil.cli.history_reading import by_axis, read_history, read_refusals
     from fdhil.cli.history_report import write_report
+    from fdhil.report.history_reading import by_axis, read_history, read_notices, read_refusals
 
-    rows, told = read_history(machine)
+    rows, told = read_history(machine, tell=partial(click.echo, err=True))
     refused = read_refusals(machine)
-    write_report(machine, by_axis(machine, rows, told, refused), refused, out, pdf)
+    write_report(machine, by_axis(machine, rows, told, refused), refused, out, pdf, read_notices(machine))
     if as_json:
         click.echo(json.dumps({"schema": "fdhil-report-1", "file": str(out), "revisions": len(rows)}))

@@ -1,9 +1,11 @@
-"""``fdhil run``, ``status``, ``arm``, ``disarm`` and ``adopt``: the daemon, and talking to it and to the guard."""
+"""``fdhil run``, and what talks to it or the guard: ``status``, ``arm``, ``disarm``, ``adopt``, ``acknowledge``."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +13,7 @@ import click
 
 from fdhil import config as machine_config
 from fdhil import tables
+from fdhil.cli.audited import write_after, write_before
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
 
 if TYPE_CHECKING:
@@ -144,7 +147,32 @@ def disarm(config: Path, as_json: bool) -> None:
         answer: Mapping[str, Any] = _ask(config, {"request": "disarm"}, DISARM_S)
     except (ConnectError, DeviceTimeout) as silent:
         answer = _disarm_at_the_guard(config, silent)
-    _tell(answer, as_json)
+    with _written_after(config, "disarm at the guard", answer) if "asked" in answer else nullcontext():
+        _tell(answer, as_json)
+
+
+@click.command()
+@CONFIG
+@click.argument("numbers", type=int, nargs=-1, metavar="NUMBER...")
+@click.option("--all", "everything", is_flag=True, help="All that wait now.")
+@click.option("--note", default="", help="A remark that is kept with it.")
+@AS_JSON
+def acknowledge(config: Path, numbers: tuple[int, ...], everything: bool, note: str, as_json: bool) -> None:
+    """Acknowledge notices of CONFIG's machine by their NUMBERs, which fdhil status and fdhil history show.
+
+    It is kept who did and when. It says that somebody has seen them: nothing is armed and nothing is sent.
+    """
+    if everything == bool(numbers):
+        raise click.UsageError("name the notices by their numbers, or give --all")
+    chosen: dict[str, Any] = {"notices": list(numbers)}
+    if everything:
+        waiting = _ask(config, {"request": "status"})["unacknowledged"]["newest"]
+        chosen = {"up_to": max((notice["number"] for notice in waiting), default=0)}
+    _tell(_ask(config, {"request": "acknowledge", "by": _user(), "note": note, **chosen}), as_json)
+
+
+def _user() -> str:
+    return os.environ.get("SUDO_USER") or os.environ.get("USER") or f"user {os.getuid()}"
 
 
 def _disarm_at_the_guard(config: Path, silent: DeviceError) -> Mapping[str, Any]:
@@ -156,7 +184,7 @@ def _disarm_at_the_guard(config: Path, silent: DeviceError) -> Mapping[str, Any]
     try:
         with GuardClient(machine.guard_directory) as guard:
             answer = guard.disarm()
-            return {**verdict(landed(guard.status)), "asked": "guard"} if answer["ok"] else answer
+            return {**(verdict(landed(guard.status)) if answer["ok"] else answer), "asked": "guard"}
     except DeviceError as error:
         text = f"{silent}; nor does the guard answer ({error}): it is unknown what is applied"
         raise ConnectError("machine", text) from None
@@ -179,9 +207,24 @@ def adopt(config: Path, yes: bool, as_json: bool) -> None:
     from fdhil.arming.guard_client import GuardClient
     from fdhil.arming.token import read_token
 
+    def token() -> str:
+        found = read_token(machine.run_directory)
+        write_before(machine, "adopt")
+        return found
+
     with GuardClient(machine.guard_directory) as guard:
-        answer = _adopted(guard, lambda: read_token(machine.run_directory), yes, quiet=as_json)
-    _tell(answer, as_json)
+        answer = _adopted(guard, token, yes, quiet=as_json)
+    with _written_after(config, "adopt", answer):
+        _tell(answer, as_json)
+
+
+@contextmanager
+def _written_after(config: Path, what: str, answer: Mapping[str, Any]) -> Iterator[None]:
+    """Have an answer in the audit after it was told: no disk delays it."""
+    try:
+        yield
+    finally:
+        write_after(machine_config.load(config), what, answer)
 
 
 def _adopted(guard: GuardClient, token: Callable[[], str], yes: bool, quiet: bool) -> Mapping[str, Any]:

@@ -12,8 +12,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from fdhil.cli.loops_view import loops_line
-from fdhil.cli.parameter_view import MEANING, cell, half_of, head
 from fdhil.records import PARAMETERS
+from fdhil.report.parameter_view import MEANING, cell, half_of, head
 
 BARS = "▁▂▃▄▅▆▇█"
 COURSE = 7  # revisions in a row of bars: what fits the column of a value
@@ -32,6 +32,7 @@ COUNTED = {
     "pdo_short": "PDO too short",
     "pdo_long": "PDO too long",
     "pdo_duplicates": "PDO doubled",
+    "pdo_late": "PDO later than the next SYNC",
     "pdo_ambiguous": "PDO of uncertain SYNC",
     "failures": "polls failed",
 }
@@ -82,11 +83,19 @@ def show(status: Mapping[str, Any], console: Console | None = None) -> None:
             out.print(escape(f"{axis}: {text}"))
         if (loops := told.get("loops")) and (line := loops_line(loops)):
             out.print(escape(f"{axis}: {line}"))
+    if (waiting := status.get("unacknowledged") or {}).get("count"):
+        out.print(f"notices that wait to be acknowledged: {waiting['count']}, of them MAJOR {waiting['MAJOR']}")
     for notice in status["notices"][-5:]:
-        axis = f"{notice['axis']}: " if notice["axis"] else ""
-        out.print(
-            escape(f"{_ago(notice['age_s']):>9} ago  {notice['severity']:5}  {axis}{notice['code']}: {notice['text']}")
-        )
+        out.print(escape(_notice_line(notice)))
+
+
+def _notice_line(notice: Mapping[str, Any]) -> str:
+    axis = f"{notice['axis']}: " if notice["axis"] else ""
+    given = notice.get("acknowledged")
+    seen = f" (acknowledged by {given['who']})" if given else ""
+    number = f"  {notice['number']:>4}" if notice.get("number") is not None else "      "
+    line = f"{_ago(notice['age_s']):>9} ago{number}  {notice['severity']:5}  {axis}{notice['code']}: {notice['text']}"
+    return line + seen
 
 
 def _heard(status: Mapping[str, Any]) -> str:

@@ -17,7 +17,7 @@ from typing import Any
 
 from fdhil.commissioning.record import KEY_NAME, sealing_key
 from fdhil.errors import StoreError
-from fdhil.store.atomic import write_file
+from fdhil.store.atomic import make_folder, write_file
 
 SCHEMA = "fdhil-commissioning-steps-1"
 MAX_BYTES = 256 * 1024
@@ -44,7 +44,7 @@ class Progress:
     """The steps of one axis that were done; each is written as soon as it is.
 
     ``doubt`` says why a file that is there is not believed. ``on_kept`` is told of each step that need not be done
-    again.
+    again. StoreError where the file is there and cannot be read, or the key.
     """
 
     def __init__(self, directory: Path, axis: str, key: Path | None = None) -> None:
@@ -74,15 +74,19 @@ class Progress:
         """Keep a step that was done, unless it could not tell something; StoreError."""
         if None in found.values():
             return
-        self._steps[name] = Step(holds_for, datetime.now(UTC).isoformat(timespec="seconds"), found)
-        document = {"schema": SCHEMA, "axis": self._axis, "steps": {k: asdict(v) for k, v in self._steps.items()}}
+        steps = {**self._steps, name: Step(holds_for, datetime.now(UTC).isoformat(timespec="seconds"), found)}
+        document = {"schema": SCHEMA, "axis": self._axis, "steps": {k: asdict(v) for k, v in steps.items()}}
         try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            seal = _seal(document, sealing_key(self._key))
+            make_folder(self._path.parent)
         except OSError as error:
             text = f"{self._path.parent} cannot be written ({error.strerror}); check the rights of [store] directory"
             raise StoreError(text) from None
-        write_file(self._path, json.dumps({**document, "seal": seal}, indent=2).encode())
+        seal = _seal(document, sealing_key(self._key))
+        content = json.dumps({**document, "seal": seal}, indent=2).encode()
+        if len(content) > MAX_BYTES:  # more would not be read again
+            raise StoreError(f"{self._path} has no room for another step; begin anew with fdhil commission --again")
+        write_file(self._path, content)
+        self._steps = steps
 
     def forget(self) -> None:
         """Let all steps be done anew; StoreError."""
@@ -99,9 +103,12 @@ class Progress:
             seal = str(document.pop("seal")).encode("utf-8", "replace")
             steps = {str(name): Step(**step) for name, step in document["steps"].items()}
             told = (document["schema"], document["axis"]) == (SCHEMA, self._axis)
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             return {}
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        except OSError as error:  # what was done may well be there: it is not written over
+            text = f"{self._path} cannot be read ({error.strerror}); check the disk, or move it away and do it all anew"
+            raise StoreError(text) from None
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
             return self._doubted("it cannot be read")
         sealed = self._key.exists() and _seal(document, sealing_key(self._key))  # a key is not made for reading
         if not (told and sealed and hmac.compare_digest(seal, sealed.encode())):

@@ -23,6 +23,7 @@ from fdhil.commissioning.void import confirm_record
 from fdhil.config import Drive, MachineConfig
 from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.errors import StoreError
+from fdhil.store.atomic import make_folder, store_error, sync_folder, write_file
 
 SCHEMA = "fdhil-commissioning-2"
 UNSEALED = "fdhil-commissioning-1"
@@ -125,24 +126,19 @@ def record_path(directory: Path, axis: str) -> Path:
 
 
 def save_record(record: CommissioningRecord, directory: Path, key: Path | None = None) -> Path:
-    """Seal and write the record (a temporary file, then renamed) and return its path; StoreError.
+    """Seal and write the record, whole or not at all, and return its path; StoreError.
 
     ``key`` is the file of the sealing key, left out: ``commissioning.key`` in the directory; it is made where there is
     none.
     """
     path = record_path(directory, record.axis)
     try:
-        directory.mkdir(parents=True, exist_ok=True)
-        seal = record.seal(sealing_key(key or directory / KEY_NAME))
-        document = {"schema": SCHEMA, **asdict(record), "digest": record.digest, "seal": seal}
-        temporary = path.with_suffix(".tmp")
-        with temporary.open("w", encoding="utf-8") as file:
-            json.dump(document, file, indent=2)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
+        make_folder(directory)
     except OSError as error:
-        raise StoreError(f"{path} cannot be written ({error.strerror}); check the directory and free space") from None
+        raise store_error(path, error) from None
+    seal = record.seal(sealing_key(key or directory / KEY_NAME))
+    document = {"schema": SCHEMA, **asdict(record), "digest": record.digest, "seal": seal}
+    write_file(path, json.dumps(document, indent=2).encode())
     confirm_record(directory, record.axis)
     return path
 
@@ -181,13 +177,30 @@ def load_record(
 
 def sealing_key(path: Path) -> bytes:
     """Return the key that seals records; make one where there is none. StoreError."""
-    with contextlib.suppress(FileExistsError):
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+    if not os.path.lexists(path):
+        try:
+            _make_key(path)
+        except OSError as error:
+            text = f"{path}, the key of the records, cannot be made ({error.strerror}); check the folder and free space"
+            raise StoreError(text) from None
+    return _key(path, may_lack=False) or b""
+
+
+def _make_key(path: Path) -> None:
+    """Make a key, whole or not at all; one that another process has made meanwhile stays. OSError."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part.unlink(missing_ok=True)  # of a process that was killed
+    descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+    try:
         with os.fdopen(descriptor, "wb") as file:
             file.write(secrets.token_hex(KEY_BYTES).encode())
             file.flush()
             os.fsync(file.fileno())
-    return _key(path, may_lack=False) or b""
+        with contextlib.suppress(FileExistsError):
+            path.hardlink_to(part)
+    finally:
+        part.unlink(missing_ok=True)
+    sync_folder(path.parent)
 
 
 def _key(path: Path, may_lack: bool) -> bytes | None:

@@ -7,10 +7,12 @@ The mark is a file of its own, so that it outlives every process; comparing the 
 from __future__ import annotations
 
 import json
+import os
 from datetime import UTC, datetime
 from pathlib import Path
 
 from fdhil.errors import StoreError
+from fdhil.store.atomic import make_folder, sync_folder
 
 
 def void_path(directory: Path, axis: str) -> Path:
@@ -32,13 +34,17 @@ def is_void(directory: Path, axis: str) -> bool:
 def void_record(directory: Path, axis: str, why: str) -> None:
     """Mark the axis' record as void, with the first reason; StoreError when the mark cannot be written."""
     path = void_path(directory, axis)
-    if path.exists():
-        return
     text = json.dumps({"why": why, "seen_utc": datetime.now(UTC).isoformat(timespec="seconds")})
     try:
-        directory.mkdir(parents=True, exist_ok=True)
-        path.write_text(text + "\n", "utf-8")
+        make_folder(directory)
+        with path.open("x", encoding="utf-8") as file:  # it is a mark as soon as it is there, even without a word in it
+            sync_folder(directory)
+            file.write(text + "\n")
+            file.flush()
+            os.fsync(file.fileno())
     except OSError as error:
+        if isinstance(error, FileExistsError) and path.exists():
+            return
         raise StoreError(
             f"{path} cannot be written ({error.strerror}); until then arm nothing after a restart of the guard"
         ) from None

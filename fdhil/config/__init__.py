@@ -26,7 +26,7 @@ from fdhil.config.reality import Reality
 from fdhil.config.regulators import Regulators
 from fdhil.config.section import Section
 from fdhil.config.sensors import Thermometer, Voltage
-from fdhil.config.service import Maintenance
+from fdhil.config.service import Access, Maintenance
 from fdhil.config.simulation import Noise, SimAxis, Thermal
 from fdhil.config.table import Accelerometer, TableEncoder
 
@@ -36,6 +36,7 @@ __all__ = [
     "CEILING_SPEED_MM_S",
     "VARIATION_MM",
     "Accelerometer",
+    "Access",
     "Axis",
     "CanBus",
     "CorrectionLimits",

@@ -12,13 +12,19 @@ from fdhil.config.axis import Axis
 from fdhil.config.bus import CanBus
 from fdhil.config.controller import G0, Correction, Identification, Nc
 from fdhil.config.nc_source import NcSource
+from fdhil.config.offers import Offers
 from fdhil.config.offset_bounds import limit_faults
 from fdhil.config.plausible import doubts
+from fdhil.config.publish import Publish
 from fdhil.config.regulators import period_faults
 from fdhil.config.section import AxisName, Positive, Section
 from fdhil.config.sensors import WORDS, LineUser, line_faults, line_user
-from fdhil.config.service import Guard, Maintenance, Play, Store
+from fdhil.config.service import Access, Guard, Maintenance, Play, Store
 from fdhil.config.simulation import Sim
+from fdhil.config.uplink import Uplink
+from fdhil.config.web import Web
+
+BESIDE_THE_MACHINE = {"access", "web", "publish", "uplink", "offers"}
 
 
 class Machine(Section):
@@ -41,8 +47,13 @@ class MachineConfig(Section):
     bus: Mapping[str, CanBus] = Field(default_factory=lambda: {"can0": CanBus()})
     store: Store = Store()
     guard: Guard = Guard()
+    access: Access = Access()
+    publish: Publish = Publish()
+    uplink: Uplink | None = None
+    offers: Offers = Offers()
     play: Play = Play()
     maintenance: Maintenance = Maintenance()
+    web: Web = Web()
     sim: Sim = Sim()
 
     @model_validator(mode="after")
@@ -68,6 +79,8 @@ class MachineConfig(Section):
         if len(ids) < len(self.axis):
             faults.append("axis: two drives of one bus have the same node_id")
         faults += [f"sim.axis.{name}: there is no [axis.{name}]" for name in self.sim.axis if name not in self.axis]
+        told = self.uplink.axis_labels if self.uplink is not None else ()
+        faults += [f"uplink.axis_labels.{name}: there is no [axis.{name}]" for name in told if name not in self.axis]
         if faults:
             raise ValueError("\n".join(faults))
         return self
@@ -106,7 +119,25 @@ class MachineConfig(Section):
         return self.guard.run_directory or self.run_directory
 
     @property
+    def uplink_directory(self) -> Path:
+        """The folder in which fdhil uplink notes how far it is."""
+        return (self.uplink and self.uplink.directory) or self.store.directory / "uplink"
+
+    @property
+    def offers_directory(self) -> Path:
+        """The folder of the offers that fdhil uplink fetched."""
+        return self.offers.directory or self.uplink_directory / "offers"
+
+    @property
+    def works_name(self) -> str:
+        """This machine's name in the works, also where nothing is sent there."""
+        return (self.uplink or Uplink()).name_of(self.machine.name)
+
+    @property
     def digest(self) -> str:
-        """SHA-256 of the configuration's meaning (not of its text), 16 hexadecimal digits."""
+        """SHA-256 of what the configuration says of the machine (not of its text), 16 hexadecimal digits.
+
+        Who may look at it, and over which network, is not the machine: a change there voids no record.
+        """
         files = "".join(axis.drive.files_digest for axis in self.axis.values())
-        return hashlib.sha256(f"{self.model_dump_json()}{files}".encode()).hexdigest()[:16]
+        return hashlib.sha256(f"{self.model_dump_json(exclude=BESIDE_THE_MACHINE)}{files}".encode()).hexdigest()[:16]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import logging
+import re
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -20,6 +21,7 @@ from fdhil.errors import ConfigError, ConfigFault
 MAX_CONFIG_BYTES = 256 * 1024
 MOST_FAULTS = 50
 MOST_DOTS = 100  # in a line
+FEW_KEYS = 8
 SHOWN_CHARS = 60
 S = TypeVar("S", bound=Section)
 OUT_OF_RANGE = {"greater_than", "greater_than_equal", "less_than", "less_than_equal", "finite_number"}
@@ -57,9 +59,19 @@ def toml_document(raw: bytes, source: str) -> dict[str, Any]:
         return tomllib.loads(raw.decode("utf-8"))
     except RecursionError:
         what = "is nested deeper than any config"
-    except ValueError as error:  # no UTF-8, no TOML, or a number of thousands of digits
-        what = f"is no TOML: {_short(str(error))}"
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        what = f"is no TOML: it is no text in UTF-8 (at line {line})"
+    except ValueError as error:  # no TOML, or a number of thousands of digits
+        said, place = _placed(str(error))
+        what = f"is no TOML: {_short(said)}{place}"
     raise ConfigError(source, [ConfigFault("file", what, "check the line it names")])
+
+
+def _placed(said: str) -> tuple[str, str]:
+    """Part what the library says from where, which is never cut short."""
+    found = re.search(r" \(at [^()]{1,60}\)$", said)
+    return (said[: found.start()], found[0]) if found else (said, "")
 
 
 def parse(
@@ -91,7 +103,19 @@ def parse(
     sim = config.sim.model_copy(update={"axis": worn})
     axes = {name: axis.model_copy(update={"drive": axis.drive.placed(folder)}) for name, axis in config.axis.items()}
     nc_source = config.nc_source.placed(folder)
-    return config.model_copy(update={"store": store, "guard": guard, "axis": axes, "sim": sim, "nc_source": nc_source})
+    placed: dict[str, Any] = {"store": store, "guard": guard, "axis": axes, "sim": sim, "nc_source": nc_source}
+    placed |= {"web": config.web.placed(folder), "publish": config.publish.placed(folder)}
+    placed |= {"offers": config.offers.placed(folder)}
+    placed |= {"uplink": config.uplink.placed(folder)} if config.uplink else {}
+    return config.model_copy(update=placed)
+
+
+def load_as(whole: type[S], path: Path, what: str) -> S:
+    """Read another file than a machine's, whose tables are those of ``whole``; ConfigError with every fault."""
+    try:
+        return whole.model_validate(read_toml(path, what))
+    except ValidationError as error:
+        raise ConfigError(str(path), _faults(error, whole=whole)) from None
 
 
 def unlikely(config: MachineConfig) -> list[str]:
@@ -121,13 +145,15 @@ def checked_value(path: str, value: Any) -> Any:
         raise ConfigError(path, _faults(error, tuple(path.split(".")))) from None
 
 
-def _faults(error: ValidationError, place: tuple[str, ...] = ()) -> list[ConfigFault]:
+def _faults(
+    error: ValidationError, place: tuple[str, ...] = (), whole: type[Section] = MachineConfig
+) -> list[ConfigFault]:
     faults = []
     items = error.errors(include_url=False)
     for item in items[:MOST_FAULTS]:
         loc = (*place, *item["loc"])
         path = ".".join(_short(str(part)) for part in loc) or "config"
-        section, key = _section(loc[:-1]), str(loc[-1]) if loc else ""
+        section, key = _section(loc[:-1], whole), str(loc[-1]) if loc else ""
         field = section.model_fields.get(key)
         meaning = field.description or "" if field else ""
         if item["type"] == "extra_forbidden":
@@ -182,9 +208,9 @@ def _constraints(of: Any) -> Iterator[Any]:
         yield from _constraints(inner)
 
 
-def _section(loc: tuple[int | str, ...]) -> type[Section]:
+def _section(loc: tuple[int | str, ...], whole: type[Section] = MachineConfig) -> type[Section]:
     """Follow a path of keys through the models as far as it leads."""
-    section: type[Section] = MachineConfig
+    section = whole
     for key in loc:
         field = section.model_fields.get(str(key))
         if field is None:  # a name chosen by the user: axis.X, bus.can0
@@ -208,5 +234,7 @@ def _arguments(annotation: Any) -> list[Any]:
 
 
 def _near_key(section: type[Section], key: str) -> str:
-    near = difflib.get_close_matches(key, section.model_fields, n=1)
-    return f"did you mean {near[0]!r}?" if near else "see configs/machine-template.toml"
+    if near := difflib.get_close_matches(key, section.model_fields, n=1):
+        return f"did you mean {near[0]!r}?"
+    few = len(section.model_fields) <= FEW_KEYS
+    return f"known are {', '.join(section.model_fields)}" if few else "see configs/machine-template.toml"

@@ -57,11 +57,11 @@ class Regulators(Section):
 
 def period_faults(regulators: Regulators, sync_period_s: float) -> list[str]:
     faults = []
-    for key, longer, shorter in (
-        ("speed_period_s", sync_period_s, regulators.speed_period_s),
-        ("current_period_s", regulators.speed_period_s, regulators.current_period_s),
+    for key, longer, of, shorter in (
+        ("speed_period_s", sync_period_s, "sync_period_s of its bus", regulators.speed_period_s),
+        ("current_period_s", regulators.speed_period_s, "speed_period_s", regulators.current_period_s),
     ):
         ratio = longer / shorter
         if ratio < 0.999 or abs(ratio - round(ratio)) > 1e-6 * ratio:
-            faults.append(f"{key}: {shorter} s does not divide {longer} s")
+            faults.append(f"{key}: {shorter} s does not divide {of}, {longer} s")
     return faults

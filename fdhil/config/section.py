@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
@@ -29,6 +30,14 @@ class Section(BaseModel):
     """A table of the TOML file: frozen, and a key it does not know is a fault."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
+
+
+class SectionWithFiles(Section):
+    """A table in which a path is taken from the folder of the file that says it."""
+
+    def placed(self, folder: Path) -> Self:
+        """Return it with the paths of its files taken from ``folder``."""
+        return self.model_copy(update={key: folder / value for key, value in self if isinstance(value, Path)})
 
 
 def one_of(table: Mapping[str, str], or_suffix: str | None = None) -> AfterValidator:

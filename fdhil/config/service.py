@@ -1,4 +1,4 @@
-"""[store], [guard], [play], [maintenance]: what the daemon, the guard and fdhil play run on."""
+"""[store], [guard], [access], [play], [maintenance]: what the daemon, the guard and fdhil play run on."""
 
 from __future__ import annotations
 
@@ -34,6 +34,16 @@ class Guard(Section):
     run_directory: Path | None = Field(None, description="the guard's socket and settings; left out: that of [store]")
     daemon_user: str | None = Field(
         None, description="the daemon's user, where the guard runs under one of its own; left out: the same user"
+    )
+
+
+class Access(Section):
+    """[access]: who may talk to daemon and guard, besides their own users and root. Users of this computer, by name."""
+
+    watch: tuple[str, ...] = Field((), description="users who may read, listen and disarm, at the guard too")
+    operate: tuple[str, ...] = Field(
+        (),
+        description="users who may also acknowledge, and arm by the operator's token; fdhil-web: to act from a browser",
     )
 
 

@@ -45,6 +45,15 @@ EXAMPLES: Mapping[str, Any] = {  # of keys without a default: the bench machine
     "feed_override": 101, "rapid_override": 102,
     "nc_source.opcua.user": "fdhil", "password_file": "nc-password",
     "certificate": "fdhil.der", "private_key": "fdhil.pem", "server_certificate": "nc.der",
+    "users_file": "web-users.json", "programs_directory": "/home/cnc/nc_files",
+    "tls_certificate_file": "web.crt", "tls_key_file": "web.key",
+    "certificate_file": "fdhil.der", "private_key_file": "fdhil.pem", "trusted_clients": "clients",
+    "tls_client_ca_file": "scrapers.crt", "publish.mqtt.user": "mill-1", "tls_ca_file": "works-ca.pem",
+    "publish.mqtt.password_file": "broker-password", "publish.mqtt.tls_certificate_file": "mill-1.crt",
+    "publish.mqtt.tls_key_file": "mill-1.key", "uplink.user": "mill-1", "uplink.password_file": "nats-password",
+    "uplink.tls_certificate_file": "mill-1.crt", "uplink.tls_key_file": "mill-1.key",
+    "uplink.directory": "/var/lib/fdhil-uplink", "uplink.credentials_file": "mill-1.creds",
+    "offers.directory": "/var/lib/fdhil-uplink/offers",
     "axis.X.voltage.type": "float32", "count_address": 42, "trigger_address": 43,
 }  # fmt: skip
 NAMES = {"axis": "X", "bus": "can0"}  # the user's own names in the template

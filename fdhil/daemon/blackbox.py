@@ -1,15 +1,46 @@
-"""Keeps the frames that were on the buses before and after the guard stopped a correction, one file per trip."""
+"""Keeps the frames that were on the buses before and after the guard stopped a correction, one file per trip.
+
+Files are numbered: which one is the newest does not hang on the wall clock.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from fdhil.errors import StoreError
 from fdhil.records import Notice
+from fdhil.store.atomic import make_folder, store_error, write_file
 
 FOLDER = "blackbox"
 KEPT_FILES = 8
+_TIME = "%Y%m%dT%H%M%S.%fZ"
+_NAME = re.compile(r"(?:(\d{6})-)?(\d{8}T\d{6}\.\d{6}Z)-([A-Za-z0-9_]{1,40})\.log")
+
+
+@dataclass(frozen=True, slots=True)
+class BlackBox:
+    """One file: its running ``number`` (0 in those of before there were numbers), when it was written, the class."""
+
+    path: Path
+    number: int
+    written: datetime
+    code: str
+
+
+def kept(store: Path) -> list[BlackBox]:
+    """Return the black boxes of a store, oldest first; a file of another name is none."""
+    found = []
+    for path in sorted((store / FOLDER).glob("*.log")):
+        match = _NAME.fullmatch(path.name)
+        if match is None or path.is_symlink() or not path.is_file():
+            continue
+        written = datetime.strptime(match[2], _TIME).replace(tzinfo=UTC)
+        found.append(BlackBox(path, int(match[1] or 0), written, match[3]))
+    return sorted(found, key=lambda box: box.number)
 
 
 def dump(store: Path, code: str, frames: Callable[[], Mapping[str, str]]) -> Notice:
@@ -18,15 +49,16 @@ def dump(store: Path, code: str, frames: Callable[[], Mapping[str, str]]) -> Not
     Returns what is to be told, also when the disk refuses: the correction is off already.
     """
     folder, logs = store / FOLDER, frames()
-    stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
-    file = folder / f"{stamp}-{code}.log"
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        file.write_text("".join(logs.values()), "ascii")
-        for old in sorted(folder.glob("*.log"))[:-KEPT_FILES]:
-            old.unlink()
-    except OSError as error:
-        text = f"{file}: the frames before the trip cannot be written ({error.strerror}); free the disk"
-        return Notice("StoreFault", "minor", text)
+        make_folder(folder)
+        before = kept(store)
+        number = max((box.number for box in before), default=0) + 1
+        file = folder / f"{number:06d}-{datetime.now(UTC).strftime(_TIME)}-{code}.log"
+        write_file(file, "".join(logs.values()).encode("ascii"))
+        for old in before[: max(0, len(before) + 1 - KEPT_FILES)]:
+            old.path.unlink()
+    except (OSError, StoreError) as error:
+        trouble = store_error(folder, error) if isinstance(error, OSError) else error
+        return Notice(trouble.code, "minor", f"the frames around the trip are not kept: {trouble}")
     lines = sum(log.count("\n") for log in logs.values())
     return Notice("BlackBox", "info", f"the last {lines} frames are in {file}")

@@ -1,10 +1,12 @@
 """Serves the control socket: one JSON object per line and request, one per answer, over a UNIX socket.
 
-A request is {"request": "status" | "arm" | "disarm" | "stop", ...}; an answer is {"ok": true, ...} or
+A request is {"request": "status" | "live" | "arm" | "disarm" | "stop", ...}; an answer is {"ok": true, ...} or
 {"ok": false, "code", "text", "advice"}. With "progress": true lines {"progress": {...}} come before an answer that
-takes its time; who closes the connection meanwhile abandons what is checked for him. The socket is mode 0600: who may
-open it may read; arming needs the token. Of sixteen connections the one that has been idle for longest makes room for
-one more; where all wait for their answers, four more may ask for ``status`` and ``disarm``.
+takes its time; who closes the connection meanwhile abandons what is checked for him. Who is at the other end is
+what the kernel says, and what he may ask for what the config says (``peers``); arming needs the operator's token
+besides. After the answer to ``live`` the connection tells the samples as they pass (``fdhil.daemon.live``). Of sixteen
+connections the one that has been idle for longest makes room for one more; where all wait for their answers, four more
+may ask for ``status`` and ``disarm``.
 """
 
 from __future__ import annotations
@@ -13,14 +15,16 @@ import asyncio
 import contextlib
 import json
 import socket
-import stat
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
 from fdhil.arming.answers import Answer, refusal
+from fdhil.config import Access
+from fdhil.daemon.peers import Peer, listen, peer_of
 from fdhil.errors import ConnectError, DeviceTimeout, FdhilError
+from fdhil.guard.peers import Role
 
 SOCKET_NAME = "daemon.sock"
 MAX_LINE = 64 * 1024
@@ -30,33 +34,39 @@ ALWAYS_HEARD = ("disarm", "status")
 IDLE_S = 60.0
 PROGRESS_S = 0.5
 
-Handler = Callable[[Mapping[str, Any]], Awaitable[Answer]]
+Handler = Callable[[Mapping[str, Any], Peer], Awaitable[Answer]]
 Progress = Callable[[], Mapping[str, Any] | None]
+Stream = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
 Done = TypeVar("Done")
 
 
 class ControlServer:
     """Serves requests to ``handle``; each client has its own task, a slow or dead one delays nobody else."""
 
-    def __init__(self, handle: Handler, progress: Progress, abandon: Callable[[], object]) -> None:
-        """``progress`` tells how far what takes long is, ``abandon`` ends it."""
-        self._handle, self._progress, self._abandon = handle, progress, abandon
+    def __init__(
+        self,
+        handle: Handler,
+        progress: Progress,
+        abandon: Callable[[], object],
+        access: Access,
+        live: Stream | None = None,
+    ) -> None:
+        """``progress`` tells how far what takes long is, ``abandon`` ends it; ``access`` says who may come.
+
+        ``live`` serves a connection after the answer that opens it as a stream.
+        """
+        self._handle, self._progress, self._abandon, self._access = handle, progress, abandon, access
+        self._live = live
         # the clients in the order of their last answers, the longest idle first, and those that wait for one
         self._clients: dict[asyncio.Task[None], None] = {}
         self._busy: set[asyncio.Task[None]] = set()
 
     @asynccontextmanager
     async def serving(self, path: Path) -> AsyncIterator[None]:
-        """Listen at ``path`` (mode 0600) until the block is left; a socket file left by a crash is replaced."""
-        with contextlib.suppress(FileNotFoundError):
-            if stat.S_ISSOCK(path.lstat().st_mode):
-                path.unlink()
-        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        """Listen at ``path`` until the block is left; a socket file left by a crash is replaced. ConnectError."""
         try:
-            listener.bind(str(path))
-            path.chmod(0o600)
+            listener = listen(path, self._access)
         except OSError as error:
-            listener.close()
             text = f"cannot be opened: {error.strerror or error}; set another [store] run_directory"
             raise ConnectError(str(path), text) from None
         server = await asyncio.start_unix_server(self._accept, sock=listener, limit=MAX_LINE)
@@ -101,25 +111,34 @@ class ControlServer:
     async def _converse(
         self, task: asyncio.Task[None], reader: asyncio.StreamReader, writer: asyncio.StreamWriter
     ) -> None:
+        peer = peer_of(writer.get_extra_info("socket"), self._access)
         while line := await _in_time(reader.readline()):
             self._busy.add(task)
-            answer = await self._attended(line, reader, writer)
+            answer = await self._attended(line, peer, reader, writer)
             self._busy.discard(task)
             self._clients[task] = self._clients.pop(task, None)
             writer.write(json.dumps(answer).encode() + b"\n")
             await _in_time(writer.drain())
+            if self._live is not None and "live" in answer:
+                self._busy.add(task)  # it is never idle: nobody takes its place
+                await self._live(reader, writer)
+                return
+            if peer.role is Role.NOBODY:
+                return
 
-    async def _attended(self, line: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Answer:
+    async def _attended(
+        self, line: bytes, peer: Peer, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> Answer:
         """Answer a request; tell its progress meanwhile where that is wanted."""
         try:
             request = json.loads(line)
         except (ValueError, RecursionError):
             return refusal("BadRequest", "the request is no JSON", "send one JSON object per line")
-        answering = asyncio.ensure_future(self._answer(request))
+        answering = asyncio.ensure_future(self._answer(request, peer))
         wanted = isinstance(request, dict) and request.get("progress") is True
         try:
             while wanted and not (await asyncio.wait([answering], timeout=PROGRESS_S))[0]:
-                if reader.at_eof():
+                if reader.at_eof() or writer.is_closing():  # the latter where it left while progress was told
                     self._abandon()
                 elif told := self._progress():
                     writer.write(json.dumps({"progress": told}).encode() + b"\n")
@@ -127,13 +146,13 @@ class ControlServer:
         finally:
             answering.cancel()
 
-    async def _answer(self, request: Any) -> Answer:
+    async def _answer(self, request: Any, peer: Peer) -> Answer:
         if not isinstance(request, dict) or not isinstance(request.get("request"), str):
             return refusal("BadRequest", "the request has no text under 'request'", "status, arm, disarm or stop")
         if len(self._busy) > MAX_CLIENTS and request["request"] not in ALWAYS_HEARD:
             return refusal("Busy", f"{MAX_CLIENTS} others wait for their answers", "wait for one of them to end")
         try:
-            return await self._handle(request)
+            return await self._handle(request, peer)
         except FdhilError as error:
             return refusal(type(error).__name__, str(error))
 

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from fdhil.cia402 import state_of
 from fdhil.config import MachineConfig
 from fdhil.daemon.moves import Moves
 from fdhil.pipeline import Record
@@ -53,6 +54,7 @@ class Hearing:
         self._sync: deque[tuple[int, int]] = deque(maxlen=SYNC_INTERVALS + 1)
         self._sync_s: float | None = None
         self._samples_s: dict[str, float] = {}
+        self._statuswords: dict[str, int] = {}
         self._since_s: dict[Trouble, float] = {}
         self._silent.clear()
 
@@ -81,6 +83,7 @@ class Hearing:
         elif isinstance(record, AxisSamples) and record.axis in self.moves:
             if record.tick.size:  # else none is whole: a TPDO of the mapping does not come
                 self._samples_s[record.axis] = now_s
+                self._statuswords[record.axis] = int(record.statusword[-1])
             self.moves[record.axis].feed(record, now_s)
         elif isinstance(record, Notice) and record.code in SILENCES:
             if record.severity == "info":
@@ -110,8 +113,9 @@ class Hearing:
             return None
         newest_tick, newest_ns = self._sync[-1]
         recent = [(tick, t_ns) for tick, t_ns in self._sync if newest_ns - t_ns <= RATE_NS and tick <= newest_tick]
-        span_s = (newest_ns - recent[0][1]) * 1e-9
-        return (newest_tick - recent[0][0]) / span_s if len(recent) >= FEW_SYNCS and span_s > 0 else None
+        ticks, span_s = newest_tick - recent[0][0], (newest_ns - recent[0][1]) * 1e-9
+        # two buses that are drained one after the other may show nothing but the same ticks twice
+        return ticks / span_s if len(recent) >= FEW_SYNCS and ticks > 0 and span_s > 0 else None
 
     def status(self, now_s: float) -> dict[str, Any]:
         """Return the part of the status document that says what is heard, with ages."""
@@ -141,6 +145,11 @@ class Hearing:
         """Return how long ago the last samples of an axis came; None when none did."""
         at_s = self._samples_s.get(axis)
         return None if at_s is None else round(now_s - at_s, 3)
+
+    def drive_state(self, axis: str) -> str | None:
+        """Return the state of CiA 402 that a drive told last; None when it told none."""
+        word = self._statuswords.get(axis)
+        return None if word is None else state_of(word).value
 
     # what is not as the config says ----------------------------------------------------------------------------
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 from collections.abc import Iterator
@@ -33,8 +34,9 @@ def sole_owner(run_directory: Path) -> Iterator[None]:
             owner = os.pread(descriptor, 32, 0).decode("ascii", "replace").strip() or "unknown"
             text = f"BusLocked: a daemon already serves it (process {owner}); stop that one first, nothing was sent"
             raise BusLocked(str(run_directory), text) from None
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+        with contextlib.suppress(OSError):  # it is only told to another one; the lock holds without it
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
         yield
     finally:
         os.close(descriptor)

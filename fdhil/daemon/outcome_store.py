@@ -5,9 +5,13 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
+from fdhil.arming.answers import Answer
 from fdhil.config import MachineConfig
+from fdhil.daemon import journal
+from fdhil.daemon.notice_book import NEWEST, NotAcknowledged, NoticeBook, acknowledgement_of, counted
 from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.errors import StoreError
 from fdhil.identification.between import HISTORY, Member
@@ -25,11 +29,12 @@ from fdhil.records import (
     WindowOutcome,
     frozen,
 )
+from fdhil.store import WINDOWS_FOLDER as WINDOWS_FOLDER
 from fdhil.store.history import FILE_NAME, History
+from fdhil.store.outbox import Outbox
 from fdhil.store.rows import Revision, Stamp, StoredWindow
 from fdhil.store.windows import RawScale, Scales, WindowStore
 
-WINDOWS_FOLDER = "windows"
 SKILLS = 3
 
 
@@ -81,10 +86,12 @@ class OutcomeStore:
         self._config = config
         self._directory = config.store.directory
         self._lock = threading.Lock()
+        self._outbox = Outbox(config.uplink, config.uplink_directory) if config.uplink else None
         self._scales = {axis: raw_scales(config, axis) for axis in config.axis}
         self._history: History | None = None
         self._windows: WindowStore | None = None
         self._accepted = {axis: deque[tuple[int, int]](maxlen=HISTORY) for axis in config.axis}  # start tick and row
+        self.notices = NoticeBook()
         self.fault: str | None = None
         self.strays: tuple[str, ...] = ()
 
@@ -99,6 +106,7 @@ class OutcomeStore:
             else:
                 notices += self._refused(error)
         notices += self._damaged_rows()
+        notices += self._begin_notices()
         if self.strays:
             names = ", ".join(self.strays[:5])
             folder = self._directory / WINDOWS_FOLDER
@@ -108,7 +116,9 @@ class OutcomeStore:
 
     def _open(self) -> None:
         if self._history is None:
-            self._history = History.open(self._directory)
+            outbox = self._outbox
+            adding = (outbox.enter, outbox.begin) if outbox else (None, None)
+            self._history = History.open(self._directory, *adding)
         folder = self._directory / WINDOWS_FOLDER
         self._windows = WindowStore(folder, self._config.store.keep_windows, self._config.digest)
         self.strays = self._windows.strays
@@ -123,6 +133,13 @@ class OutcomeStore:
             return []
         text = f"Damaged rows of the history were put aside, older ones are used: {places}; check the disk."
         return [Notice("CorruptFile", "MAJOR", text)]
+
+    def _begin_notices(self) -> list[Notice]:
+        try:
+            self.notices.begin(self._history.notices(limit=NEWEST) if self._history is not None else [])
+        except StoreError as error:
+            return self._refused(error)
+        return []
 
     def _put_aside(self, error: StoreError) -> list[Notice]:
         path = self._directory / FILE_NAME
@@ -160,10 +177,7 @@ class OutcomeStore:
         return [skill for axis in self._config.axis for skill in self._history.skills(axis, limit=SKILLS)]
 
     def known(self, axis: str) -> Known:
-        """Return where an earlier run left off: first values, newest set, the newest accepted windows' estimates.
-
-        Loops are known as long as the configuration is the same: a drive may have been tuned with it.
-        """
+        """Return where an earlier run left off: first values, newest set, the newest accepted windows' estimates."""
         if self._history is None:
             return Known()
         newest = self._history.revisions(axis, limit=1)
@@ -174,9 +188,8 @@ class OutcomeStore:
         windows = [window for window in self._history.windows(axis, limit=2 * HISTORY) if window.accepted][-HISTORY:]
         points = tuple(map(_point, windows[-4 * POOL_WINDOWS :]))
         published = newest[0].set if newest else None
-        same = published is not None and published.config_digest == self._config.digest
-        loops = self._history.loops(axis, limit=1) if same else []
-        return Known(first, published, points, _members(windows), loops[0][1] if loops else None)
+        loops = self._history.own_loops(axis, self._config.digest)
+        return Known(first, published, points, _members(windows), loops)
 
     def counts(self, axis: str) -> tuple[int, int]:
         """Return how many windows of an axis were ever accepted and refused."""
@@ -198,6 +211,23 @@ class OutcomeStore:
                 return [Notice("StoreRecovered", "info", text)]
         return []
 
+    def acknowledge(self, request: Mapping[str, Any]) -> Answer:
+        """Store who has seen which notices, so that they are open no more; StoreError when the disk refuses."""
+        with self._lock:
+            try:
+                given = acknowledgement_of(request, self.notices.chosen(request))
+            except NotAcknowledged as refused:
+                return refused.answer
+            if self._history is None:
+                self._open()
+            assert self._history is not None
+            if given.notices:
+                self._history.add_acknowledgement(given)
+                self.notices.acknowledged(given)
+        text = f"{counted(given.notices)} acknowledged by {given.who}; {self.notices.status()['count']} more wait"
+        journal.write_line(text)
+        return {"ok": True, "text": text, "acknowledged": list(given.notices)}
+
     def _keep(self, outcome: Outcome) -> None:
         assert self._history is not None
         assert self._windows is not None
@@ -213,7 +243,7 @@ class OutcomeStore:
             ids = [number for tick, number in self._accepted[outcome.axis] if tick in outcome.window_ticks]
             self._history.add_revision(outcome, ids, stamp)
         elif isinstance(outcome, Notice):
-            self._history.add_notice(outcome, stamp)
+            self.notices.stored(outcome, self._history.add_notice(outcome, stamp), stamp)
         elif isinstance(outcome, LoopEstimate):
             self._history.add_loops(outcome, stamp)
         else:

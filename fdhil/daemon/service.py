@@ -22,12 +22,17 @@ from fdhil.arming.standing import ADOPT, START_AND_ADOPT, Standing
 from fdhil.commissioning.void import void_record
 from fdhil.config import MachineConfig, unlikely
 from fdhil.daemon import blackbox, journal
+from fdhil.daemon.audited import Audited
+from fdhil.daemon.clock import ClockWatch, newest_record_s
 from fdhil.daemon.control import SOCKET_NAME, ControlServer
 from fdhil.daemon.kernel_warmup import warm
+from fdhil.daemon.live import LiveStream
 from fdhil.daemon.lock import sole_owner
 from fdhil.daemon.notify import notify
+from fdhil.daemon.offer_watch import OfferWatch
 from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.daemon.record_queue import RecordQueue
+from fdhil.daemon.resources import ResourceWatch, Use, uses
 from fdhil.daemon.status import Watch
 from fdhil.errors import DeviceError, FdhilError, StoreError
 from fdhil.pipeline import AxisPipeline, Record
@@ -38,6 +43,7 @@ FIRST_RETRY_S = 0.1
 LAST_RETRY_S = 5.0
 WATCHDOG_S = 2.0
 LISTEN_S = 0.25
+RESOURCES_S = 10.0
 STUCK_S = 60.0  # a batch that is digested for so long hangs
 
 
@@ -72,14 +78,17 @@ class Service:
         self._store = OutcomeStore(config)
         self._desk = ArmingDesk(config, self._store, self._run_directory)
         self._watch = Watch(config, time.monotonic())
+        self._live = LiveStream(config)
         self._pipelines: dict[str, AxisPipeline] = {}
         self._queues = {axis: RecordQueue() for axis in config.axis}
         self._busy_since_s: dict[str, float] = {}
         self._notices = asyncio.Queue[Notice](NOTICE_QUEUE)
         self._gate = journal.FloodGate()
+        self._audit = Audited(self._handle, config.store.directory)
         self._opened = asyncio.Event()
         self._stop = asyncio.Event()
         self._source: Source | None = None
+        self._resources: tuple[Use, ...] = ()
         self._frames_seen = -1
         self._delay_s = FIRST_RETRY_S
 
@@ -94,6 +103,7 @@ class Service:
             finally:
                 notify("STOPPING=1")
                 stands = await self._desk.stand_down()
+                await self._audit.written()
                 await asyncio.to_thread(self._store.close)
                 for number in (signal.SIGTERM, signal.SIGINT):
                     loop.remove_signal_handler(number)
@@ -114,10 +124,14 @@ class Service:
         return self._desk.guard.standing
 
     async def _serve(self) -> None:
-        self._say(await asyncio.to_thread(self._store.open))
+        clock = ClockWatch(await asyncio.to_thread(newest_record_s, self._config.store.directory))
+        self._tell(await asyncio.to_thread(self._store.open))
         self._say([Notice("ConfigUnlikely", "minor", text) for text in unlikely(self._config)])
         await asyncio.to_thread(self._prepare)
-        control = ControlServer(self._handle, lambda: self._desk.checking, self._desk.abandon)
+        desk = self._desk
+        control = ControlServer(
+            self._audit.of, lambda: desk.checking, desk.abandon, self._config.access, self._live.serve
+        )
         async with control.serving(self._run_directory / SOCKET_NAME), asyncio.TaskGroup() as tasks:
             acquiring = tasks.create_task(self._acquire(), name="acquire")
             others = [tasks.create_task(self._work(axis), name=f"axis {axis}") for axis in self._config.axis]
@@ -126,6 +140,7 @@ class Service:
             others.append(tasks.create_task(self._desk.stream(self._tell), name="stream"))
             others.append(tasks.create_task(self._feed_watchdog(), name="watchdog"))
             others.append(tasks.create_task(self._listen(), name="listen"))
+            others.append(tasks.create_task(self._watch_resources(clock), name="resources"))
             others.append(tasks.create_task(self._say_ready(), name="ready"))
             await self._stop.wait()
             notify("STOPPING=1")
@@ -188,6 +203,7 @@ class Service:
         if isinstance(record, Notice):
             self._tell([record])
             return
+        self._live.take(record)
         if isinstance(record, Temperature):
             self._desk.knowledge.note_temperature(record)
         elif isinstance(record, AxisSamples):
@@ -230,7 +246,7 @@ class Service:
                 await asyncio.to_thread(self._void, notice)
             if notice.code == TRIPPED and self._source is not None:
                 code, store = notice.text.partition(":")[0], self._config.store.directory
-                self._say([await asyncio.to_thread(blackbox.dump, store, code, self._source.black_box)])
+                self._tell([await asyncio.to_thread(blackbox.dump, store, code, self._source.black_box)])
             self._notices.task_done()
 
     def _void(self, notice: Notice) -> None:
@@ -278,21 +294,35 @@ class Service:
                 self._watch.hearing.counted(self._source.counters(), now_s)
             self._tell(self._watch.troubles(now_s))
 
+    async def _watch_resources(self, clock: ClockWatch) -> None:
+        """Look now and then: is memory, are descriptors nearly used up, was the clock set, does an offer wait."""
+        watch, offers = ResourceWatch(), OfferWatch(self._config)
+        while True:
+            self._resources = uses()
+            self._tell([*watch.look(self._resources), *clock.look(time.time(), time.monotonic())])
+            self._tell(await asyncio.to_thread(offers.look))
+            await asyncio.sleep(RESOURCES_S)
+
     # control ---------------------------------------------------------------------------------------------------
 
     async def _handle(self, request: Mapping[str, Any]) -> Answer:
         if request["request"] == "status":
             return self._status()
+        if request["request"] == "live":
+            return self._live.begin()
         if request["request"] == "arm":
             answer = await self._desk.arm(request)
             self._tell([_told(answer)])
             return answer
         if request["request"] == "disarm":
             return await self._desk.disarm()
+        if request["request"] == "acknowledge":
+            return await asyncio.to_thread(self._store.acknowledge, request)
         if request["request"] == "stop":
             self._stop.set()
             return {"ok": True, "text": "stopping"}
-        return refusal("BadRequest", f"{request['request']!r} is no request", "send status, arm, disarm or stop")
+        text = f"{request['request']!r} is no request"
+        return refusal("BadRequest", text, "send status, live, arm, disarm, acknowledge or stop")
 
     def _status(self) -> Answer:
         counters = dict(self._source.counters()) if self._source is not None else {}
@@ -303,7 +333,7 @@ class Service:
             "fault": self._store.fault,
             "strays": list(self._store.strays),
         }
-        status = self._watch.status(time.monotonic())
+        status = self._watch.status(time.monotonic(), self._store.notices.told)
         guard = self._desk.guard
         for axis, celsius in self._desk.knowledge.temperatures.items():
             status["axes"][axis]["slideway_c"] = celsius
@@ -314,12 +344,14 @@ class Service:
             "frames": {"received": counters.get("frames", 0), "lost": counters.get("lost", 0)},
             "counters": counters,
             "dropped": dropped,
+            "resources": {use.name: {"used": use.used, "allowed": use.allowed} for use in self._resources},
             "guard": dict(guard.status),
             "may_stand": {"nothing": guard.standing.nothing, "text": str(guard.standing)},
             "armed": self._desk.armed,
             "checking": self._desk.checking,
             "passes": self._desk.passes,
             "store": store,
+            "unacknowledged": self._store.notices.status(),
         }
 
 

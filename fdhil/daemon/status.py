@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from fdhil.config import MachineConfig
 from fdhil.daemon.hearing import Hearing, Trouble
 from fdhil.daemon.nc_watch import NcWatch
-from fdhil.daemon.outcome_json import loops_document, parameters_status, terms_status
+from fdhil.daemon.outcome_json import loops_document
 from fdhil.records import LoopEstimate, Notice, Outcome, ParameterSet, Skill, WindowOutcome
+from fdhil.store.set_document import parameters_status, terms_status
 
 SCHEMA = "fdhil-status-1"
 NOTICES = 20
@@ -74,15 +76,18 @@ class Watch:
         before = self._troubles
         self._troubles = self.hearing.troubles({axis: watch.windows for axis, watch in self._axes.items()}, now_s)
         begun = [
-            Notice(code, "minor" if code in MINOR else "MAJOR", text, axis)
+            Notice(code, severity_of(code), text, axis)
             for (code, axis), text in self._troubles.items()
             if (code, axis) not in before
         ]
         over = [(code, axis) for code, axis in before if (code, axis) not in self._troubles]
         return begun + [Notice(code, "info", "this is no longer so", axis) for code, axis in over]
 
-    def status(self, now_s: float) -> dict[str, Any]:
-        """Return the status document (without what others know: counters, store, guard)."""
+    def status(self, now_s: float, stored: Callable[[Notice], Mapping[str, Any]] = lambda _: {}) -> dict[str, Any]:
+        """Return the status document (without what others know: counters, store, guard).
+
+        ``stored`` tells what is known of a notice since it was stored.
+        """
         return {
             "schema": SCHEMA,
             "machine": self._config.machine.name,
@@ -90,9 +95,14 @@ class Watch:
             "uptime_s": round(now_s - self._started_s, 3),
             **self.hearing.status(now_s),
             "nc": self.nc.status(now_s),
-            "troubles": [{"code": code, "axis": axis, "text": text} for (code, axis), text in self._troubles.items()],
+            "troubles": [
+                {"code": code, "severity": severity_of(code), "axis": axis, "text": text}
+                for (code, axis), text in self._troubles.items()
+            ],
             "axes": {axis: self._axis_status(axis, now_s) for axis in self._axes},
-            "notices": [{"age_s": round(now_s - at_s, 3), **asdict(notice)} for at_s, notice in self._notices],
+            "notices": [
+                {"age_s": round(now_s - at_s, 3), **asdict(notice), **stored(notice)} for at_s, notice in self._notices
+            ],
         }
 
     def _axis_status(self, axis: str, now_s: float) -> dict[str, Any]:
@@ -113,9 +123,15 @@ class Watch:
             "last_window": _window_status(last) if last else None,
             "skill": asdict(watch.skill) if watch.skill else None,
             "loops": loops_document(watch.loops) if watch.loops else None,
+            "drive_state": self.hearing.drive_state(axis),
             "samples_s_ago": self.hearing.samples_s_ago(axis, now_s),
             "moves": self.hearing.moves[axis].status(),
         }
+
+
+def severity_of(code: str) -> Literal["minor", "MAJOR"]:
+    """Return how severe a trouble of a class is."""
+    return "minor" if code in MINOR else "MAJOR"
 
 
 def _window_status(outcome: WindowOutcome) -> dict[str, Any]:

@@ -8,7 +8,7 @@ commissioned.
 from __future__ import annotations
 
 from fdhil.guard import feedforward
-from fdhil.guard.conditions import AGREEING, ARMING_INTERLOCKS, View, Views, known
+from fdhil.guard.conditions import AGREEING, ARMING_INTERLOCKS, View, Views, known, views_of
 from fdhil.guard.feeding import is_fed
 from fdhil.guard.interlocks import Alarm, Alarms, Reaction
 from fdhil.guard.limits import CEILING_OFFSET_UM, ceiling
@@ -64,13 +64,12 @@ def in_doubt(views: Views, doubtful: Alarms) -> Alarm:
     told = next((a for a in doubtful if a.axis == own.name and a.code == "OffsetDoubtful"), None)
     if told is not None:
         return told
-    shown = "" if axis.read_back is None else f"{_um(own, axis.read_back)}: "
-    return Alarm("OffsetDoubtful", own.name, shown + doubtful[0].cause)
+    return Alarm("OffsetDoubtful", own.name, f"{_um(own, axis.read_back or 0)}: {doubtful[0].cause}")
 
 
-def may_stand(state: State, settings: Settings) -> tuple[int | None, ...]:
+def may_stand(state: State) -> tuple[int | None, ...]:
     """Return what may still be applied in each drive, in increments; 0: it is known that nothing is, None: unknown."""
-    return tuple([_may_stand(state, axis) for axis, _ in zip(state.axes, settings.axes, strict=True)])
+    return tuple([_may_stand(state, axis) for axis in state.axes])
 
 
 def _may_stand(state: State, axis: AxisState) -> int | None:
@@ -109,10 +108,9 @@ def adopting(state: State, settings: Settings) -> State:
     """Take over what the drives hold: the ramp starts from the value read; speed and torque get zeros."""
     cause = Alarm("StaleOffset")
     if _nothing_held(state):
-        axes = tuple([axis._replace(sent=(0,) * len(axis.sent), offset=0, rate=0) for axis in state.axes])
-        return state.after(Event.NOTHING_HELD, axes=axes, adopt_checked=True, cause=None)
+        return state.after(Event.NOTHING_HELD, axes=tuple(map(at_zero, state.axes)), cause=None)
     feed = feedforward.zeroing(len(state.axes), cause) if is_fed(state) and settings.feeds else state.feed
-    state = state.after(Event.ADOPT, zeros_sent=0, adopt_checked=True, cause=cause, feed=feed)
+    state = state.after(Event.ADOPT, zeros_sent=0, cause=cause, feed=feed)
     return _from_measured(state)
 
 
@@ -141,18 +139,21 @@ def at_rest(axis: AxisState, offset: int) -> AxisState:
     return axis._replace(offset=offset, rate=0, sent=(offset,) * len(axis.sent), echo_misses=0, zero_shown=False)
 
 
+def at_zero(axis: AxisState) -> AxisState:
+    """The drive has shown that it holds 0, and nothing but that is sent."""
+    return at_rest(axis, 0)._replace(readings=AGREEING, zero_shown=True)
+
+
 def unread(state: State) -> State:
     """Return the state with what the drives hold to be read anew."""
-    return state._replace(
-        axes=tuple([axis._replace(read_back=None, readings=0, zero_shown=False) for axis in state.axes])
-    )
+    return state._replace(axes=tuple([axis._replace(read_back=None, zero_shown=False) for axis in state.axes]))
 
 
 def frozen(state: State, cause: Alarm) -> State:
     """Stop sending: what the drive holds is unknown, unless only zeros were sent and shown."""
     if not state.measuring and all(map(is_zero, state.axes)):
         return state.after(Event.BLOCKED_AT_ZERO, cause=cause, places=())
-    axes = tuple([axis._replace(read_back=None, readings=0) for axis in state.axes])
+    axes = tuple([axis._replace(read_back=None) for axis in state.axes])
     return state.after(Event.BLOCKED, cause=cause, places=(), axes=axes, measuring=0)
 
 
@@ -168,18 +169,17 @@ def adopt_at_start(state: State, inputs: Inputs, alarms: Alarms, views: Views, s
     if not is_fed(state) and not any(axis.read_back for axis in state.axes):
         return state._replace(unknown_for=0)
     doubtful = doubts(views, alarms)
-    if not doubtful:
-        return adopting(state, settings)
-    if state.unknown_for < patience(settings):
+    if doubtful and state.unknown_for < patience(settings):
         return state._replace(unknown_for=state.unknown_for + 1)
-    return state.after(Event.DOUBTFUL, cause=in_doubt(views, doubtful), adopt_checked=True)
+    state = state._replace(adopt_checked=True)
+    return state.after(Event.DOUBTFUL, cause=in_doubt(views, doubtful)) if doubtful else adopting(state, settings)
 
 
-def measure(state: State, alarms: Alarms, views: Views, settings: Settings) -> State:
+def measure(state: State, inputs: Inputs, alarms: Alarms, settings: Settings) -> State:
     """After another node's offset frame nothing is sent until the drives show what they hold; then from there to 0."""
     if not state.measuring:
         return state
-    views = tuple([(own, seen, axis) for (own, seen, _), axis in zip(views, state.axes, strict=True)])
+    views = views_of(settings, inputs, state)
     doubtful = doubts(views, alarms)
     if not doubtful:
         return _from_measured(state)

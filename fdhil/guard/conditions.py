@@ -13,12 +13,12 @@ from fdhil.cia402 import (
     STATUS_INTERNAL_LIMIT,
     Mode,
     Nmt,
-    State,
     state_of,
 )
+from fdhil.cia402 import State as DriveState
 from fdhil.guard.interlocks import Alarm, Alarms
-from fdhil.guard.settings import AxisSettings
-from fdhil.guard.state import AxisInput, AxisState, BusView
+from fdhil.guard.settings import AxisSettings, Settings
+from fdhil.guard.state import AxisInput, AxisState, BusView, Inputs, State
 
 View = tuple[AxisSettings, AxisInput, AxisState]
 """One axis: what it is set to, what it showed, and what is remembered of it."""
@@ -28,8 +28,14 @@ AGREEING = 3
 """TPDOs in a row that must show the same offset before it is known."""
 
 
-def _status(bit: int, wanted: bool) -> Good:
-    return lambda _own, seen, _axis: seen.statusword is not None and bool(seen.statusword & bit) is wanted
+def views_of(settings: Settings, inputs: Inputs, state: State) -> Views:
+    """Put together what belongs to each axis."""
+    return tuple(zip(settings.axes, inputs.axes, state.axes, strict=True))
+
+
+def _shows(seen: AxisInput, bit: int) -> bool | None:
+    """Return whether the statusword has a bit, None when it is unknown."""
+    return None if seen.statusword is None else bool(seen.statusword & bit)
 
 
 def known(axis: AxisState) -> int | None:
@@ -38,12 +44,11 @@ def known(axis: AxisState) -> int | None:
 
 
 def _enabled(_own: AxisSettings, seen: AxisInput, _axis: AxisState) -> bool:
-    return seen.statusword is not None and state_of(seen.statusword) is State.OPERATION_ENABLED
+    return seen.statusword is not None and state_of(seen.statusword) is DriveState.OPERATION_ENABLED
 
 
 def _following(own: AxisSettings, seen: AxisInput, axis: AxisState) -> bool:
-    bit_clear = seen.statusword is None or not seen.statusword & STATUS_FOLLOWING_ERROR
-    return bit_clear and abs(axis.following_error) <= own.window / 2
+    return not _shows(seen, STATUS_FOLLOWING_ERROR) and abs(axis.following_error) <= own.window / 2
 
 
 def _heartbeat(own: AxisSettings, seen: AxisInput, _axis: AxisState) -> bool:
@@ -52,18 +57,18 @@ def _heartbeat(own: AxisSettings, seen: AxisInput, _axis: AxisState) -> bool:
 
 # (class, what must be true): evaluated per axis and SYNC, in this order
 AXIS_INTERLOCKS: tuple[tuple[str, Good], ...] = (
+    ("PdoLength", lambda _own, seen, _axis: seen.short_frames < 3),  # before what follows from it
     ("StaleData", lambda _own, seen, _axis: seen.feedback_age <= 3),
     ("HeartbeatLost", _heartbeat),
     ("NmtStateWrong", lambda _own, seen, _axis: seen.nmt is None or seen.nmt == Nmt.OPERATIONAL),
     ("FollowingError", _following),
     ("DriveNotEnabled", _enabled),
-    ("NotFollowing", _status(STATUS_FOLLOWS_DEMAND, True)),
-    ("LimitActive", _status(STATUS_INTERNAL_LIMIT, False)),
+    ("NotFollowing", lambda _own, seen, _axis: _shows(seen, STATUS_FOLLOWS_DEMAND) is True),
+    ("LimitActive", lambda _own, seen, _axis: _shows(seen, STATUS_INTERNAL_LIMIT) is False),
     ("NotCsp", lambda _own, seen, _axis: seen.mode == Mode.CYCLIC_SYNC_POSITION),
     ("ReadBackStale", lambda _own, seen, _axis: seen.read_back_age <= 2),
     ("EchoMismatch", lambda _own, _seen, axis: axis.echo_misses < 2 and axis.feed_misses < 2),
     ("Implausible", lambda _own, _seen, axis: axis.implausible < 2),
-    ("PdoLength", lambda _own, seen, _axis: seen.short_frames < 3),
     ("TargetLost", lambda _own, seen, _axis: seen.target is not None),
     ("FeedbackGap", lambda _own, seen, _axis: seen.feedback_age <= 1),
 )

@@ -11,21 +11,20 @@ import os
 import queue
 import select
 import socket
-import struct
 import threading
 from array import array
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from fdhil.errors import DeviceError
+from fdhil.guard.peers import Access, Peer, Role, credentials
 from fdhil.guard.protocol import SOCKET_NAME
 from fdhil.guard.requests import Document, parse_line
 
 MAX_CLIENTS = 8
 MAX_LINE_BYTES = 1 << 15
-SO_PEERCRED = getattr(socket, "SO_PEERCRED", 17)
 MOST_DESCRIPTORS = 253  # the kernel's limit: what does not fit the buffer would be closed in this thread
 ANCILLARY_BYTES = socket.CMSG_SPACE(MOST_DESCRIPTORS * 4)
 
@@ -66,6 +65,7 @@ class Client:
     socket: socket.socket
     heard_s: float
     closer: Closer
+    peer: Peer
     inbox: bytes = b""
     outbox: bytearray = field(default_factory=bytearray)
     descriptor: int | None = None
@@ -141,18 +141,19 @@ class Client:
 class Control:
     """The listening socket ``guard.sock`` and its clients; DeviceError when it cannot be made.
 
-    The file is the guard's alone (0600), or its group's too (0660) where the daemon runs as another user, ``peer_uid``.
+    The file is the guard's alone (0600), or its group's too (0660) where ``access`` names others. Whom it does not name
+    is told so and let go, and ``turned_away`` is called.
     """
 
-    def __init__(self, run_directory: Path, peer_uid: int | None = None) -> None:
+    def __init__(self, run_directory: Path, access: Access, turned_away: Callable[[Peer, object], None]) -> None:
         self.path = run_directory / SOCKET_NAME
         self.clients: list[Client] = []
-        self._trusted = {0, os.getuid(), *([] if peer_uid is None else [peer_uid])}
+        self._access, self._turned_away = access, turned_away
         self._closer = Closer()
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             self.path.unlink(missing_ok=True)  # the bus lock is ours already: no other guard listens here
-            mask = os.umask(0o177 if peer_uid is None else 0o117)
+            mask = os.umask(0o117 if access.shared else 0o177)
             try:
                 self._listener.bind(str(self.path))
             finally:
@@ -196,16 +197,18 @@ class Control:
         return None
 
     def _accept(self, now_s: float) -> None:
-        """Take one connection of a trusted user; when there are too many, the one that was silent longest ends."""
+        """Take one connection of who may talk; when there are too many, the one that was silent longest ends."""
         try:
             connection, _ = self._listener.accept()
         except OSError:
             return
         connection.setblocking(False)
-        client = Client(connection, now_s, self._closer)
-        credentials = connection.getsockopt(socket.SOL_SOCKET, SO_PEERCRED, 12)
-        if struct.unpack("3i", credentials)[1] not in self._trusted:
+        pid, uid = credentials(connection)
+        client = Client(connection, now_s, self._closer, Peer(uid, pid, self._access.role_of(uid)))
+        if client.peer.role is Role.NOBODY:
+            client.reply({}, ok=False, **client.peer.refused(None))
             client.close()
+            self._turned_away(client.peer, None)
             return
         if len(self.clients) >= MAX_CLIENTS:
             silent = min((c for c in self.clients if not c.armed), key=lambda c: c.heard_s)

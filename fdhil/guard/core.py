@@ -8,8 +8,18 @@ path, the motion of the offset, and a check of the frame by other formulas than 
 from __future__ import annotations
 
 from fdhil.guard import feedforward
-from fdhil.guard.adoption import adopt_at_start, adopt_refusals, adopting, at_rest, compared, frozen, measure, unread
-from fdhil.guard.conditions import AGREEING, Views, failing, not_ready, withheld
+from fdhil.guard.adoption import (
+    adopt_at_start,
+    adopt_refusals,
+    adopting,
+    at_rest,
+    at_zero,
+    compared,
+    frozen,
+    measure,
+    unread,
+)
+from fdhil.guard.conditions import Views, failing, not_ready, views_of, withheld
 from fdhil.guard.feeding import go_on
 from fdhil.guard.interlocks import FACTS, FEEDFORWARD_FACTS, Alarm, Alarms, Reaction
 from fdhil.guard.limits import brake, ceiling, follow, violation
@@ -31,13 +41,13 @@ def step(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outpu
     """Decide what leaves the guard now. ``inputs.sync`` False is the local timer's step, taken when SYNC is silent."""
     before = state.mode
     state = observe(state, inputs, settings)
-    views = tuple(zip(settings.axes, inputs.axes, state.axes, strict=True))
+    views = views_of(settings, inputs, state)
     alarms = _alarms(state, inputs, views)
     state = state._replace(good_for=0 if alarms else state.good_for + inputs.sync)
     state, refused = _request(state, inputs, alarms, views, settings)
     state = _react(state, inputs, alarms, settings)
     state = adopt_at_start(state, inputs, alarms, views, settings)
-    state = measure(state, alarms, views, settings)
+    state = measure(state, inputs, alarms, settings)
     if inputs.sync:
         state = rest(_follow_path(state, inputs, alarms, settings))
     state, output = _move(state, inputs, settings)
@@ -61,7 +71,7 @@ def _alarms(state: State, inputs: Inputs, views: Views) -> Alarms:
 
 def standing(state: State, inputs: Inputs, settings: Settings) -> Alarms:
     """Return what was not good at the step that took ``inputs``, what forbids arming included; for the status."""
-    views = tuple(zip(settings.axes, inputs.axes, state.axes, strict=True))
+    views = views_of(settings, inputs, state)
     return (*_alarms(state, inputs, views), *not_ready(views))
 
 
@@ -125,8 +135,6 @@ def _armed(state: State, inputs: Inputs) -> State:
         program_digest=inputs.path.program_digest,
         start_row=inputs.path.standing_rows(),
         axes=tuple([at_rest(axis, 0) for axis in state.axes]),
-        places=(),
-        held_for=0,
         cause=None,
     )
 
@@ -289,8 +297,7 @@ def _arrived(state: State, path: CorrectedPath | None) -> State:
         return state._replace(zeros_sent=0)
     sent = state.zeros_sent + 1
     if sent > ZEROS and all(axis.zero_shown for axis in state.axes):
-        axes = tuple([at_rest(axis, 0)._replace(readings=AGREEING, zero_shown=True) for axis in state.axes])
-        return state.after(Event.ZERO_SHOWN, axes=axes, zeros_sent=sent)
+        return state.after(Event.ZERO_SHOWN, axes=tuple(map(at_zero, state.axes)))
     if sent > ZEROS_UNCONFIRMED:
         cause = Alarm("EchoMismatch", detail="no zero was read back")
         return unread(state).after(Event.ZERO_NOT_SHOWN, cause=cause)

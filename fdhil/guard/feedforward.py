@@ -96,6 +96,10 @@ class Feed(NamedTuple):
         """Note what is sent now."""
         return self._replace(sent=(pairs, *self.sent)[:KEPT])
 
+    def not_sent(self) -> Feed:
+        """The last frames did not leave: the offsets before them are still in force."""
+        return self._replace(sent=(self.sent[1], *self.sent[1:])) if len(self.sent) > 1 else self
+
 
 def armed(laws: tuple[Law, ...]) -> Feed:
     """Return the state behind an arming: nothing is sent but zeros until enough targets were heard."""
@@ -144,7 +148,7 @@ def move(feed: Feed, limits: Sequence[FeedforwardLimits], fade_cycles: int, conf
     ``confirmed``: no drive shows anything but 0; zeros are sent for longer when one does.
     """
     if feed.mode is FeedMode.ZEROING:
-        return _landed(feed.send(((0, 0),) * len(feed.applied))._replace(zeros=feed.zeros + 1), confirmed)
+        return zeroed(feed, confirmed)
     known = all(len(past) == law.depth for law, past in zip(feed.laws, feed.targets, strict=True))
     share = feed.share + 1 if feed.mode is FeedMode.ON else feed.share - 1
     feed = feed._replace(share=clamp(share, 0, fade_cycles) if known else 0)
@@ -156,6 +160,11 @@ def move(feed: Feed, limits: Sequence[FeedforwardLimits], fade_cycles: int, conf
     feed = feed.send(tuple(applied))._replace(limited=feed.limited + limited)
     still = feed.mode is FeedMode.ENDING and feed.share == 0 and not any(map(any, applied))
     return _landed(feed._replace(zeros=feed.zeros + 1 if still else 0), confirmed)
+
+
+def zeroed(feed: Feed, confirmed: bool = True) -> Feed:
+    """Go one cycle on with zeros."""
+    return _landed(feed.send(((0, 0),) * len(feed.applied))._replace(zeros=feed.zeros + 1), confirmed)
 
 
 def _landed(feed: Feed, confirmed: bool) -> Feed:
@@ -172,7 +181,7 @@ def _inside(before: Pair, wanted: Pair, share: int, fade_cycles: int, limits: Fe
     bounds = ((limits.speed, limits.speed_rate), (limits.torque, limits.torque_rate))
     values = []
     for last, goal, (largest, rate) in zip(before, wanted, bounds, strict=True):
-        faded = clamp(goal, -largest, largest) * share // fade_cycles if share else 0
+        faded = clamp(goal, -largest, largest) * share // fade_cycles
         values.append(clamp(faded, last - rate, last + rate))
     return values[0], values[1]
 

@@ -17,7 +17,7 @@ def is_fed(state: State) -> bool:
 
 def go_on(state: State, inputs: Inputs, alarms: Alarms, settings: Settings, output: Output) -> tuple[State, Output]:
     """Go on with the feed-forward; on a lost SYNC its zeros are sent all the same."""
-    before = state.feed
+    before = state.feed if inputs.transmitted else state.feed.not_sent()
     if before.mode is FeedMode.OFF:
         return state, output
     own = () if inputs.main_alive is True else (Alarm("MainLost"),)
@@ -31,7 +31,7 @@ def go_on(state: State, inputs: Inputs, alarms: Alarms, settings: Settings, outp
     ways = zip(limits, before.applied, moved.applied, strict=True)
     if any(feedforward.violates(*way) for way in ways):
         cause = Alarm("InternalError", detail=f"feed-forward {before.applied} -> {moved.applied}")
-        moved = feedforward.move(feedforward.react(before, (cause,)), limits, settings.cycles(FADE_S))
+        moved = feedforward.zeroed(feedforward.react(before, (cause,)))
     heartbeat = output.heartbeat or state.tick % settings.heartbeat_cycles == 0
     changed = None if moved.mode is before.mode else (before.mode, moved.mode)
     state = state._replace(feed=moved)

@@ -79,10 +79,8 @@ def stopping(rate: int, acceleration: int) -> int:
 
 def approach(distance: int, acceleration: int) -> int:
     """Return the largest rate u with u + stopping(u) <= ``distance`` >= 0: the fastest move that still stops there."""
-    steps = (isqrt(8 * distance // acceleration + 1) - 1) // 2
-    while acceleration * steps * (steps + 1) // 2 < distance:
-        steps += 1
-    return (distance + acceleration * steps * (steps - 1) // 2) // steps if steps else 0
+    steps = (isqrt(8 * distance // acceleration + 1) + 1) // 2
+    return (distance + acceleration * steps * (steps - 1) // 2) // steps
 
 
 def clamp(value: int, low: int, high: int) -> int:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import nan
 
 EPS = 2
 """Increments by which a sniffed target may differ from the table's demand."""
@@ -57,7 +58,7 @@ class CorrectedPath:
         """Return the number of the last row that still stands at the first row's demand."""
         row = self.first
         start = [values[0] for values in self.demand]
-        while self.has(row + 1) and self.mismatch(row + 1, start) == 0:
+        while self.mismatch(row + 1, start) == 0:
             row += 1
         return row
 
@@ -72,29 +73,26 @@ class Place:
 
 def around(path: CorrectedPath, row: int, targets: Sequence[int]) -> tuple[Place, ...]:
     """Return the rows near ``row`` whose demand is the targets', the nearest first: a place is looked for."""
-    places = []
-    for candidate in sorted(range(row - SEARCH, row + SEARCH + 1), key=lambda r: (abs(r - row), r)):
-        distance = path.mismatch(candidate, targets)
-        if distance is not None and distance <= EPS:
-            places.append(Place(candidate, distance))
-    return best_first(places)
+    near = sorted(range(row - SEARCH, row + SEARCH + 1), key=lambda r: (abs(r - row), r))
+    return _agreeing(path, [Place(candidate) for candidate in near], targets)
 
 
 def advance(path: CorrectedPath, places: Sequence[Place], targets: Sequence[int] | None) -> tuple[Place, ...]:
     """Move each place one row on and keep those that the targets agree with; without targets time alone moves them."""
-    if targets is None:
-        return tuple([Place(place.row + 1, place.cost) for place in places])
-    moved = []
-    for place in places:
-        distance = path.mismatch(place.row + 1, targets)
-        if distance is not None and distance <= EPS:
-            moved.append(Place(place.row + 1, place.cost + distance))
-    return best_first(moved) if len(moved) > 1 else tuple(moved)
+    moved = onward(places)
+    return moved if targets is None else _agreeing(path, moved, targets)
 
 
-def best_first(places: Sequence[Place]) -> tuple[Place, ...]:
-    """Sort by what they cost so far; equals keep their order."""
-    return tuple(sorted(places, key=lambda place: place.cost))
+def onward(places: Sequence[Place]) -> tuple[Place, ...]:
+    """Move each place one row on."""
+    return tuple([Place(place.row + 1, place.cost) for place in places])
+
+
+def _agreeing(path: CorrectedPath, places: Sequence[Place], targets: Sequence[int]) -> tuple[Place, ...]:
+    """Return the places that the targets agree with, by what they cost so far; equals keep their order."""
+    off = [(place, path.mismatch(place.row, targets)) for place in places]
+    agreeing = [Place(place.row, place.cost + by) for place, by in off if by is not None and by <= EPS]
+    return tuple(sorted(agreeing, key=lambda place: place.cost))
 
 
 def rate_between(path: CorrectedPath, row: int, last: Sequence[int], targets: Sequence[int]) -> float | None:
@@ -108,13 +106,11 @@ def rate_between(path: CorrectedPath, row: int, last: Sequence[int], targets: Se
 
 def _fraction(path: CorrectedPath, row: int, targets: Sequence[int]) -> float | None:
     """Return where on the path the targets are, in rows, within ``2 SEARCH`` before and ``SEARCH`` behind ``row``."""
-    for k in range(row + SEARCH, row - 2 * SEARCH, -1):
-        if not path.has(k) or not path.has(k + 1):
-            continue
+    for k in range(min(row + SEARCH, path.end - 2), max(row - 2 * SEARCH, path.first - 1), -1):
         rows = [(values[k - path.first], values[k + 1 - path.first]) for values in path.demand]
         longest = max(range(len(rows)), key=lambda axis: abs(rows[axis][1] - rows[axis][0]))
         begin, end = rows[longest]
-        part = (targets[longest] - begin) / (end - begin) if end != begin else -1.0
+        part = (targets[longest] - begin) / (end - begin) if end != begin else nan
         ways = zip(rows, targets, strict=True)
         if 0 <= part < 1 and all(abs(a + part * (b - a) - target) <= 2 * EPS for (a, b), target in ways):
             return k + part

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import inf
 
-from fdhil.guard.conditions import AGREEING
 from fdhil.guard.feedforward import Pair
 from fdhil.guard.protocol import ON_PATH, SENDING, Mode
 from fdhil.guard.settings import AxisSettings, Settings
@@ -81,7 +81,7 @@ def _sampled(
     return axis._replace(
         following_error=error,
         read_back=seen.read_back,
-        readings=min(axis.readings, AGREEING - 1) + 1 if seen.read_back == axis.read_back else 1,
+        readings=axis.readings + 1 if seen.read_back == axis.read_back else 1,
         off_demand=_off_demand(seen, k, history),
         echo_misses=axis.echo_misses + 1 if wrong else 0,
         late_echoes=axis.late_echoes + late,
@@ -95,7 +95,7 @@ def _off_demand(seen: AxisInput, k: int, history: tuple[tuple[int, ...] | None, 
         return 0.0
     targets = [latched[k] for latched in history[1:] if latched is not None]
     without = seen.demand - seen.read_back
-    return max(min(targets) - without, without - max(targets), 0) if targets else float("inf")
+    return max(min(targets) - without, without - max(targets), 0) if targets else inf
 
 
 def _believed(axis: AxisState, seen: AxisInput, setting: AxisSettings, tick: int) -> AxisState:

@@ -23,6 +23,7 @@ from fdhil.guard.intake import Intake
 from fdhil.guard.interlocks import FACTS, WITHDRAWABLE, Alarm
 from fdhil.guard.journal import Journal, Notifier
 from fdhil.guard.landing import land
+from fdhil.guard.peers import Access, Peer
 from fdhil.guard.protocol import FeedMode, Mode
 from fdhil.guard.requests import Document, parse_request
 from fdhil.guard.settings import Settings
@@ -32,6 +33,7 @@ from fdhil.guard.state import Inputs, Output, Request, initial
 IDLE_S = 0.05
 REST_S = 0.001
 RESTORE_S = 0.5
+REFUSED_S = 1.0  # one line of the journal for all who are refused in that time: they may not fill it
 DECIDED = ("arm", "feedforward", "disarm", "adopt", "compared")
 
 
@@ -46,7 +48,8 @@ class Guard:
     ) -> None:
         self.settings = settings
         self.state = initial(settings)
-        self.control = Control(Path(settings.run_directory), settings.daemon_uid)
+        access = Access(settings.daemon_uid, settings.watching)
+        self.control = Control(Path(settings.run_directory), access, self._tell_refused)
         self.intake = Intake(settings, journal)
         self._can = can
         self._journal = journal
@@ -66,6 +69,7 @@ class Guard:
         self._stopping = False
         self._lost_seen = 0
         self._restore_s = 0.0
+        self._refused_s, self._refused = -REFUSED_S, 0
         self._wake = wake
 
     # --- the loop ---
@@ -212,9 +216,10 @@ class Guard:
         """Run one step of the core and send what it says; answer and journal after that."""
         client, document, request = self._requests.popleft() if self._requests and not late else (None, {}, None)
         arming = request is not None and request.kind in ("arm", "feedforward")
-        in_charge = client if arming and not self.state.sending else self._owner
+        taking_over = arming and not self.state.sending
+        in_charge, withdrawn = (client, ()) if taking_over else (self._owner, self._withdrawn)
         alive, alarms = self._alive(in_charge, now_s), self._listener.alarms()
-        heard = (late, self._transmitted, alive, alarms, self._withdrawn, self.intake.path, request)
+        heard = (late, self._transmitted, alive, alarms, withdrawn, self.intake.path, request)
         inputs = Inputs(seen.sync, seen.axes, seen.bus, *heard)
         before = self.state.axes
         self.state, output = core.step(self.state, inputs, self.settings)
@@ -297,7 +302,10 @@ class Guard:
 
     def _request(self, client: Client, document: Document) -> None:
         kind = document.get("request")
-        if kind == "status":
+        if not client.peer.may(kind):
+            client.reply(document, ok=False, **client.peer.refused(kind))
+            self._tell_refused(client.peer, kind)
+        elif kind == "status":
             client.reply(document, ok=True, **self.status())
         elif kind == "alive":
             self._withdraw(client, document)
@@ -329,9 +337,23 @@ class Guard:
     def _answer(self, client: Client, document: Document, refused: tuple[Alarm, ...]) -> None:
         if not refused:
             client.reply(document, ok=True, state=self.state.mode.value)
+            if document["request"] != "disarm":
+                self._journal.write("granted", request=document["request"], uid=client.peer.uid, pid=client.peer.pid)
             return
+        if Alarm("AuthRequired") in refused:
+            self._tell_refused(client.peer, document["request"])
         told = list(map(status.told, refused))
         client.reply(document, ok=False, state=self.state.mode.value, **told[0], refused=told)
+
+    def _tell_refused(self, peer: Peer, kind: object) -> None:
+        """Write down who asked for what he may not; ``times`` counts all that were refused since the line before."""
+        self._refused, now_s = self._refused + 1, time.monotonic()
+        if now_s - self._refused_s >= REFUSED_S:
+            told = str(kind)[:40] if kind else "to talk"
+            self._journal.write(
+                "refused", code="AuthRequired", request=told, uid=peer.uid, pid=peer.pid, times=self._refused
+            )
+            self._refused_s, self._refused = now_s, 0
 
     def status(self) -> dict[str, Any]:
         """Return what the guard knows, for the daemon's status."""

@@ -99,7 +99,7 @@ class Settings:
     ``clock`` "sync": time is SYNC count x period (a simulated machine need not run in real time). ``token_sha256`` is
     the hash of the operator's token, empty: nothing can be armed. ``offset_synchronous``: the drive applies our RPDO
     at the next SYNC, so that without SYNC nothing can be ramped. ``daemon_uid`` is the user of the daemon where it is
-    another than the guard's.
+    another than the guard's, ``watching`` are the users who may look and disarm besides.
     """
 
     bus: str
@@ -113,6 +113,7 @@ class Settings:
     axes: tuple[AxisSettings, ...]
     offset_synchronous: bool = True
     daemon_uid: int | None = None
+    watching: tuple[int, ...] = ()
 
     @property
     def silence_s(self) -> float:
@@ -164,7 +165,7 @@ def from_json(text: str, source: str = "settings") -> Settings:
             raise ValueError(f"schema is not {SCHEMA}")
         document.pop("digest", None)
         axes = tuple(_axis(axis) for axis in document.pop("axes"))
-        settings = Settings(axes=axes, **document)
+        settings = Settings(axes=axes, watching=tuple(document.pop("watching")), **document)
         _check(settings)
     except (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError) as error:
         fault = ConfigFault("file", f"cannot be used: {str(error)[:200]}", "let fdhil-guard write it")
@@ -253,6 +254,8 @@ def _check(settings: Settings) -> None:
         raise ValueError("offset_synchronous is neither true nor false")
     if settings.daemon_uid is not None:
         _whole(settings.daemon_uid, 0, 2**32 - 2, "daemon_uid")
+    for uid in settings.watching:
+        _whole(uid, 0, 2**32 - 2, "watching")
     for axis in settings.axes:
         _check_axis(axis)
         _check_limits(axis, settings.sync_period_s)

@@ -31,7 +31,7 @@ def offset_um(state: State, settings: Settings) -> dict[str, float | None]:
 
 def may_stand_um(state: State, settings: Settings) -> dict[str, float | None]:
     """Return what may still be applied in each drive: 0.0 when it is known that nothing is, None when it is unknown."""
-    return in_um(may_stand(state, settings), settings)
+    return in_um(may_stand(state), settings)
 
 
 def sentence(standing_um: Mapping[str, float | None]) -> str:

@@ -270,18 +270,17 @@ def renew(
 
     TableRefused when they are not those rows: of another program, more than there are, or of another demand.
     """
-    names, path = decode(body, sequence)
-    rows = path.end - path.first
+    names, path = decode(body)
     same = loaded is not None and names == tuple(axes) and path.first == loaded.first == 0 and path.end <= loaded.end
     if loaded is None or not same or path.program_digest != loaded.program_digest:
         raise TableRefused("ProgramMismatch", "the rows are not the first ones of the loaded table; load it anew")
-    if any(list(new) != list(old[:rows]) for new, old in zip(path.demand, loaded.demand, strict=True)):
+    if any(list(new) != list(old[: path.end]) for new, old in zip(path.demand, loaded.demand, strict=True)):
         raise TableRefused("ProgramMismatch", "the rows are those of another path than the loaded one; load it anew")
     offset = tuple(
-        [array("i", new) + array("i", old[rows:]) for new, old in zip(path.offset, loaded.offset, strict=True)]
+        [array("i", new) + array("i", old[path.end :]) for new, old in zip(path.offset, loaded.offset, strict=True)]
     )
     joined = replace(loaded, offset=offset, sequence=sequence)
-    return Loading(joined, limits, travel, stop=min(joined.end, rows + limits[0].window + 3))
+    return Loading(joined, limits, travel, stop=min(joined.end, path.end + limits[0].window + 3))
 
 
 def _join(old: Sequence[Sequence[int]], new: Sequence[Sequence[int]], cut: int) -> tuple[Sequence[int], ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fdhil.guard.interlocks import Alarm
-from fdhil.guard.path import EPS, CorrectedPath, Place, advance, around, rate_between
+from fdhil.guard.path import EPS, CorrectedPath, Place, advance, around, onward, rate_between
 from fdhil.guard.state import State
 from fdhil.guard.transitions import Event
 
@@ -50,7 +50,7 @@ def track(state: State, path: CorrectedPath) -> tuple[State, Alarm | None]:
     places = around(path, state.anchor + 1, targets) if looks else ()
     if places:
         return state._replace(places=places, anchor=places[0].row, resuming=False), None
-    return state._replace(places=advance(path, state.places, None), resuming=False), _lost(state, path, targets)
+    return state._replace(places=onward(state.places), resuming=False), _lost(state, path, targets)
 
 
 def _lost(state: State, path: CorrectedPath, targets: tuple[int, ...]) -> Alarm:

@@ -5,5 +5,6 @@ from __future__ import annotations
 from fdhil.pipeline.analysis import analyse
 from fdhil.pipeline.axis import POOL_WINDOWS, AxisPipeline, Known, Record
 from fdhil.pipeline.pooling import pool
+from fdhil.pipeline.recorded import analyse_windows
 
-__all__ = ["POOL_WINDOWS", "AxisPipeline", "Known", "Record", "analyse", "pool"]
+__all__ = ["POOL_WINDOWS", "AxisPipeline", "Known", "Record", "analyse", "analyse_windows", "pool"]

@@ -24,3 +24,20 @@ def contour_error_um(reference_mm: Float, actual_mm: Float, dt_s: float, first: 
     if not fits or reference.ndim != 2:
         raise ValueError(f"reference {reference.shape} and actual path {actual.shape} must both be (n, d)")
     return kernels.contour(reference, actual, round(WINDOW_S / dt_s), first or 0) * 1e3
+
+
+def nearest_points_mm(reference_mm: Float, actual_mm: Float, dt_s: float, first: int) -> Float:
+    """Return the points (m, d) of the path (n, d) from which the contour error of the actual points (m, d) counts.
+
+    The actual points belong to the rows of the reference from ``first`` on.
+    """
+    window = round(WINDOW_S / dt_s)
+    found = np.empty_like(actual_mm)
+    for k, point in enumerate(actual_mm):
+        begin = reference_mm[max(0, first + k - window) : first + k + window + 1]
+        edge = np.diff(begin, axis=0)
+        length = np.maximum(np.sum(edge**2, axis=1), 1e-30)
+        share = np.clip(np.sum(edge * (point - begin[:-1]), axis=1) / length, 0.0, 1.0)
+        on = begin[:-1] + share[:, None] * edge
+        found[k] = on[np.argmin(np.sum((on - point) ** 2, axis=1))]
+    return found

@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from fdhil.errors import ProgramError
+from fdhil.errors import GcodeBudget, ProgramError
 from fdhil.program.budget import Budget
 from fdhil.program.commands import FANUC, Command
 from fdhil.program.expressions import is_whole
@@ -155,7 +155,7 @@ class Flow:
         if known is not None and (known.line != line or known.kind != kind):
             raise ProgramError(line, f"O<{label}>", f"is the label of line {known.line} already; choose another one")
         if known is None and len(labels) >= self._budget.max_labels:
-            raise ProgramError(line, f"O<{label}>", f"is one label more than the {self._budget.max_labels} allowed")
+            raise GcodeBudget(line, f"O<{label}>", f"is one label more than the {self._budget.max_labels} allowed")
         if known is None:
             place = self.source.after() if kind in ("do", "repeat") else self.source.here()
             known = labels[label] = Label(kind, line, place)
@@ -289,7 +289,7 @@ class Flow:
 
     def _enter(self, frame: Frame, line: int) -> None:
         if self.depth >= self._budget.max_call_depth:
-            raise ProgramError(line, f"O<{frame.name}>", f"calls nest deeper than {self._budget.max_call_depth} levels")
+            raise GcodeBudget(line, f"O<{frame.name}>", f"calls nest deeper than {self._budget.max_call_depth} levels")
         known = self._subs.get(frame.name)
         frame.repeated = self.repeating or frame.name in self._entered
         self._entered.add(frame.name)

@@ -14,7 +14,7 @@ from copy import deepcopy
 from functools import partial
 from pathlib import Path
 
-from fdhil.errors import ProgramError
+from fdhil.errors import GcodeBudget, ProgramError
 from fdhil.program import arcs, canned, lathe, modes, offsets, probing, roughing, splines, targets
 from fdhil.program.budget import Budget
 from fdhil.program.checks import CYCLES, check_machine_words, check_readers, one_reader_of_axes
@@ -127,12 +127,12 @@ class Interpreter:
         self._blocks += 1
         if self._blocks > self._budget.max_blocks:
             what = f"more than {self._budget.max_blocks} blocks were executed; raise max_blocks if they are meant"
-            raise ProgramError(line, raw.strip()[:24], what)
+            raise GcodeBudget(line, raw.strip()[:24], what)
         if self._flow.repeating:
             self._again += 1
             if self._again > self._budget.max_repeated_blocks:
                 what = f"more than {self._budget.max_repeated_blocks} blocks were executed again; is a loop endless?"
-                raise ProgramError(line, raw.strip()[:24], f"{what} If not, raise max_repeated_blocks")
+                raise GcodeBudget(line, raw.strip()[:24], f"{what} If not, raise max_repeated_blocks")
 
     def _state(self) -> object:
         """Return a copy of all that the program has changed so far but its place."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from fdhil.errors import GcodeBudget
 from fdhil.program.budget import Budget
 from fdhil.program.compensation import Compensation, Piece, Waiting
 from fdhil.program.modal import Modal
@@ -132,7 +133,7 @@ class Machine:
     def _order(self, block: Block, motion: Motion) -> None:
         if len(self.out) >= self.budget.max_motions_per_block:
             most = self.budget.max_motions_per_block
-            raise block.fault("", f"orders more than {most} motions; split it")
+            raise GcodeBudget(block.line, "", f"orders more than {most} motions; split it")
         self.out.append(motion)
 
     def _checked(self, block: Block, position: list[float]) -> Point:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from fdhil.errors import ProgramError
+from fdhil.errors import GcodeBudget, ProgramError
 
 LAST_NUMBER = 5601
 LOCAL_NUMBERS = 30
@@ -60,7 +60,7 @@ class Variables:
             raise ProgramError(line, f"#<{key}>", "shows the machine's state and cannot be set; choose another name")
         names = self._globals if key.startswith("_") else self._locals
         if len(names) >= self._max and key not in names:
-            raise ProgramError(line, f"#<{key}>", f"is one parameter more than the {self._max} that are allowed")
+            raise GcodeBudget(line, f"#<{key}>", f"is one parameter more than the {self._max} that are allowed")
         names[key] = value
 
     def store(self, index: int, value: float) -> None:

@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import IO, NamedTuple, cast
 
-from fdhil.errors import ProgramError
+from fdhil.errors import GcodeBudget, ProgramError
 
 _SPOOL_BYTES = 4_000_000
 _READ_AHEAD_BYTES = 1 << 18
@@ -110,7 +110,7 @@ class Source:
             raw = self._draw(self._feed)
         if len(raw) > self._max_chars and len(raw.rstrip(b"\r\n")) > self._max_chars:
             word = raw[:12].decode("latin-1")
-            raise ProgramError(self.line + 1, word, f"the line is longer than {self._max_chars} characters; split it")
+            raise GcodeBudget(self.line + 1, word, f"the line is longer than {self._max_chars} characters; split it")
         if self._end == 0 and raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
             raise ProgramError(1, "", "the file is text in UTF-16, which no NC reads; save it as ASCII or UTF-8")
         if b"\0" in raw:

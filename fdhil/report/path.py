@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fdhil.prediction.contour import WINDOW_S
+from fdhil.prediction.contour import nearest_points_mm
 from fdhil.prediction.gain import Gain, plus_minus
 from fdhil.records import Correction, Float, Prediction, Trajectory, Zone
 from fdhil.report import figures
@@ -212,18 +212,8 @@ def _place(cases: Sequence[tuple[str, Prediction]], zone: Zone, row: int) -> tup
 def nearest_mm(predicted: Prediction, rows: slice) -> Float:
     """Return for each predicted point of ``rows`` the point (m, d) of the path from which its contour error counts."""
     reference = predicted.reference
-    path = reference.path_mm
     actual = np.column_stack([predicted.predicted_mm[axis] for axis in reference.axes])[rows]
-    window = round(WINDOW_S / reference.dt_s)
-    found = np.empty_like(actual)
-    for k, point in enumerate(actual):
-        begin = path[max(0, rows.start + k - window) : rows.start + k + window + 1]
-        edge = np.diff(begin, axis=0)
-        length = np.maximum(np.sum(edge**2, axis=1), 1e-30)
-        share = np.clip(np.sum(edge * (point - begin[:-1]), axis=1) / length, 0.0, 1.0)
-        on = begin[:-1] + share[:, None] * edge
-        found[k] = on[np.argmin(np.sum((on - point) ** 2, axis=1))]
-    return found
+    return nearest_points_mm(reference.path_mm, actual, reference.dt_s, rows.start)
 
 
 def _zones(before: Prediction, after: Prediction | None) -> Section:

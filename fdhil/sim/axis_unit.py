@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from fdhil.sim.drive.servo import Drive
 from fdhil.sim.frame import BusFrame
+from fdhil.sim.frame_faults import FrameFaults
 from fdhil.sim.thermal import SlideWay
 from fdhil.sim.wire.modbus_sensor import VoltageSensor
 
@@ -43,7 +44,7 @@ class AxisUnit:
     """One axis of the machine: its drive and what is mounted around it. It is also what a fault acts on.
 
     ``injected`` holds the machine's foreign frames, sent at every SYNC; ``sync_on`` is False while the NC's SYNC fails
-    on the axis' bus.
+    on the axis' bus; ``wire`` spoils what goes over that bus.
     """
 
     axis: str
@@ -53,6 +54,7 @@ class AxisUnit:
     sensor: VoltageSensor
     outbox: list[BusFrame]
     injected: dict[int, tuple[str, bytes]]
+    wire: FrameFaults
     offsets: RpdoStream = field(default_factory=RpdoStream)
     sync_on: bool = True
     _before: dict[tuple[int, int], int] = field(default_factory=dict)

@@ -15,6 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from fdhil.sim.axis_unit import AxisUnit
 from fdhil.sim.drive.sensors import SIGNALS
+from fdhil.sim.frame_faults import VALUES, FaultValue, FrameFault, Way
+from fdhil.sim.wire.modbus_answers import ANSWER_FAULTS
 
 _MODBUS_CODES = frozenset({1, 2, 3, 4, 5, 6, 7, 8, 10, 11})
 
@@ -35,11 +37,23 @@ class FaultEntry(BaseModel):
     sub: Annotated[int, Field(ge=0, le=0xFF)] = 0
     can_id: Annotated[int, Field(ge=0, le=0x7FF)] | None = None
     data: str | None = None
+    way: Way | None = None
+    percent: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] | None = None
+
+    @property
+    def at(self) -> tuple[float | None, int | None, int | None]:
+        """When it happens, by time, SYNC or row."""
+        return self.at_s, self.at_sync, self.at_row
 
     @property
     def number(self) -> float:
         """The value, 0 where there is none."""
         return 0.0 if self.value is None else self.value
+
+    @property
+    def share(self) -> float:
+        """Percentage of the frames, or of the answers, that is met."""
+        return 100.0 if self.percent is None else self.percent
 
     @field_validator("fault")
     @classmethod
@@ -60,7 +74,7 @@ class FaultEntry(BaseModel):
     @model_validator(mode="after")
     def _whole(self) -> FaultEntry:
         kind = FAULTS[self.fault]
-        if sum(at is not None for at in (self.at_s, self.at_sync, self.at_row)) > 1:
+        if sum(at is not None for at in self.at) > 1:
             raise ValueError("give one of at_s, at_sync and at_row")
         if kind.needs_axis and self.axis is None:
             raise ValueError(f"{self.fault} needs an axis")
@@ -70,29 +84,9 @@ class FaultEntry(BaseModel):
             raise ValueError(f"the value of {self.fault} is {kind.value.meaning}: {wrong}")
         if self.fault == "object" and self.index is None:
             raise ValueError("object needs the index (and sub) of what is to be overwritten")
-        if self.fault == "frame" and (self.can_id is None or self.data is None):
-            raise ValueError("frame needs can_id and data (hexadecimal)")
+        if self.fault in ("frame", "bus_inject") and (self.can_id is None or self.data is None):
+            raise ValueError(f"{self.fault} needs can_id and data (hexadecimal)")
         return self
-
-
-@dataclass(frozen=True, slots=True)
-class FaultValue:
-    """The meaning of a fault's value, and its limits."""
-
-    meaning: str
-    low: float = -1e6
-    high: float = 1e6
-    whole: bool = False
-    among: frozenset[int] = frozenset()
-
-    def fault(self, value: float) -> str:
-        """Return what is wrong with a value, "" when nothing is."""
-        if self.whole and value != int(value):
-            return f"{value:g} is no whole number"
-        if not self.low <= value <= self.high or (self.among and value not in self.among):
-            allowed = ", ".join(map(str, sorted(self.among))) or f"{self.low:g} to {self.high:g}"
-            return f"{value:g} is not among {allowed}"
-        return ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +147,39 @@ def _frame(unit: AxisUnit, entry: FaultEntry, on: bool) -> None:
         unit.injected.pop(can_id, None)
 
 
+def _spoil_answers(unit: AxisUnit, entry: FaultEntry, on: bool) -> None:
+    answers, kind = unit.sensor.faults.answers, entry.fault.removeprefix("sensor_")
+    if on:
+        answers[kind] = entry.share
+    else:
+        answers.pop(kind, None)
+
+
+def _frames_of(unit: AxisUnit, entry: FaultEntry) -> FrameFault:
+    """The fault of frames that an entry means: of one COB-ID, else of the axis' drive, else of all."""
+    node = None if entry.axis is None else _ids_of(unit.drive.node_id)
+    can_ids = node if entry.can_id is None else frozenset({entry.can_id})
+    kind = entry.fault.removeprefix("bus_")
+    value = 1 if entry.value is None else entry.value
+    way = entry.way or ("sent" if kind == "inject" else None)
+    data = bytes.fromhex(entry.data or "")
+    return FrameFault(kind, value, can_ids, way, percent=entry.share, data=data)
+
+
+def _ids_of(node_id: int) -> frozenset[int]:
+    """The identifiers of a node by CiA 301: EMCY, PDOs, SDO and heartbeat."""
+    return frozenset((*range(0x80 + node_id, 0x680, 0x80), 0x700 + node_id))
+
+
+def _bus_fault(unit: AxisUnit, entry: FaultEntry, on: bool) -> None:
+    act = unit.wire.add if on else unit.wire.remove
+    act(_frames_of(unit, entry))
+
+
+def _bus_down(unit: AxisUnit, _: FaultEntry, on: bool) -> None:
+    unit.wire.down = on
+
+
 _TPDO = FaultValue("number of the TPDO", 1, 4, whole=True)
 _FACTOR = FaultValue("factor", -100, 100)
 _SIGNAL_FAULTS: tuple[tuple[str, str, Any, FaultValue | None], ...] = (
@@ -194,10 +221,17 @@ FAULTS: Mapping[str, FaultKind] = {
     "sensor_exception": _sensor(
         "exception", 0, FaultValue("Modbus exception code", 1, 11, whole=True, among=_MODBUS_CODES)
     ),
+    **{f"sensor_{kind}": FaultKind(_spoil_answers) for kind in ANSWER_FAULTS},
     "sensor_stuck": _sensor_signal("stuck", False),
     "sensor_delayed": _sensor_signal("delay_cycles", 0, FaultValue("samples", 0, 10000, whole=True)),
     "sensor_gain": _sensor_signal("gain", 1.0, _FACTOR),
     "sensor_offset": _sensor_signal("offset", 0.0, FaultValue("V")),
+    **{
+        f"bus_{kind}": FaultKind(_bus_fault, value, needs_axis=False)
+        for kind, value in VALUES.items()
+        if kind != "raise"  # that is for whoever holds a bus, not for those who share it
+    },
+    "bus_down": FaultKind(_bus_down, needs_axis=False),
     "sync_lost": FaultKind(_sync_lost, needs_axis=False),
     "frame": FaultKind(_frame, needs_axis=False),
 }

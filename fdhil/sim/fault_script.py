@@ -80,7 +80,13 @@ class FaultSchedule:
         for end, entry in [item for item in self._running if item[0] <= tick]:
             self._running.remove((end, entry))
             self._apply(entry, on=False)
-        due = [entry for entry in self._waiting if self._is_due(entry, tick, row)]
+        return self._start([entry for entry in self._waiting if self._is_due(entry, tick, row)], tick)
+
+    def at_once(self, tick: int) -> list[FaultEntry]:
+        """Start those that wait for nothing, where no SYNC may ever come; return them."""
+        return self._start([entry for entry in self._waiting if entry.at == (None, None, None)], tick)
+
+    def _start(self, due: list[FaultEntry], tick: int) -> list[FaultEntry]:
         for entry in due:
             self._waiting.remove(entry)
             self._apply(entry, on=True)

@@ -16,8 +16,10 @@ from fdhil.errors import ConfigError, ConfigFault, StoreError
 from fdhil.sim.axis_unit import AxisUnit, RpdoStream
 from fdhil.sim.drive import description
 from fdhil.sim.drive.servo import Drive
+from fdhil.sim.fault_kinds import FaultEntry
 from fdhil.sim.fault_script import FaultSchedule
 from fdhil.sim.frame import BusFrame, Frame
+from fdhil.sim.frame_faults import FrameFaults
 from fdhil.sim.nc.controller import Event, NcController
 from fdhil.sim.nc.drive_link import Wiring
 from fdhil.sim.nc.path import Row
@@ -31,7 +33,10 @@ OFFSET_OBJECTS = (0x60B0, 0x60B1, 0x60B2)
 
 
 class Machine:
-    """The machine of one configuration. ``events`` collects what it has to tell; ``tick`` counts SYNC periods."""
+    """The machine of one configuration. ``events`` collects what it has to tell; ``tick`` counts SYNC periods.
+
+    ``wires`` are the faults of its buses, by name: whoever carries its frames lets them pass there.
+    """
 
     def __init__(self, config: MachineConfig) -> None:
         self.config = config
@@ -41,6 +46,7 @@ class Machine:
         self.tick = 0
         self._outbox: list[BusFrame] = []
         self._injected: dict[int, tuple[str, bytes]] = {}
+        self.wires = {axis.drive.bus: FrameFaults(seed=config.sim.seed) for axis in config.axis.values()}
         seeds = np.random.SeedSequence(config.sim.seed).spawn(2 * len(config.axis))
         self.units = {
             axis: self._unit(axis, seeds[2 * place], seeds[2 * place + 1]) for place, axis in enumerate(config.axis)
@@ -78,6 +84,7 @@ class Machine:
             sensor,
             self._outbox,
             self._injected,
+            self.wires[section.drive.bus],
         )
 
     def _wiring(self, axis: str) -> Wiring:
@@ -133,6 +140,11 @@ class Machine:
                 self.nc.hear(bus, answer)
         return answers
 
+    def lost(self, bus: str, can_id: int) -> None:
+        """Note a frame that a fault of the bus keeps from the drives for now: lockstep does not wait for it."""
+        for unit in self._of_bus.get(bus, ()):
+            unit.drive.pdo.lost(can_id)
+
     def cycle(self) -> list[BusFrame]:
         """Run one period of the NC: its SYNC, the drives' answers, its set-points for the next one."""
         frames: list[BusFrame] = []
@@ -164,6 +176,8 @@ class Machine:
 
     def wall_clock(self, now_s: float) -> list[BusFrame]:
         """Run what depends on time and not on SYNC: heartbeats and their monitoring, and motion without SYNC."""
+        if not self.nc.on and not self.faults.idle:
+            self._tell(self.faults.at_once(self.tick))
         alone = self._realtime and not self.nc.on
         frames = self.tables.wall_clock(now_s, [unit.drive for unit in self.units.values()] if alone else [])
         for unit in self.units.values():
@@ -234,17 +248,20 @@ class Machine:
             unit.set_input(self.config.g0.input_bit, on)
 
     def _run_faults(self, row: int | None) -> None:
-        for entry in self.faults.step(self.tick, row):
+        self._tell(self.faults.step(self.tick, row))
+
+    def _tell(self, started: list[FaultEntry]) -> None:
+        for entry in started:
             self.events.append({"event": "fault", "sync": self.tick, **entry.model_dump(exclude_none=True)})
 
     def waits(self) -> bool:
         """Whether an RPDO that belongs into this cycle has not arrived yet (lockstep)."""
         if self._listed:
             return any(
-                stream.awaited and number not in self.units[axis].drive.pdo.heard
+                stream.awaited and number not in self.units[axis].drive.pdo.sent
                 for (axis, number), stream in self._streams.items()
             )
-        return any(unit.drive.pdo.heard_before - unit.drive.pdo.heard for unit in self.units.values())
+        return any(unit.drive.pdo.sent_before - unit.drive.pdo.sent for unit in self.units.values())
 
     def holds_offset(self) -> bool:
         """Whether a drive was given an offset of position, speed or torque that is not zero: its sender goes on."""

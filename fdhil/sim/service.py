@@ -24,6 +24,7 @@ from fdhil.records import Trajectory
 from fdhil.sim.drive import eds
 from fdhil.sim.fault_kinds import FaultEntry
 from fdhil.sim.frame import BusFrame, Frame
+from fdhil.sim.frame_faults import Passed
 from fdhil.sim.machine import Machine
 from fdhil.sim.nc.stream import DemandStream, StreamError
 from fdhil.sim.operator_commands import MAX_LINE, CommandError, OperatorCommands
@@ -126,6 +127,7 @@ class SimService:
     def _open(self) -> None:
         for name in self.machine.buses:
             self._buses[name] = attach(name, self.config.bus[name])
+            self._buses[name].spoil = partial(self._arrive, name)
         if self.config.sim.modbus:
             units = self.machine.units
             places = {axis: partial(getattr, unit.drive, "table_mm") for axis, unit in units.items()}
@@ -137,10 +139,37 @@ class SimService:
             assert section is not None
             self._streams[axis] = StreamPort(f"accelerometer {axis}", section.device)
 
+    def _arrive(self, bus: str, frame: Frame, sender: object) -> list[Passed]:
+        passed = self.machine.wires[bus].take(frame, "received", time.monotonic(), sender)
+        if frame[0] not in [can_id for (can_id, _), _ in passed]:
+            self.machine.lost(bus, frame[0])
+        return passed
+
     def _take(self, bus: str, frame: Frame) -> None:
         answers = self.machine.receive(bus, frame)
         if answers:
-            self._buses[bus].send(answers)
+            self._leave(bus, answers)
+
+    def _leave(self, bus: str, frames: Sequence[Frame]) -> None:
+        """Send what the bus' faults make of frames."""
+        wire = self.machine.wires[bus]
+        if not wire.idle:
+            now_s = time.monotonic()
+            frames = [each for frame in frames for each, _ in wire.take(frame, "sent", now_s)]
+        self._buses[bus].send(frames)
+
+    def _let_go(self, now_s: float) -> None:
+        """Let pass on what the faults of the buses held back until now."""
+        for name, wire in self.machine.wires.items():
+            if wire.idle:
+                continue
+            bus = self._buses[name]
+            if wire.down:
+                bus.hang_up()
+            bus.send([frame for frame, _ in wire.due("sent", now_s)])
+            for frame, sender in wire.due("received", now_s):
+                bus.relay(frame, sender)
+                self._take(name, frame)
 
     def ready_event(self) -> dict[str, Any]:
         """Return the ready event; the EDS files it names are written now."""
@@ -242,6 +271,7 @@ class SimService:
             stream.send(self.machine.tables.accelerometers[axis].take())
         for event in self.machine.take_events():
             self._emit(event)
+        self._let_go(now_s)
         for bus in buses:
             bus.flush(now_s)
 
@@ -257,6 +287,7 @@ class SimService:
     def _timeout_s(self) -> float:
         now_s = time.monotonic()
         deadlines = [self._wall_s, self._sync_due_s(), now_s + _MAX_WAIT_S]
+        deadlines += [wire.due_s() for wire in self.machine.wires.values()]
         deadlines += [at for bus in self._buses.values() if (at := bus.deadline_s()) is not None]
         return max(0.0, min(deadlines) - now_s)
 
@@ -286,11 +317,10 @@ class SimService:
 
     def _send(self, frames: Sequence[BusFrame]) -> None:
         if len(self._buses) == 1:
-            (bus,) = self._buses.values()
-            bus.send([frame for _, frame in frames])
+            self._leave(next(iter(self._buses)), [frame for _, frame in frames])
             return
-        for name, bus in self._buses.items():
-            bus.send([frame for where, frame in frames if where == name])
+        for name in self._buses:
+            self._leave(name, [frame for where, frame in frames if where == name])
 
     # -- panel and files
 

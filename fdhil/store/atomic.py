@@ -5,31 +5,45 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import stat
+from collections.abc import Iterable
 from pathlib import Path
 
 from fdhil.errors import StoreError
 
+PAGE_BYTES = 64 * 1024  # what the history takes when it is opened
 _CODES = {
     errno.ENOSPC: "DiskFull",
     errno.EDQUOT: "DiskFull",
     errno.EROFS: "ReadOnlyStore",
     errno.EACCES: "ReadOnlyStore",
 }
-_CAUSES = {
+CAUSES = {
     "DiskFull": "the disk is full; free space or lower keep_windows in [store]",
     "ReadOnlyStore": "it may not be written; check the rights and the mount of [store] directory",
 }
 
 
+def is_full(path: Path) -> bool:
+    """Whether there is no room for one more page on the disk of a file."""
+    try:
+        room = os.statvfs(path.parent)
+    except OSError:
+        return False
+    return room.f_bavail * room.f_frsize < PAGE_BYTES
+
+
 def store_error(path: Path, error: OSError) -> StoreError:
     """Say what an operating system's refusal means for the store; ``code`` is DiskFull, ReadOnlyStore or StoreFault."""
     code = _CODES.get(error.errno or 0, "StoreFault")
-    cause = _CAUSES.get(code, f"{error.strerror}; check the disk, the file is not tried again")
+    cause = CAUSES.get(code, f"{error.strerror}; check the disk, the file is not tried again")
     return StoreError(f"{path} could not be written: {cause}", code)
 
 
-def write_file(path: Path, content: bytes) -> None:
+def write_file(path: Path, content: bytes, like: os.stat_result | None = None) -> None:
     """Write ``content`` under a temporary name, fsync, rename, fsync the folder. StoreError when any step fails.
+
+    ``like``: with the mode and the owner of another file.
 
     The temporary name is fixed (``.NAME.part``), so that what a power cut leaves behind is overwritten, never piled up.
     """
@@ -37,7 +51,10 @@ def write_file(path: Path, content: bytes) -> None:
     try:
         descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
         try:
-            _write_all(descriptor, content)
+            if like is not None:
+                os.fchown(descriptor, like.st_uid, like.st_gid)
+                os.fchmod(descriptor, stat.S_IMODE(like.st_mode))
+            write_all(descriptor, content)
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
@@ -49,10 +66,32 @@ def write_file(path: Path, content: bytes) -> None:
         raise store_error(path, error) from None
 
 
-def _write_all(descriptor: int, content: bytes) -> None:
+def write_all(descriptor: int, content: bytes) -> None:
+    """Write all of ``content``; OSError."""
     view = memoryview(content)
     while view:  # a write may be short
         view = view[os.write(descriptor, view) :]
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder, and those above it that are missing, so that they survive a power cut; OSError."""
+    if not folder.is_dir():
+        make_folder(folder.parent)
+        folder.mkdir(exist_ok=True)
+        sync_folder(folder.parent)
+
+
+def keep_newest(path: Path, others: Iterable[Path], most: int) -> None:
+    """Remove the oldest of ``others`` until there are ``most`` files with ``path``, the newest of them; OSError.
+
+    Their order is that of their times, which no clock that was set back turns round: ``path`` gets a later one.
+    """
+    newest = sorted(others, key=lambda file: file.stat().st_mtime_ns, reverse=True)
+    last_ns = newest[0].stat().st_mtime_ns if newest else 0
+    if path.stat().st_mtime_ns <= last_ns:
+        os.utime(path, ns=(last_ns + 1, last_ns + 1))
+    for file in newest[most - 1 :]:
+        file.unlink(missing_ok=True)
 
 
 def sync_folder(folder: Path) -> None:

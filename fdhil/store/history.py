@@ -10,45 +10,54 @@ from __future__ import annotations
 import json
 import math
 import sqlite3
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from itertools import islice
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any
 
 from fdhil.errors import StoreError
 from fdhil.identification.pooling import friction_at, member
 from fdhil.records import LoopEstimate, Notice, Parameters, ParameterSet, Reason, Skill, WindowOutcome
-from fdhil.store import schema
-from fdhil.store.rows import DECODED, Comparison, Revision, Stamp, StoredWindow
-from fdhil.store.schema import told
+from fdhil.store import HISTORY_FILE, schema
+from fdhil.store.atomic import make_folder
+from fdhil.store.rows import DECODED, Acknowledgement, Comparison, Revision, Stamp, StoredNotice, StoredWindow
+from fdhil.store.schema import Also, told
 
-FILE_NAME = "history.sqlite"
+FILE_NAME = HISTORY_FILE
+CHECKED = 5_000  # newest rows of a table that are looked at whatever they say: a start must not last longer every year
 KEEP_NOTICES = 100_000
+RECENT_NOTICES = 5_000  # the newest: an older one asks nobody any more
 KEEP_COMPARISONS = 10_000
+KEEP_ACKNOWLEDGEMENTS = 10_000
+Tell = Callable[[str], object]
+
+Begin = Callable[[sqlite3.Connection], None]
+"""Does once what is to be done in a file that was opened."""
 
 
 class History:
     """The history of one store directory. Every method raises StoreError when the database refuses."""
 
     def __init__(
-        self, connection: sqlite3.Connection, path: Path, version: int, tell: Callable[[str], object] | None = None
+        self, db: sqlite3.Connection, path: Path, version: int, tell: Tell | None = None, also: Also | None = None
     ) -> None:
-        self._db = connection
+        self._db = db
         self._path = path
-        self._version = version
+        self.version = version
         self._tell = tell
         self._damaged: dict[tuple[str, int], dict[str, Any]] = {}
+        self._also = also
 
     @classmethod
-    def open(cls, directory: Path) -> History:
-        """Open for writing, and create where needed. StoreError with code SchemaVersion, CorruptFile, ReadOnlyStore."""
+    def open(cls, directory: Path, also: Also | None = None, begin: Begin | None = None) -> History:
+        """Open for writing; ``also`` adds to each row. StoreError: SchemaVersion, CorruptFile, ReadOnlyStore."""
         path = directory / FILE_NAME
         with told(path):
             try:
-                directory.mkdir(parents=True, exist_ok=True)
+                make_folder(directory)
             except OSError as error:
                 text = f"{directory} cannot be made: {error.strerror}; check [store] directory"
                 raise StoreError(text, "ReadOnlyStore") from None
@@ -58,39 +67,34 @@ class History:
                 db.execute("PRAGMA synchronous = FULL")
                 schema.check_file(db, path)
                 schema.bring_up(db, path)
+                if begin is not None:
+                    begin(db)
             except (sqlite3.Error, StoreError):
                 db.close()
                 raise
-        return cls(db, path, schema.SCHEMA_VERSION)
+        return cls(db, path, schema.SCHEMA_VERSION, also=also)
 
     @classmethod
-    def read(cls, directory: Path, tell: Callable[[str], object] | None = None) -> History:
+    def read(
+        cls,
+        directory: Path,
+        tell: Tell | None = None,
+        checked: set[tuple[int, int]] | None = None,
+    ) -> History:
         """Open for reading only, also from a read-only disk. StoreError when there is none or it is unusable.
 
-        ``tell`` hears, when it is closed, of the rows that were damaged and left out.
+        ``tell`` hears, when it is closed, of the rows that were damaged and left out. Who opens it again and again
+        keeps in ``checked`` which files were whole (device and inode): of those each row that is read tells its damage.
         """
         path = directory / FILE_NAME
-        if not path.is_file():
-            raise StoreError(f"{path} does not exist: nothing was recorded yet; run the daemon first", "NoHistory")
-        with told(path):
-            for flags in ("mode=ro", "mode=ro&immutable=1"):  # without a shared-memory file only the latter opens
-                db = sqlite3.connect(f"{path.resolve().as_uri()}?{flags}", uri=True, timeout=5.0)
-                try:
-                    version = schema.check_file(db, path, least=1)
-                except sqlite3.OperationalError:
-                    db.close()
-                    continue
-                except (sqlite3.Error, StoreError):
-                    db.close()
-                    raise
-                return cls(db, path, version, tell)
-        raise StoreError(f"{path} cannot be opened; check its rights", "StoreFault")
+        db, version = schema.open_to_read(path, checked)
+        return cls(db, path, version, tell)
 
     def close(self) -> None:
         """Close the database; tell what was left out."""
         self._db.close()
         if self._damaged and self._tell is not None:
-            places = named(self._damaged)
+            places = schema.named(self._damaged)
             self._tell(f"{self._path}: {places} damaged and left out; start the daemon, which puts them aside")
             self._damaged.clear()
 
@@ -105,36 +109,48 @@ class History:
     def _insert(self, table: str, row: dict[str, Any], stamp: Stamp) -> int:
         row = row | {"wall_s": stamp.wall_s, "boot": stamp.boot, "monotonic_ns": stamp.monotonic_ns}
         with told(self._path):
-            return schema.insert(self._db, table, row)
+            return schema.insert(self._db, table, row, self._also)
 
     def _read(
         self, table: str, only: Mapping[str, Any], limit: int | None = None, *, oldest: bool = False
     ) -> list[Any]:
         """Return what the newest rows (or the ``oldest``) hold, oldest first; damaged ones are noted and left out.
 
-        ``only`` is compared after a row was checked, so that damage of the very value compared is seen too.
+        ``only`` is compared after a row was checked, so that damage of the very value compared is seen too; of the rows
+        before the newest ``CHECKED`` the database hands over those alone that say to be such ones.
         """
-        found: list[Any] = []
-        with told(self._path), closing(self._db.cursor()) as cursor:
-            cursor.row_factory = sqlite3.Row
-            for row in map(dict, cursor.execute(f"SELECT * FROM {table} ORDER BY id{'' if oldest else ' DESC'}")):
-                if len(found) == limit:
-                    break
-                if self._version >= schema.WITH_DIGESTS and row.get("digest") != schema.digest_of(table, row):
-                    self._damaged[table, row["id"]] = row
-                    continue
-                if all(row[name] == value for name, value in only.items()):
-                    try:
-                        found.append(DECODED[table](row))
-                    except (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError):
-                        self._damaged[table, row["id"]] = row
+        rows = self._rows(table, only, oldest=oldest)
+        found = list(islice((it for row in rows if (it := self._believed(table, row, only)) is not None), limit))
         return found if oldest else found[::-1]
 
+    def _rows(self, table: str, only: Mapping[str, Any], *, oldest: bool = False) -> Iterator[dict[str, Any]]:
+        """Yield rows as they are, one at a time: the newest ``CHECKED``, and of those before them that match."""
+        newest = f"id > (SELECT max(id) - {CHECKED} FROM {table})"
+        match = " AND ".join(f"{name} = :{name}" for name in only) or "1"
+        query = f"SELECT * FROM {table} WHERE {newest} OR ({match}) ORDER BY id{'' if oldest else ' DESC'}"
+        with told(self._path), closing(self._db.cursor()) as cursor:
+            cursor.row_factory = sqlite3.Row
+            yield from map(dict, cursor.execute(query, only))
+
+    def _believed(self, table: str, row: dict[str, Any], only: Mapping[str, Any] = MappingProxyType({})) -> Any | None:
+        """Return what a sound row holds, if it is one of ``only``; a damaged one is noted."""
+        try:
+            if self.version < schema.WITH_DIGESTS or row.get("digest") == schema.digest_of(table, row):
+                return DECODED[table](row) if all(row[name] == value for name, value in only.items()) else None
+        except (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError):
+            pass
+        self._damaged[table, row["id"]] = row
+        return None
+
     def put_damaged_aside(self) -> str:
-        """Check every row, move the damaged ones to the table ``quarantine``, and name them; empty: all are sound."""
+        """Move damaged rows to the table ``quarantine``, and name them; empty: all are sound.
+
+        The newest ``CHECKED`` rows of each table are looked at; one before them is seen, and left out, when it is read.
+        """
         for table in schema.TABLES:
-            self._read(table, {})
-        places = named(self._damaged)
+            for row in islice(self._rows(table, {}), CHECKED):
+                self._believed(table, row)
+        places = schema.named(self._damaged)
         for (table, _), row in self._damaged.items():
             with told(self._path):
                 schema.put_aside(self._db, table, row)
@@ -198,9 +214,14 @@ class History:
 
     def loops(self, axis: str | None = None, limit: int | None = None) -> list[tuple[Stamp, LoopEstimate]]:
         """Return what was found of the drives' own loops, oldest first."""
-        if self._version < schema.WITH_TERMS:
-            return []
-        return self._read("loops", _of(axis), limit)
+        return [] if self.version < schema.WITH_TERMS else self._read("loops", _of(axis), limit)
+
+    def own_loops(self, axis: str, config_digest: str) -> LoopEstimate | None:
+        """Return the newest loops of an axis if the configuration is the same: it may have been tuned with it."""
+        newest = self.revisions(axis, limit=1)
+        same = bool(newest) and newest[0].set.config_digest == config_digest
+        loops = self.loops(axis, limit=1) if same else []
+        return loops[0][1] if loops else None
 
     def add_skill(self, skill: Skill, stamp: Stamp) -> int:
         """Store how well a move was predicted."""
@@ -214,6 +235,14 @@ class History:
         if number % 1000 == 0:
             with told(self._path):
                 self._db.execute("DELETE FROM notices WHERE id <= ?", (number - KEEP_NOTICES,))
+        return number
+
+    def add_acknowledgement(self, given: Acknowledgement) -> int:
+        """Store who has acknowledged which notices; the oldest beyond ``KEEP_ACKNOWLEDGEMENTS`` go."""
+        row = {"notices": json.dumps(given.notices), "who": given.who, "note": given.note}
+        number = self._insert("acknowledgements", row, given.stamp)
+        with told(self._path):
+            self._db.execute("DELETE FROM acknowledgements WHERE id <= ?", (number - KEEP_ACKNOWLEDGEMENTS,))
         return number
 
     def add_comparison(self, found: Comparison, stamp: Stamp) -> int:
@@ -237,7 +266,7 @@ class History:
 
     def comparisons(self, program: str, limit: int) -> list[tuple[Stamp, Comparison]]:
         """Return what was predicted of a program (its digest), newest first."""
-        if self._version < schema.WITH_COMPARISONS:
+        if self.version < schema.WITH_COMPARISONS:
             return []  # a reader does not bring an older store up
         return self._read("comparisons", {"program": program}, limit)[::-1]
 
@@ -263,18 +292,44 @@ class History:
         """Return the analysed windows, oldest first; with ``limit`` the newest so many."""
         return self._read("windows", _of(axis), limit)
 
+    def chosen_windows(self, condition: str, values: Mapping[str, Any], limit: int) -> list[StoredWindow]:
+        """Return the first ``limit`` sound windows that an SQL condition, order included, chooses."""
+        with told(self._path), closing(self._db.cursor()) as cursor:
+            cursor.row_factory = sqlite3.Row
+            rows = map(dict, cursor.execute(f"SELECT * FROM windows WHERE {condition}", values))
+            return list(islice((it for row in rows if (it := self._believed("windows", row)) is not None), limit))
+
+    def figures(self, query: str, values: Mapping[str, Any] | Sequence[Any]) -> list[tuple[Any, ...]]:
+        """Return what an SQL query counts; it is a figure for people, and damaged rows are in it."""
+        with told(self._path):
+            return self._db.execute(query, values).fetchall()
+
     def skills(self, axis: str | None = None, limit: int | None = None) -> list[Skill]:
         """Return the skills of recorded moves, oldest first."""
         return self._read("skills", _of(axis), limit)
 
-    def notices(self, axis: str | None = None, limit: int | None = None) -> list[tuple[Stamp, Notice]]:
-        """Return the notices with their time, oldest first."""
-        return self._read("notices", _of(axis), limit)
+    def notices(self, axis: str | None = None, limit: int | None = None) -> list[StoredNotice]:
+        """Return the notices, each with its newest acknowledgement, oldest first; with ``limit`` the newest so many."""
+        found: list[StoredNotice] = self._read("notices", _of(axis), limit)
+        given = {number: one for one in self.acknowledgements() for number in one.notices} if found else {}
+        return [replace(notice, acknowledged=given.get(notice.number)) for notice in found]
+
+    def acknowledgements(self, limit: int | None = None) -> list[Acknowledgement]:
+        """Return who has acknowledged what, oldest first."""
+        return [] if self.version < schema.WITH_ACKNOWLEDGEMENTS else self._read("acknowledgements", {}, limit)
 
     def counts(self, axis: str) -> tuple[int, int]:
-        """Return how many windows of an axis were accepted and refused."""
-        found = Counter(window.accepted for window in self.windows(axis))
-        return found[True], found[False]
+        """Return how many windows of an axis were accepted and refused; a figure for people, damaged rows are in it."""
+        found = dict(self.figures("SELECT accepted, count(*) FROM windows WHERE axis = ? GROUP BY accepted", (axis,)))
+        return found.get(1, 0), found.get(0, 0)
+
+    def newest_rows(self) -> tuple[int, ...]:
+        """Return the number of each table's newest row: as long as they are the same, nothing was added."""
+        acknowledged = ("acknowledgements",) if self.version >= schema.WITH_ACKNOWLEDGEMENTS else ()
+        tables = ("windows", "revisions", "notices", *acknowledged)
+        with told(self._path):
+            found = (self._db.execute(f"SELECT max(id) FROM {table}").fetchone()[0] for table in tables)
+            return tuple(number or 0 for number in found)
 
     def last_window_number(self) -> int:
         """Return the largest number a stored window file may have had, 0 when there was none."""
@@ -286,18 +341,6 @@ class History:
 
 def _of(axis: str | None) -> dict[str, str]:
     return {"axis": axis} if axis else {}
-
-
-def named(rows: Mapping[tuple[str, int], Any]) -> str:
-    """Return which rows of which table these are, in one short phrase; empty for none."""
-    tables: dict[str, list[int]] = {}
-    for table, number in sorted(rows):
-        tables.setdefault(table, []).append(number)
-    parts = [
-        f"{len(numbers)} of {table} (row {', '.join(map(str, numbers[:5]))}{', ...' if len(numbers) > 5 else ''})"
-        for table, numbers in tables.items()
-    ]
-    return " and ".join(parts)
 
 
 def _dumped(reasons: Sequence[Reason]) -> str:

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from fdhil.correction.learning import Lesson
-from fdhil.store.atomic import store_error, write_file
+from fdhil.store.atomic import keep_newest, make_folder, store_error, write_file
+from fdhil.store.recording_table import UNREADABLE
 
 SCHEMA = "fdhil-lesson-1"
 MOST_PROGRAMS = 50  # the oldest lessons go
@@ -21,6 +22,19 @@ def lesson_path(folder: Path, program_digest: str, config_digest: str) -> Path:
     return folder / f"{program_digest[:32]}-{config_digest}.npz"
 
 
+def kept_lessons(folder: Path, config_digest: str) -> list[tuple[float, str, Lesson]]:
+    """Return the lessons for one configuration, newest first, each with when it was written (s since 1970) and of what.
+
+    A program is told by the first 32 digits of its digest. What cannot be read is left out.
+    """
+    found = []
+    for path in folder.glob(f"*-{config_digest}.npz"):
+        lesson = read_lesson(path)
+        if lesson is not None:
+            found.append((path.stat().st_mtime, path.name.partition("-")[0], lesson))
+    return sorted(found, key=lambda kept: -kept[0])
+
+
 def read_lesson(path: Path) -> Lesson | None:
     """Return the lesson; None where there is none, or what is there cannot be one: it is learned anew."""
     try:
@@ -30,7 +44,7 @@ def read_lesson(path: Path) -> Lesson | None:
             offsets = {str(axis): np.asarray(found[f"offset_{axis}_um"], np.float64) for axis in found["axes"]}
             curve = tuple(float(value) for value in found["curve_um"])
             lesson = Lesson(offsets, float(found["without_um"]), float(found["gain"]), curve)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    except (zipfile.BadZipFile, *UNREADABLE):
         return None
     finite = all(u.ndim == 1 and np.isfinite(u).all() for u in offsets.values())
     return lesson if offsets and finite and np.isfinite([lesson.without_um, lesson.gain]).all() else None
@@ -49,10 +63,9 @@ def write_lesson(path: Path, lesson: Lesson) -> None:
         **{f"offset_{axis}_um": offset for axis, offset in lesson.offset_um.items()},  # type: ignore[arg-type]
     )
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        newest = sorted(path.parent.glob("*.npz"), key=lambda file: file.stat().st_mtime, reverse=True)
-        for file in newest[MOST_PROGRAMS - 1 :]:
-            file.unlink(missing_ok=True)
+        make_folder(path.parent)
+        write_file(path, content.getvalue())
+        others = [file for file in path.parent.glob("*.npz") if file != path]
+        keep_newest(path, others, MOST_PROGRAMS)
     except OSError as error:
         raise store_error(path, error) from None
-    write_file(path, content.getvalue())

@@ -9,10 +9,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from fdhil.records import Window
 from fdhil.store.export import table_of
 from fdhil.store.recording_table import FORMAT, UNITS, UNREADABLE, RecordingTable, check_size, unreadable
 from fdhil.store.windows import FORMAT as WINDOW_FORMAT
-from fdhil.store.windows import decode_window
+from fdhil.store.windows import decode_window, read_window
 
 _META = b"fdhil"
 
@@ -46,9 +47,19 @@ def decode(content: bytes, source: str) -> RecordingTable:
 
 def is_recording(path: Path) -> bool:
     """Whether a Parquet file is a recording and not a stored window; False where it cannot be told."""
+    return _format_of(path) == FORMAT
+
+
+def stored_window(path: Path) -> Window | None:
+    """Return the window of a file that is a stored one, None of any other. RecordingError where it is damaged."""
+    is_one = path.suffix.lower() == ".parquet" and _format_of(path) == WINDOW_FORMAT
+    return read_window(path) if is_one else None
+
+
+def _format_of(path: Path) -> object:
     try:
         metadata = pq.read_schema(path).metadata or {}
         told = json.loads(metadata.get(_META, b"{}"))
     except (pa.ArrowException, *UNREADABLE):
-        return False
-    return isinstance(told, dict) and told.get("format") == FORMAT
+        return None
+    return told.get("format") if isinstance(told, dict) else None

@@ -113,6 +113,31 @@ class Comparison:
     zones: tuple[Mapping[str, Any], ...]
 
 
+@dataclass(frozen=True, slots=True)
+class Acknowledgement:
+    """Who has answered for ``notices`` (their numbers), when, and what was remarked."""
+
+    notices: tuple[int, ...]
+    who: str
+    note: str
+    stamp: Stamp
+
+
+@dataclass(frozen=True, slots=True)
+class StoredNotice:
+    """A notice as stored, and who has acknowledged it; one of severity info asks for no acknowledgement."""
+
+    number: int
+    notice: Notice
+    stamp: Stamp
+    acknowledged: Acknowledgement | None = None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it waits for somebody to acknowledge it."""
+        return self.acknowledged is None and self.notice.severity != "info"
+
+
 def _stamp(row: Mapping[str, Any]) -> Stamp:
     return Stamp(row["wall_s"], row["boot"], row["monotonic_ns"])
 
@@ -145,8 +170,13 @@ def _skill(row: Mapping[str, Any]) -> Skill:
     return Skill(row["axis"], row["tick"], *(_number(row[name]) for name in figures))
 
 
-def _notice(row: Mapping[str, Any]) -> tuple[Stamp, Notice]:
-    return _stamp(row), Notice(*(row[name] for name in ("code", "severity", "text", "axis", "tick")))
+def _notice(row: Mapping[str, Any]) -> StoredNotice:
+    notice = Notice(*(row[name] for name in ("code", "severity", "text", "axis", "tick")))
+    return StoredNotice(row["id"], notice, _stamp(row))
+
+
+def _acknowledgement(row: Mapping[str, Any]) -> Acknowledgement:
+    return Acknowledgement(tuple(map(int, json.loads(row["notices"]))), row["who"], row["note"], _stamp(row))
 
 
 def _stored_window(row: Mapping[str, Any]) -> StoredWindow:
@@ -181,4 +211,5 @@ DECODED: Mapping[str, Callable[[Mapping[str, Any]], Any]] = {
     "notices": _notice,
     "comparisons": _comparison,
     "loops": _loops,
+    "acknowledgements": _acknowledgement,
 }

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import hashlib
 import sqlite3
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from fdhil.errors import StoreError
-from fdhil.store.atomic import store_error
+from fdhil.store.atomic import CAUSES, is_full, store_error, sync_folder
 
 _CODES = {"SQLITE_FULL": "DiskFull", "SQLITE_READONLY": "ReadOnlyStore", "SQLITE_CANTOPEN": "ReadOnlyStore"}
 # SQLITE_ERROR: our own statements are right, so the tables are not what their version says
@@ -62,11 +62,25 @@ CREATE TABLE loops (id INTEGER PRIMARY KEY AUTOINCREMENT, axis TEXT NOT NULL, st
   warnings TEXT NOT NULL, {_STAMP}, digest TEXT NOT NULL DEFAULT '')
 """
 _NC = "ALTER TABLE windows ADD COLUMN nc TEXT"
-TABLES = (*_WITH_DIGESTS, "loops")
-# what leads from each schema to the next, in order: a new one is added at the end, an old one never changes
-_STEPS = (_FIRST, _COMPARISONS, _DIGESTS, _TERMS, _NC)
+# ``notices`` are the numbers of the rows that one person has seen and answered for at once
+_ACKNOWLEDGEMENTS = f"""
+CREATE TABLE acknowledgements (id INTEGER PRIMARY KEY AUTOINCREMENT, notices TEXT NOT NULL, who TEXT NOT NULL,
+  note TEXT NOT NULL, {_STAMP}, digest TEXT NOT NULL DEFAULT '')
+"""
+# what a works is to be told: ``message`` is the digest of the row at the time; ``store`` tells this file from any other
+_OUTBOX = """
+CREATE TABLE outbox (id INTEGER PRIMARY KEY AUTOINCREMENT, of TEXT NOT NULL, row INTEGER NOT NULL, axis TEXT NOT NULL,
+  message TEXT NOT NULL, with_file INTEGER NOT NULL);
+CREATE TABLE outbox_of (store TEXT NOT NULL, dropped INTEGER NOT NULL);
+INSERT INTO outbox_of VALUES (lower(hex(randomblob(16))), 0)
+"""
+TABLES = (*_WITH_DIGESTS, "loops", "acknowledgements")
+_BESIDE = ("quarantine", "outbox", "outbox_of")
+# what leads from each schema to the next, in order: a new one is added at the end, an old one never changes; one that
+# changes the columns of a table renews the messages of its rows in the outbox, too
+_STEPS = (_FIRST, _COMPARISONS, _DIGESTS, _TERMS, _NC, _ACKNOWLEDGEMENTS, _OUTBOX)
 SCHEMA_VERSION = len(_STEPS)
-WITH_COMPARISONS, WITH_DIGESTS, WITH_TERMS = 2, 3, 4
+WITH_COMPARISONS, WITH_DIGESTS, WITH_TERMS, WITH_ACKNOWLEDGEMENTS, WITH_OUTBOX = 2, 3, 4, 6, 7
 # what the check of the structure says of single values; their row's digest tells the same and no more than the row
 _OF_ONE_ROW = (" value in ", "CHECK constraint failed")
 
@@ -80,12 +94,16 @@ def told(path: Path) -> Iterator[None]:
         raise _damaged(path, "a name in it is no text") from None
     except sqlite3.Error as error:
         name = getattr(error, "sqlite_errorname", "") or ""
-        code = next((code for prefix, code in _CODES.items() if name.startswith(prefix)), "StoreFault")
-        raise (
-            _damaged(path, str(error))
-            if _DAMAGE & {name, name[:14]}
-            else StoreError(f"{path} cannot be used ({error}); check the disk, or move the file away", code)
-        ) from None
+        raise (_damaged(path, str(error)) if _DAMAGE & {name, name[:14]} else _unusable(path, name, error)) from None
+
+
+def _unusable(path: Path, name: str, error: sqlite3.Error) -> StoreError:
+    """Say why the file cannot be used now; nothing is wrong with what is in it."""
+    code = next((code for prefix, code in _CODES.items() if name.startswith(prefix)), "StoreFault")
+    if name.startswith("SQLITE_IOERR") and is_full(path):  # SQLite calls it by its name when it grows a table alone
+        code = "DiskFull"
+    cause = CAUSES.get(code, "check the disk; the history is left as it is")
+    return StoreError(f"{path} cannot be used ({error}): {cause}", code)
 
 
 def _damaged(path: Path, what: str) -> StoreError:
@@ -98,8 +116,11 @@ def version_of(db: sqlite3.Connection) -> int:
     return int(db.execute("PRAGMA user_version").fetchone()[0])
 
 
-def check_file(db: sqlite3.Connection, path: Path, least: int = 0) -> int:
-    """Return the file's schema; StoreError when it is another program's, not what it says, or damaged in structure."""
+def check_file(db: sqlite3.Connection, path: Path, least: int = 0, *, pages: bool = True) -> int:
+    """Return the file's schema; StoreError when it is another program's, not what it says, or damaged in structure.
+
+    All ``pages`` are looked at, which takes a second for some hundred megabytes.
+    """
     db.text_factory = lambda raw: raw.decode("utf-8", "replace")  # a damaged text is seen by its digest
     version = version_of(db)
     if not least <= version <= SCHEMA_VERSION:
@@ -107,14 +128,40 @@ def check_file(db: sqlite3.Connection, path: Path, least: int = 0) -> int:
         raise StoreError(text, "SchemaVersion")
     if _columns(db) != _columns_of(version):
         raise _damaged(path, f"its tables are not those of schema {version}")
-    for (found,) in db.execute("PRAGMA quick_check(20)"):
+    for (found,) in db.execute("PRAGMA quick_check(20)") if pages else ():
         if found != "ok" and not any(part in found for part in _OF_ONE_ROW):
             raise _damaged(path, " ".join(found.split())[:120])
     return version
 
 
+def open_to_read(path: Path, checked: set[tuple[int, int]] | None = None) -> tuple[sqlite3.Connection, int]:
+    """Open a file for reading only, also from a read-only disk, and return it with its schema; StoreError.
+
+    Who opens it again and again keeps in ``checked`` which files were whole (device and inode).
+    """
+    if not path.is_file():
+        raise StoreError(f"{path} does not exist: nothing was recorded yet; run the daemon first", "NoHistory")
+    place = path.stat()
+    known = checked is not None and (place.st_dev, place.st_ino) in checked
+    with told(path):
+        for flags in ("mode=ro", "mode=ro&immutable=1"):  # without a shared-memory file only the latter opens
+            db = sqlite3.connect(f"{path.resolve().as_uri()}?{flags}", uri=True, timeout=5.0)
+            try:
+                version = check_file(db, path, least=1, pages=not known)
+            except sqlite3.OperationalError:
+                db.close()
+                continue
+            except (sqlite3.Error, StoreError):
+                db.close()
+                raise
+            if checked is not None:
+                checked.add((place.st_dev, place.st_ino))
+            return db, version
+    raise StoreError(f"{path} cannot be opened; check its rights", "StoreFault")
+
+
 def _columns(db: sqlite3.Connection) -> list[list[tuple[Any, ...]]]:
-    return [db.execute(f"PRAGMA table_info({table})").fetchall() for table in (*TABLES, "quarantine")]
+    return [db.execute(f"PRAGMA table_info({table})").fetchall() for table in (*TABLES, *_BESIDE)]
 
 
 @cache
@@ -128,10 +175,11 @@ def _columns_of(version: int) -> list[list[tuple[Any, ...]]]:
 def bring_up(db: sqlite3.Connection, path: Path) -> None:
     """Take an older schema, or an empty file, to the present one: every step is whole or not made at all.
 
-    An older file is kept beside it as it was, under its name and the schema it had.
+    An older file is kept beside it as it was at each step, under its name and the schema it had.
     """
+    new = version_of(db) == 0
     while (version := version_of(db)) < SCHEMA_VERSION:
-        if version:
+        if not new:
             _keep_copy(db, path.with_name(f"{path.name}.schema-{version}"))
         db.execute("BEGIN IMMEDIATE")
         try:
@@ -155,6 +203,7 @@ def _keep_copy(db: sqlite3.Connection, path: Path) -> None:
         with closing(sqlite3.connect(part)) as copy:
             db.backup(copy)
         part.replace(path)
+        sync_folder(path.parent)
     except OSError as error:
         raise store_error(path, error) from None
 
@@ -189,8 +238,12 @@ def digest_of(table: str, row: Mapping[str, Any]) -> str:
     return hashlib.sha256(ascii((table, values)).encode()).hexdigest()
 
 
-def insert(db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> int:
-    """Add a row with the digest of what the file then holds of it; return its number."""
+Also = Callable[[sqlite3.Connection, str, Mapping[str, Any]], None]
+"""Adds what belongs to a new row (its table, what the file holds of it), in the same transaction."""
+
+
+def insert(db: sqlite3.Connection, table: str, row: Mapping[str, Any], also: Also | None = None) -> int:
+    """Add a row with the digest of what the file then holds of it, and what ``also`` adds; return its number."""
     names = ", ".join(row)
     marks = ", ".join(f":{name}" for name in row)
     db.execute("BEGIN IMMEDIATE")
@@ -198,7 +251,10 @@ def insert(db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> int:
         number = int(db.execute(f"INSERT INTO {table} ({names}, digest) VALUES ({marks}, '')", row).lastrowid or 0)
         cursor = db.execute(f"SELECT * FROM {table} WHERE id = ?", (number,))
         stored = dict(zip([column[0] for column in cursor.description], cursor.fetchone(), strict=True))
-        db.execute(f"UPDATE {table} SET digest = ? WHERE id = ?", (digest_of(table, stored), number))
+        stored["digest"] = digest_of(table, stored)
+        db.execute(f"UPDATE {table} SET digest = ? WHERE id = ?", (stored["digest"], number))
+        if also is not None:
+            also(db, table, stored)
         db.execute("COMMIT")
     except sqlite3.Error:
         db.rollback()
@@ -217,3 +273,15 @@ def put_aside(db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> Non
     except sqlite3.Error:
         db.rollback()
         raise
+
+
+def named(rows: Mapping[tuple[str, int], Any]) -> str:
+    """Return which rows of which table these are, in one short phrase; empty for none."""
+    tables: dict[str, list[int]] = {}
+    for table, number in sorted(rows):
+        tables.setdefault(table, []).append(number)
+    parts = [
+        f"{len(numbers)} of {table} (row {', '.join(map(str, numbers[:5]))}{', ...' if len(numbers) > 5 else ''})"
+        for table, numbers in tables.items()
+    ]
+    return " and ".join(parts)

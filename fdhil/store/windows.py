@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 
 from fdhil.errors import RecordingError, StoreError
 from fdhil.records import Float, NcMove, SlowVoltage, Stages, Window, read_only
-from fdhil.store.atomic import store_error, sync_folder, write_file
+from fdhil.store.atomic import make_folder, store_error, sync_folder, write_file
 from fdhil.store.parquet_pages import uncompressed_bytes
 
 FORMAT = "fdhil-window-1"
@@ -285,7 +285,7 @@ class WindowStore:
         self._keep = keep
         self._config_digest = config_digest
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            make_folder(folder)
         except OSError as error:
             raise store_error(folder, error) from None
         listing = list_windows(folder)

@@ -24,13 +24,13 @@ _EDGE = 8  # rows at either end that a shifted comparison leaves out
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """Where the model's table was at the SYNC instants (n,), mm, and the ``rows`` (m,) that can be compared.
+    """The model's ``response`` at the SYNC instants (n,), and the ``rows`` (m,) that can be compared.
 
     Of those: ``difference_um`` (m,), measured less predicted, and ``following_um`` (m,), measured less demanded.
     ``step_um`` is the measured position's resolution.
     """
 
-    predicted_mm: Float
+    response: closed_loop.Response
     rows: Int
     difference_um: Float
     following_um: Float
@@ -41,9 +41,12 @@ class Replay:
         kept = (self.rows >= begin) & (self.rows < end)
         if np.count_nonzero(kept) < LEAST_ROWS:
             return self
-        return Replay(
-            self.predicted_mm, self.rows[kept], self.difference_um[kept], self.following_um[kept], self.step_um
-        )
+        return Replay(self.response, self.rows[kept], self.difference_um[kept], self.following_um[kept], self.step_um)
+
+    @property
+    def predicted_mm(self) -> Float:
+        """Where the drive's encoder was at the SYNC instants (n,), as the model has it."""
+        return self.response.position_mm
 
     @property
     def unexplained_um(self) -> float:
@@ -76,14 +79,14 @@ def replay(
     demand = _filled(demand_mm, "demand")
     offset = None if offset_mm is None else np.nan_to_num(offset_mm)
     start = closed_loop.standing(parameters, axis, float(_filled(position_mm, "position")[0]), standstill_a)
-    predicted = closed_loop.simulate(parameters, axis, sync_period_s, demand, offset, state=start).position_mm
+    response = closed_loop.simulate(parameters, axis, sync_period_s, demand, offset, state=start)
     rows = np.flatnonzero(np.isfinite(demand_mm) & np.isfinite(position_mm))
     rows = rows[(rows >= _EDGE) & (rows < demand.size - _EDGE)]
     if rows.size < LEAST_ROWS:
         raise ValueError(f"a move with {rows.size} whole rows is too short to judge the model")
-    difference = (position_mm - predicted)[rows] * 1e3
+    difference = (position_mm - response.position_mm)[rows] * 1e3
     return Replay(
-        predicted, rows, difference, (position_mm - demand_mm)[rows] * 1e3, 1e3 * resolution(position_mm[rows])
+        response, rows, difference, (position_mm - demand_mm)[rows] * 1e3, 1e3 * resolution(position_mm[rows])
     )
 
 

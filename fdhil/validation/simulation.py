@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,8 +18,27 @@ EXCESS = 1.5  # of the variance that noise explains
 SHAPE_SHARE = 0.002  # of the rapid speed: what the voltage's course within a sample leaves open
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Simulated:
+    """A drive simulated from its measured voltage at ``time_s`` (m,) after row 0, beside its measured speed there."""
+
+    time_s: Float
+    current_a: Float
+    speed_rad_s: Float
+    measured_rad_s: Float
+
+
 def fit_percent(window: Window, estimate: Estimate, fit: Fit | None) -> float | None:
-    """Return 100 (1 - |w - what| / |w - mean w|) of the speed simulated from voltage; None without a model.
+    """Return 100 (1 - |w - what| / |w - mean w|) of the speed simulated from voltage; None without a model."""
+    told = simulated(window, estimate, fit)
+    if told is None:
+        return None
+    known = np.isfinite(told.measured_rad_s)
+    return _explained_percent(told.measured_rad_s[known], told.speed_rad_s[known])
+
+
+def simulated(window: Window, estimate: Estimate, fit: Fit | None) -> Simulated | None:
+    """Simulate a window's current and speed from its voltage alone; None without a model or a voltage.
 
     A delay of the voltage that the estimate found, and that is no more than a sample, is taken out first. Where a slow
     voltage leaves R or L open, the fit's own value is taken: a simulation needs all.
@@ -32,17 +51,16 @@ def fit_percent(window: Window, estimate: Estimate, fit: Fit | None) -> float | 
         return None
     p = replace(p, ft=max(p.ft, 0.0), Cd=max(p.Cd, 0.0))
     if window.slow_voltage is not None:
-        return _slow_fit_percent(window, p, estimate.delay_s or 0.0)
+        return _slowly(window, p, estimate.delay_s or 0.0)
     assert window.voltage_v is not None
-    known = np.isfinite(window.speed_rad_s)
+    row: Float = np.arange(window.n, dtype=np.float64)
     voltage = carried(window.voltage_v)
     if fit is not None:
         voltage = voltage + voltage_terms_v(fit.problem.motions[0], fit.theta)
     if estimate.delay_s and abs(estimate.delay_s) <= window.dt_s:
-        row = np.arange(voltage.size)
         voltage = np.interp(row + estimate.delay_s / window.dt_s, row, voltage)
-    _, speed = simulate_plant(p, voltage, window.dt_s, window.voltage_sampling)
-    return _explained_percent(window.speed_rad_s[known], speed[known])
+    current, speed = simulate_plant(p, voltage, window.dt_s, window.voltage_sampling)
+    return Simulated(row * window.dt_s, current, speed, window.speed_rad_s)
 
 
 def _complete(estimate: Estimate, fit: Fit | None) -> Estimate:
@@ -51,18 +69,18 @@ def _complete(estimate: Estimate, fit: Fit | None) -> Estimate:
     return replace(estimate, values=np.where(np.isnan(estimate.values), fit.theta[:6], estimate.values))
 
 
-def _slow_fit_percent(window: Window, parameters: Parameters, delay_s: float) -> float | None:
+def _slowly(window: Window, parameters: Parameters, delay_s: float) -> Simulated:
     """Simulate on the grid of the slow sensor itself, and compare with the measured speed at its instants."""
     slow = window.slow_voltage
     assert slow is not None
-    begin = slow.begin_s - delay_s + slow.period_s * np.arange(slow.voltage_v.size)
+    begin: Float = slow.begin_s - delay_s + slow.period_s * np.arange(slow.voltage_v.size, dtype=np.float64)
     voltage = carried(slow.voltage_v)
     if slow.late_s is not None:  # of a sensor that was asked: its values are brought to the grid, and across its holes
         known = np.isfinite(slow.voltage_v)
         voltage = np.interp(begin, (begin + slow.late_s)[known], slow.voltage_v[known]) if known.any() else voltage
-    _, speed = simulate_plant(parameters, voltage, slow.period_s, window.voltage_sampling)
+    current, speed = simulate_plant(parameters, voltage, slow.period_s, window.voltage_sampling)
     measured = np.interp(begin, np.arange(window.n) * window.dt_s, carried(window.speed_rad_s))
-    return _explained_percent(measured, speed)
+    return Simulated(begin, current, speed, measured)
 
 
 def _explained_percent(measured: Float, speed: Float) -> float | None:

@@ -207,6 +207,10 @@ async def test_the_operators_token_decides_and_a_missing_guard_is_told(config: M
         answer = await desk.arm(request | {"token": token})
         assert (answer["ok"], answer["code"]) == (False, "AuthRequired")
     token = read_token(config.store.run_directory)
+    meant = {"token": token, "program_digest": program_digest(program)}
+    assert (await desk.arm(request | meant))["code"] == "GuardAbsent"
+    program.write_bytes(program.read_bytes() + b"\n")
+    assert (await desk.arm(request | meant))["code"] == "ProgramMismatch"
     assert (await desk.arm(request | {"token": token}))["code"] == "GuardAbsent"
     assert (await desk.arm(request | {"token": token, "method": "magic"}))["code"] == "BadRequest"
     assert (await desk.arm({"request": "arm", "token": token}))["code"] == "BadRequest"

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from fdhil import config as machine_config
 from fdhil.arming import standing
 from fdhil.arming.desk import ArmingDesk
 from fdhil.arming.guard_link import GuardLink
@@ -19,6 +20,7 @@ from fdhil.config import MachineConfig
 from fdhil.daemon.control import ask
 from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.errors import ConnectError, DeviceError
+from fdhil.store import audit
 from tests.arming.guard_peer import Guard
 from tests.daemon.machine import Machine, config_of
 from tests.daemon.shop import BENCH, fdhil
@@ -270,9 +272,56 @@ def test_adopt_says_what_stands_asks_and_ends_at_zero(
     code, out, _ = fdhil("adopt", machine, capsys=capsys)
     assert (code, out) == (0, "guard: OFF, offset 0\n")
     assert guard.heard[2] == "adopt"
+    assert in_the_audit(machine) == [("adopt", None), ("adopt", "done")]
     code, out, _ = fdhil("adopt", machine, "--yes", capsys=capsys)
     assert (code, out) == (0, "guard: OFF, offset 0: there is nothing to adopt\n")
     assert guard.heard.count("adopt") == 1
+
+
+def in_the_audit(machine: Path) -> list[tuple[str, str | None]]:
+    """What was asked or answered, and with which result."""
+    found = audit.entries(machine_config.load(machine).store.directory)
+    return [(entry.get("asked") or entry["answered"], entry.get("result")) for entry, wrong in found if wrong is None]
+
+
+@pytest.mark.fault("F5")
+def test_no_disk_keeps_an_offset_from_being_taken_away(machine: Path, guard: Guard, capsys: Any) -> None:
+    """What cannot be written down is told, after the answer."""
+    folder = machine_config.load(machine).store.directory
+    (folder / audit.FILE_NAME).mkdir(parents=True)
+    now = [FROZEN, OFF]
+    guard.says = lambda kind: {"ok": True} if kind in ("adopt", "disarm") else now.pop(0) if len(now) > 1 else now[0]
+    code, out, err = fdhil("adopt", machine, "--yes", capsys=capsys)
+    assert (code, out) == (0, "guard: OFF, offset 0\n")
+    assert err.count("adopt is not in the audit: ") == 2
+    code, out, err = fdhil("disarm", machine, capsys=capsys)
+    assert (code, "disarm at the guard is not in the audit" in err) == (0, True)
+    (folder / audit.FILE_NAME).rmdir()
+    assert fdhil("disarm", machine, capsys=capsys)[0] == 0
+    assert in_the_audit(machine) == [("disarm at the guard", "done")]
+
+
+@pytest.mark.fault("F5")
+def test_a_disk_that_hangs_delays_an_adoption_by_a_moment_alone(
+    machine: Path, guard: Guard, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    answers = threading.Event()
+    hung = iter((True, False))  # it answers again when the offset is away
+    append = audit.append
+
+    def slow(folder: Path, entry: dict[str, Any]) -> None:
+        if next(hung):
+            answers.wait()
+        append(folder, entry)
+
+    monkeypatch.setattr(audit, "append", slow)
+    monkeypatch.setattr("fdhil.cli.audited.DISK_S", 0.05)
+    now = [FROZEN, OFF]
+    guard.says = lambda kind: {"ok": True} if kind == "adopt" else now.pop(0) if len(now) > 1 else now[0]
+    code, out, err = fdhil("adopt", machine, "--yes", capsys=capsys)
+    answers.set()
+    assert (code, out) == (0, "guard: OFF, offset 0\n")
+    assert "adopt is not in the audit: the disk does not answer" in err
 
 
 def test_adopt_that_does_not_end_at_zero_is_1_with_the_cause(machine: Path, guard: Guard, capsys: Any) -> None:

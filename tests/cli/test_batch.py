@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pty
+import signal
 import sys
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pytest
 
 from fdhil.cli import batch
 from fdhil.cli.main import cli, run_safely
 from fdhil.config import Identification
+from fdhil.errors import FdhilError
+from fdhil.fleet import objects
+from fdhil.fleet.window_work import analyse_again
+from fdhil.identification.windows import moving_range
+from fdhil.store.windows import read_window
 from studies import bench
+from tests.daemon.shop import fdhil
+from tests.fleet import rapids
 from tests.identification.recorded import signals
 
 SETTINGS = Identification()
@@ -48,7 +57,45 @@ def test_other_processes_give_the_same(recordings: list[Path], limit: str, monke
         assert one.file == other.file
         assert one.pooled is not None
         assert other.pooled is not None
-        np.testing.assert_allclose(one.pooled.values, other.pooled.values, rtol=1e-6)
+        assert one.pooled.values.tobytes() == other.pooled.values.tobytes()
+
+
+def test_a_process_that_dies_is_a_sentence(recordings: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batch, "MANY_FILES", 1)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(batch, "_analyse_some", dying)
+    with pytest.raises(FdhilError, match="was ended from outside"):
+        list(batch.analyse_files(recordings, SETTINGS))
+
+
+def dying(numbered: Any, **how: Any) -> None:
+    """Die as a process does that the kernel ends."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_folder_is_all_its_recordings_and_a_stored_window_the_bits_that_a_fleet_finds(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "objects"
+    windows = rapids.stored(folder, 1, 3)
+    (folder / "notes.txt").write_text("no recording")
+    code, out, _ = fdhil("identify", folder, "--method", "least_squares", "--json", capsys=capsys)
+    files = {Path(file["file"]).stem: file for file in json.loads(out)["files"]}
+    assert (code, sorted(files)) == (0, sorted(window.name for window in windows))
+    for again in analyse_again(windows, rapids.method(folder)):
+        (told,) = files[again.window.name]["windows"]
+        fleet = json.loads(again.text)
+        window = read_window(objects.path_of(folder, again.window.name))
+        assert told["start_s"] == round(window.start_s + moving_range(window)[0] * window.dt_s, 6)  # as it was recorded
+        assert told["validated"] == fleet["accepted"]
+        assert told["fit_percent"] == fleet["fit_percent"]
+        for name, found in fleet["parameters"].items():
+            assert (told["parameters"][name]["value"], told["parameters"][name]["std"]) == (
+                found["value"],
+                found["std"],
+            )
+    (tmp_path / "empty").mkdir()
+    assert "has no recordings" in fdhil("identify", tmp_path / "empty", capsys=capsys)[2]
 
 
 def test_a_terminal_sees_how_far_the_work_is(recordings: list[Path], capsys: pytest.CaptureFixture[str]) -> None:

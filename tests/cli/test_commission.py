@@ -9,12 +9,15 @@ import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from fdhil import config as machine_config
 from fdhil.cli.main import cli, run_safely
 from fdhil.commissioning.record import load_record
+from fdhil.errors import DriveFault
+from fdhil.store import audit
 from fdhil.store.history import History
 from tests.bench import bench_toml
 from tests.drivers.peer import DrivePeer
@@ -233,6 +236,48 @@ WRONG: dict[str, tuple[Callable[[Bench], None], str, bool]] = {
 }  # fmt: skip
 
 
+def in_the_audit(bench: Bench) -> list[tuple[str, str, str | None]]:
+    """What was asked or answered, of which axis, and with which result."""
+    found = [entry for entry, wrong in audit.entries(bench.store) if wrong is None]
+    return [(entry.get("asked") or entry["answered"], entry["axis"], entry.get("result")) for entry in found]
+
+
+def test_what_is_done_to_a_drive_is_in_the_audit_before_it_is_done(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before: list[Any] = []
+
+    def commission(*_: object) -> None:
+        before.extend(in_the_audit(bench))
+        raise DriveFault("drive X", "it is not as it must be")
+
+    monkeypatch.setattr("fdhil.commissioning.steps.commission", commission)
+    monkeypatch.setattr("fdhil.commissioning.pdo_setup.set_up_pdos", commission)
+    assert bench.commission("--yes")[0] == 1
+    assert before == [("commission", "X", None)]
+    assert in_the_audit(bench)[1:] == [("commission", "X", "DriveFault")]
+    assert bench.commission("--yes", "--set-pdos")[0] == 1
+    assert before[-1] == ("set the PDOs up", "X", None)
+    bench.commission("--dry-run")
+    assert len(in_the_audit(bench)) == 4
+
+
+@pytest.mark.fault("F5")
+@pytest.mark.parametrize("options", [(), ("--set-pdos",)])
+def test_what_cannot_be_written_down_is_not_done(options: tuple[str, ...], bench: Bench) -> None:
+    (bench.store / audit.FILE_NAME).mkdir(parents=True)
+    code, _, err = bench.commission("--yes", *options)
+    assert (code, "could not be written" in err) == (3, True)
+    assert bench.peer.heard == []
+
+
+@pytest.mark.goal("R20")
+def test_twelve_wrong_set_ups_and_more_are_tried(record_property: Callable[[str, object], None]) -> None:
+    assert len(WRONG) >= 12
+    record_property("goal", f"{len(WRONG)} wrong set-ups ({', '.join(WRONG)}), each refused by the command")
+
+
+@pytest.mark.goal("R20")
 @pytest.mark.parametrize("what", WRONG)
 def test_a_wrong_set_up_is_refused(what: str, bench: Bench) -> None:
     spoil, says, switched_on = WRONG[what]

@@ -25,8 +25,7 @@ from fdhil.commissioning.record import axis_digest, save_record
 from fdhil.guard.limits import OffsetLimits
 from fdhil.guard.settings import load
 from tests.arming.test_guard_settings import RECORD
-from tests.guard.machine import DEMAND_AT_REST
-from tests.guard.peer import Peer, write_config
+from tests.guard.peer import Peer, at_rest, write_config
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
@@ -36,11 +35,8 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
 
 @pytest.fixture
 def peer() -> Iterator[Peer]:
-    made = Peer(DEMAND_AT_REST)
-    made.start()
-    yield made
-    made.ended.set()
-    made.join()
+    with at_rest() as made:
+        yield made
 
 
 def test_help(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fdhil.records import PARAMETERS, frozen
+from fdhil.records import PARAMETERS, Notice, frozen
 from fdhil.store.history import History
-from fdhil.store.rows import Stamp
+from fdhil.store.rows import Acknowledgement, Stamp
 from tests.daemon.machine import config_of
 from tests.daemon.shop import BENCH, fdhil
 from tests.store.made import outcome, published, window
@@ -184,3 +184,23 @@ def test_every_table_fits_80_columns_and_says_what_its_intervals_are(worn: Path,
     half = (told["high"] - told["low"]) / 2
     assert f"±{1e3 * half:.0f}" in out.splitlines()[out.splitlines().index(newest) + 1].split()
     assert half == pytest.approx(1.96 * told["std"], rel=1e-3)
+
+
+def test_history_and_report_tell_what_waits_and_who_acknowledged(tmp_path: Path, capsys: Any) -> None:
+    path = tmp_path / "machine.toml"
+    path.write_text(BENCH)
+    with History.open(config_of(tmp_path).store.directory) as history:
+        for k, text in enumerate(("the bus was gone", "the bus was gone again")):
+            history.add_notice(Notice("BusDown", "MAJOR", text), Stamp(START_S + k, "boot", k))
+        history.add_notice(Notice("BusDown", "info", "the bus is back"), Stamp(START_S + 9, "boot", 9))
+        history.add_acknowledgement(Acknowledgement((1,), "anna", "plug", Stamp(START_S + 60, "boot", 60)))
+    out = fdhil("history", path, capsys=capsys)[1]
+    assert "wait to be acknowledged (fdhil acknowledge): 1" in out
+    assert "acknowledged by anna" in out
+    assert "the bus is back" not in out
+    told = json.loads(fdhil("history", path, "--json", capsys=capsys)[1])["notices"]
+    assert [notice["acknowledged"] and notice["acknowledged"]["who"] for notice in told] == ["anna", None]
+    assert fdhil("report", path, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
+    page = (tmp_path / "report.html").read_text("utf-8")
+    assert "the bus was gone again" in page
+    assert re.search(r"anna, 2027-01-15 \d\d:\d\d: plug", page)

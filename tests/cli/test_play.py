@@ -18,6 +18,7 @@ import can
 import pytest
 
 from fdhil import config as machine_config
+from fdhil.store import audit
 from tests.integration.conftest import sign_off
 from tests.sim.twin_process import TwinProcess, write_config
 
@@ -105,6 +106,11 @@ class Shop:
         self.wait(moves)
         return process
 
+    def last_in_the_audit(self) -> tuple[str, str | None]:
+        """What was asked or answered last, and with which result."""
+        *_, (entry, _) = audit.entries(machine_config.load(self.folder / "machine.toml").store.directory)
+        return entry.get("asked") or entry["answered"], entry.get("result")
+
     def wait(self, condition: Callable[[], bool]) -> None:
         deadline = time.monotonic() + 300
         while not condition():
@@ -162,6 +168,7 @@ def test_a_killed_process_leaves_drives_that_stop(shop: Shop) -> None:
     process.send_signal(signal.SIGKILL)
     said = process.communicate()
     assert process.returncode == -signal.SIGKILL, said
+    assert shop.last_in_the_audit() == ("play", None)  # what it came to is not known
     assert shop.stopped_by_themselves()
 
 
@@ -172,5 +179,6 @@ def test_a_lost_bus_leaves_drives_that_stop_and_is_told(shop: Shop) -> None:
     _, err = process.communicate()
     assert process.returncode == 3
     assert "a drive that is on stops by itself" in err
+    assert shop.last_in_the_audit()[1] not in (None, "done")
     assert "Traceback" not in err
     assert shop.stopped_by_themselves()

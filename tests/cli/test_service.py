@@ -14,11 +14,11 @@ from typing import Any
 import pytest
 
 from fdhil.arming.token import ensure_token
-from fdhil.cli.parameter_view import cell, half_of
 from fdhil.cli.status_view import believed, sparkline
 from fdhil.daemon import journal
 from fdhil.daemon.status import Watch
 from fdhil.records import Notice
+from fdhil.report.parameter_view import cell, half_of
 from tests.daemon.machine import config_of
 from tests.daemon.shop import BENCH, fdhil
 from tests.store.made import outcome, published
@@ -216,3 +216,37 @@ def test_terms_and_what_is_warned_of_are_told_beside_the_table() -> None:
     told = "load 2.50 ±0.02 N.m; 0.25 um of a rapid unexplained; OneDirection: all moves go one way"
     assert believed(axis) == told
     assert believed({"terms": None, "unexplained_um": None, "warnings": []}) == ""
+
+
+NOTICE = {"number": 41, "time": "2026-11-22T13:47:00+00:00", "axis": "X", "code": "GuardTripped", "severity": "MAJOR",
+          "text": "EchoMismatch: why", "acknowledged": None}  # fmt: skip
+
+
+def test_notices_are_acknowledged_by_their_numbers(machine: Path, capsys: Any) -> None:
+    with answering(machine, {"ok": True, "text": "notice 41 acknowledged by me; 0 more wait"}) as asked:
+        code, out, _ = fdhil("acknowledge", machine, "41", "--note", "seen", capsys=capsys)
+    assert (code, out) == (0, "notice 41 acknowledged by me; 0 more wait\n")
+    (request,) = asked
+    assert (request["request"], request["notices"], request["note"]) == ("acknowledge", [41], "seen")
+    assert request["by"]
+
+
+def test_a_notice_that_there_is_not_is_the_daemons_no(machine: Path, capsys: Any) -> None:
+    for arguments in ((), ("41", "--all")):
+        assert fdhil("acknowledge", machine, *arguments, capsys=capsys)[0] == 2
+    refused = {"ok": False, "code": "NoSuchNotice", "text": "there is no notice 7", "advice": "see fdhil status"}
+    with answering(machine, refused):
+        code, _, err = fdhil("acknowledge", machine, "7", capsys=capsys)
+    assert (code, err) == (1, "refused: NoSuchNotice: there is no notice 7; see fdhil status\n")
+
+
+def test_status_tells_what_waits_and_who_acknowledged(machine: Path, tmp_path: Path, capsys: Any) -> None:
+    status = status_of(tmp_path)
+    given = {"who": "anna", "time": "2026-11-22T14:00:00+00:00", "note": ""}
+    notice = {"age_s": 5.0, **NOTICE, "acknowledged": given}
+    told = status | {"unacknowledged": {"count": 3, "MAJOR": 1, "newest": []}, "notices": [notice]}
+    with answering(machine, told):
+        out = fdhil("status", machine, capsys=capsys)[1]
+    assert "notices that wait to be acknowledged: 3, of them MAJOR 1" in out
+    assert "41" in out
+    assert "(acknowledged by anna)" in " ".join(out.split())

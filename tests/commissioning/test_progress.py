@@ -94,3 +94,13 @@ def test_a_store_that_takes_nothing_is_told(tmp_path: Path) -> None:
     progress = Progress(tmp_path / "file" / "store", "X")
     with pytest.raises(StoreError, match=r"cannot be written .* check the rights"):
         progress.keep("sign test", "this drive", FOUND)
+
+
+def test_a_step_for_which_there_is_no_room_is_refused_and_those_before_it_stay(tmp_path: Path) -> None:
+    progress, room = Progress(tmp_path, "X"), {"told": "x" * 21_000}
+    for number in range(12):
+        progress.keep(f"step {number}", "this drive", room)
+    with pytest.raises(StoreError, match="no room for another step"):
+        progress.keep("one too many", "this drive", room)
+    again = Progress(tmp_path, "X")
+    assert (again.doubt, len(again.done()), len(progress.done())) == ("", 12, 12)

@@ -14,11 +14,13 @@ from typing import Any
 import pytest
 
 from fdhil.arming.token import ensure_token, read_token
+from fdhil.config import Access
 from fdhil.daemon import journal
 from fdhil.daemon.control import MAX_CLIENTS, ControlServer, ask
 from fdhil.daemon.journal import BURST, FloodGate, line_of, printable
 from fdhil.daemon.lock import BusLocked, sole_owner
 from fdhil.daemon.notify import notify
+from fdhil.daemon.peers import Peer
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
 from fdhil.records import Notice, Skill
 from tests.store.made import outcome, published
@@ -64,7 +66,7 @@ async def test_what_takes_its_time_tells_its_progress_and_ends_when_nobody_waits
     turn = {"count": 0}
     free, abandoned = asyncio.Event(), asyncio.Event()
 
-    async def handle(request: Mapping[str, Any]) -> Mapping[str, Any]:
+    async def handle(request: Mapping[str, Any], peer: Peer) -> Mapping[str, Any]:
         await (free if request["request"] == "arm" else abandoned).wait()
         return {"ok": True}
 
@@ -75,7 +77,7 @@ async def test_what_takes_its_time_tells_its_progress_and_ends_when_nobody_waits
         return {"checked_s": turn["count"]}
 
     told: list[Mapping[str, Any]] = []
-    async with ControlServer(handle, progress, abandoned.set).serving(tmp_path / "c"):
+    async with ControlServer(handle, progress, abandoned.set, Access()).serving(tmp_path / "c"):
         answer = await asyncio.to_thread(ask, tmp_path / "c", {"request": "arm"}, 10.0, told.append)
         assert answer == {"ok": True}
         assert told == [{"checked_s": 1}, {"checked_s": 2}]
@@ -88,7 +90,7 @@ async def test_idle_connections_make_room_and_those_that_wait_leave_some_for_dis
     """Three times as many connections as there are places, idle ones and such that wait for an answer."""
     free, waiting = asyncio.Event(), asyncio.Semaphore(0)
 
-    async def handle(request: Mapping[str, Any]) -> Mapping[str, Any]:
+    async def handle(request: Mapping[str, Any], peer: Peer) -> Mapping[str, Any]:
         if request["request"] == "arm":
             waiting.release()
             await free.wait()
@@ -96,7 +98,7 @@ async def test_idle_connections_make_room_and_those_that_wait_leave_some_for_dis
 
     path = tmp_path / "c"
     idle: list[socket.socket] = []
-    async with ControlServer(handle, lambda: None, free.set).serving(path):
+    async with ControlServer(handle, lambda: None, free.set, Access()).serving(path):
         for _ in range(3 * MAX_CLIENTS):
             idle.append(socket.socket(socket.AF_UNIX))
             idle[-1].connect(str(path))

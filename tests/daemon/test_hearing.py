@@ -17,7 +17,7 @@ import pytest
 from fdhil import config as machine_config
 from fdhil.cli.status_view import counted, open_console, show
 from fdhil.config import MachineConfig
-from fdhil.daemon.hearing import Hearing
+from fdhil.daemon.hearing import FEW_SYNCS, Hearing
 from fdhil.daemon.status import Watch
 from fdhil.drivers import open_machine
 from fdhil.pipeline import Record
@@ -146,6 +146,17 @@ def test_the_rate_is_of_what_is_heard_now(tmp_path: Path) -> None:
     assert hearing.status(2.1)["source"]["buses"] == {"can0": 1.1}
     hearing.source_lost(3.0)
     assert hearing.status(3.0)["source"]["state"] == "reconnecting"
+
+
+def test_two_buses_that_show_the_same_ticks_twice_are_no_rate(tmp_path: Path) -> None:
+    """On a busy host a bus was drained long after another: the newest tick was the oldest one known, too."""
+    hearing = Hearing(config_of(tmp_path), 0.0)
+    hearing.source_opened(0.0)
+    for late_ns in (0, 300_000_000):
+        ticks = np.full(FEW_SYNCS, 5)
+        hearing.record_came(TickTimes(frozen_ints(ticks), frozen_ints(late_ns + np.arange(FEW_SYNCS))), 0.5)
+    assert hearing.sync_rate_hz(0.6) is None
+    assert not any(code == "SyncPeriodSuspect" for code, _ in hearing.troubles({}, 100.0))
 
 
 def test_a_drive_that_answers_but_does_not_sample_is_told_once_and_its_end_too(tmp_path: Path) -> None:

@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fdhil.daemon.outcome_json import as_document, set_document
+from fdhil.daemon.outcome_json import as_document
 from fdhil.daemon.outcome_store import OutcomeStore, raw_scales
 from fdhil.identification.pooling import member
 from fdhil.records import LoopEstimate, Notice, Outcome, Verdict, frozen
 from fdhil.store.history import FILE_NAME, History
+from fdhil.store.set_document import set_document
 from fdhil.store.windows import encode_window, list_windows
 from tests.daemon.machine import config_of
 from tests.store.made import BENCH, outcome, published, window

@@ -58,6 +58,10 @@ class SensorPeer:
         function, address, value = struct.unpack(">BHH", request[:5])
         if self.mode == "exception":
             return bytes([function | 0x80, 2])
+        if self.mode == "nonsense":
+            return bytes([0x1A, 1, 2])
+        if self.mode == "other function":
+            return struct.pack(">BB", function ^ 7, 2 * value) + bytes(2 * value)
         if self.mode == "busy":
             return bytes([function | 0x80, 6])
         if function == 6:

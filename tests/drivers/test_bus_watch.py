@@ -45,6 +45,16 @@ def test_a_simulated_machine_that_was_held_up_misses_nothing() -> None:
     assert grid.missed == 0
 
 
+@pytest.mark.fault("A6")
+def test_a_turn_whose_end_is_lost_again_and_again_is_no_shorter_one() -> None:
+    """Then every later row would be one too early."""
+    grid = SyncGrid(0.001)
+    heard = [k for k in range(1000) if k not in (239, 479, 718, 719)]
+    got = np.concatenate([grid.feed(frames_of(syncs([k]))).syncs.tick for k in heard])
+    assert got.tolist() == heard
+    assert grid.missed == 4
+
+
 @pytest.mark.fault("A11", "A12")
 def test_duplicates_and_reordered_syncs_are_put_aside() -> None:
     grid = SyncGrid(0.001)

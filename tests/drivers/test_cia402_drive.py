@@ -117,6 +117,24 @@ def test_a_lost_sync_is_no_lost_pdo_wherever_the_blocks_part() -> None:
         assert decoder.counters()["pdo_lost"] == 0, cut
 
 
+def test_a_target_that_stands_still_is_not_lost_with_a_sync() -> None:
+    wire = Wire(n=60)
+    wire.reference = {k: min(k, 30) for k in wire.reference}
+    rows = [row for row in wire.rows() if row != wire.sync(40)]
+    got, _, decoder = decode_all([frames_of(rows)])
+    check_rows(wire, got)
+    assert (decoder.counters()["sync_missed"], decoder.counters()["pdo_lost"]) == (1, 0)
+
+
+def test_a_frame_that_is_left_beside_a_lost_sync_is_not_taken_for_another_rows() -> None:
+    """SYNC 30 and the TPDO of tick 29 are lost: what came after SYNC 29 is of tick 30."""
+    wire = Wire(n=60)
+    lost = (wire.sync(30), *wire.tpdos(29)[:2])
+    got, _, decoder = decode_all([frames_of([row for row in wire.rows() if row not in lost])])
+    check_rows(wire, got)
+    assert (decoder.counters()["sync_missed"], decoder.counters()["pdo_lost"]) == (1, 2)
+
+
 def test_a_lost_target_is_a_hole_where_it_mattered() -> None:
     wire = Wire(n=60)
     frames = wire.frames()
@@ -138,6 +156,27 @@ def test_a_duplicate_is_no_second_sample() -> None:
     counted = decoder.counters()
     assert counted["pdo_duplicates"] + counted["sync_duplicates"] <= 2
     assert got["tick"].tolist() == list(range(2, 58))
+
+
+@pytest.mark.fault("A13")
+@pytest.mark.parametrize("still", [False, True])
+def test_a_frame_that_comes_after_the_next_sync_is_told_and_its_rows_are_holes(still: bool) -> None:
+    """``still``: it is equal to the next one, so that one is as good as it."""
+    wire = Wire(n=60)
+    rows = wire.rows()
+    mine = [i for i, row in enumerate(rows) if row[1] == 0x181]
+    late = rows[mine[30]]
+    if still:
+        late = rows[mine[30]] = (late[0], late[1], rows[mine[31]][2])
+    moved = [*rows[: mine[30]], *rows[mine[30] + 1 : mine[31]], late, *rows[mine[31] :]]
+    for cut in (0, mine[30], mine[31], mine[31] + 1):
+        got, notices, decoder = decode_all([frames_of(moved[:cut]), frames_of(moved[cut:])])
+        check_rows(wire, got)
+        holes = set(range(2, 58)) - set(got["tick"].tolist())
+        assert holes == ({30} if still else {30, 31}), cut
+        counted = decoder.counters()
+        assert (counted["pdo_late"], counted["pdo_lost"]) == (1, 0), cut
+        assert [notice.code for notice in notices] == ["LateFrame"], cut
 
 
 @pytest.mark.fault("A15", "A16")

@@ -191,6 +191,7 @@ async def test_a_thermometer_that_tells_lines(tmp_path: Path) -> None:
 BLOCK = {"samples": 20, "counter_address": 40}
 
 
+@pytest.mark.fault("B9")
 @pytest.mark.parametrize(
     "block",
     [

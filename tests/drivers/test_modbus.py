@@ -80,6 +80,8 @@ async def test_a_sensor_that_stands_still_is_noticed_once() -> None:
         ("exception", ProtocolError, "illegal register address"),
         ("busy", ProtocolError, "busy"),
         ("short", DeviceError, ""),
+        ("nonsense", ProtocolError, "what came is no answer of Modbus TCP"),
+        ("other function", ProtocolError, "function 1 is answered where 6 was asked"),
         ("nan", ProtocolError, "sample rate of nan Hz"),
         ("too many", ProtocolError, "101 samples"),
         ("hang up", DeviceError, ""),
@@ -230,6 +232,29 @@ def test_samples_that_come_again_are_taken_once() -> None:
                 taken += record.counter.tolist()
     assert taken == [*range(60), *range(100, 140), *range(10)]
     assert (sensor.samples, sensor.lost) == (110, 40)
+
+
+@pytest.mark.fault("B9")
+@pytest.mark.parametrize("tear", [-65536, 65536])
+@pytest.mark.parametrize("lasting", [False, True])
+def test_a_count_of_two_moments_is_left_out_once_and_believed_when_it_stays(tear: int, lasting: bool) -> None:
+    sensor, ticks = ModbusVoltage("X", config(1)), TickClock(0.001)
+    taken: list[int] = []
+    told: list[str] = []
+    for poll in range(6):
+        newest = 200_039 + 40 * poll + (tear if poll == 3 or (lasting and poll > 3) else 0)
+        block = SensorBlock(newest, 1000.0, np.nan, False, newest - 99, np.zeros(100), 0.0)
+        for record in sensor.accept(block, poll * 40_000_000, poll * 40_000_000 + 200_000, ticks):
+            if isinstance(record, VoltageSamples):
+                taken += record.counter.tolist()
+            elif isinstance(record, Notice):
+                told.append(record.code)
+    assert told[0] == "RegisterTear"
+    assert told.count("RegisterTear") == 1
+    if not lasting:
+        assert np.all(np.diff(taken) == 1)
+        assert sensor.lost == 0
+    assert taken[-1] == newest
 
 
 def test_late_stamps_of_sync_do_not_move_the_samples() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from fdhil.drivers.can import sdo
 from fdhil.drivers.can.sdo import SdoLink
-from fdhil.errors import DeviceTimeout, ProtocolError, SdoAbort
+from fdhil.errors import ProtocolError, SdoAbort, SdoTimeout, SdoToggle, SdoTooLarge
 
 
 class SlowNode:
@@ -45,7 +45,7 @@ def test_the_roll_back_is_not_spoilt_by_a_late_answer(monkeypatch: pytest.Monkey
     link = SdoLink("drive X", 1, node.send)
     node.link = link
     monkeypatch.setattr(sdo, "QUIET_S", 0.0)
-    with pytest.raises(DeviceTimeout):
+    with pytest.raises(SdoTimeout):
         link.read_int(0x1016, 1)
     monkeypatch.setattr("fdhil.drivers.can.sdo.time.sleep", node.arrive)
     assert link.read_int(0x60B0) == 7
@@ -86,20 +86,20 @@ class SegmentedNode:
 
 @pytest.mark.fault("A27")
 @pytest.mark.parametrize(
-    ("node", "says", "code"),
+    ("node", "says", "code", "error"),
     [
-        (SegmentedNode(toggles=False), "was answered wrongly .*toggle", 0x05030000),
-        (SegmentedNode(toggles=True), "is longer than 65536 bytes", 0x05040005),
-        (SegmentedNode(toggles=True, declares=1 << 30), "is longer than 65536 bytes", 0x05040005),
+        (SegmentedNode(toggles=False), "was answered wrongly .*toggle", 0x05030000, SdoToggle),
+        (SegmentedNode(toggles=True), "is longer than 65536 bytes", 0x05040005, SdoTooLarge),
+        (SegmentedNode(toggles=True, declares=1 << 30), "is longer than 65536 bytes", 0x05040005, SdoTooLarge),
     ],
     ids=["toggle", "endless", "declares too much"],
 )
 def test_segments_that_are_wrong_or_without_end_are_aborted(
-    node: SegmentedNode, says: str, code: int, monkeypatch: pytest.MonkeyPatch
+    node: SegmentedNode, says: str, code: int, error: type[ProtocolError], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sdo, "QUIET_S", 0.0)
     node.link = SdoLink("drive X", 1, node.send, patience=100.0)
-    with pytest.raises(ProtocolError, match=f"(?i){says}"):
+    with pytest.raises(error, match=f"(?i){says}"):
         node.link.read(0x1008)
     assert set(node.aborts) == {code}
     assert node.segments <= 65536 // 7 + 2
@@ -110,7 +110,7 @@ def test_segments_that_take_too_long_are_aborted(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(sdo, "DEADLINE_S", 0.0)
     node = SegmentedNode(toggles=True)
     node.link = SdoLink("drive X", 1, node.send)
-    with pytest.raises(ProtocolError, match="was not finished after 0 s"):
+    with pytest.raises(SdoTooLarge, match="was not finished after 0 s"):
         node.link.read(0x1008)
     assert node.aborts == [0x05040000]
 

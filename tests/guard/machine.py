@@ -196,6 +196,10 @@ class Bench:
     def hear(self, cob_id: int, data: bytes) -> None:
         self.listener.take(cob_id, data, self.tick * 1e-3)
 
+    def to_zero(self, since_tick: int) -> int:
+        """How many SYNC after ``since_tick`` the first frames with zero on every axis left, by the bus trace alone."""
+        return next(tick for tick, offsets in self.frames if tick > since_tick and not any(offsets)) - since_tick
+
     def inject(self, cob_id: int, data: bytes) -> None:
         """Another node's frame on the bus, an offset by PDO or SDO included: the drives take it as the guard's."""
         self.hear(cob_id, data)

@@ -6,13 +6,14 @@ import select
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from fdhil.config import CanBus
 from fdhil.guard.transmit_socket import connect_bus, greet
 from tests.bench import bench_toml
-from tests.guard.machine import Drive, Frame
+from tests.guard.machine import DEMAND_AT_REST, Drive, Frame
 
 ANSWER_S = 0.3
 NEVER = 1 << 30
@@ -38,7 +39,8 @@ class Peer(threading.Thread):
     Each cycle: SYNC, the drives' TPDOs, then the NC's targets; while ``lockstep`` the next SYNC waits for the offset
     frames of a guard that sent some in the cycle before: briefly after a zero, long while an offset is in force, and no
     longer once a test says that they are not ``expected``. ``row`` runs over ``demand`` while ``playing``, slowly from
-    ``slow_from``, so that a test on a busy host still meets the path where it wants to.
+    ``slow_from``, so that a test on a busy host still meets the path where it wants to. ``at_row`` are frames of
+    another node that come once, with the TPDOs of that row; ``rows_at`` tells the row of each SYNC.
     """
 
     def __init__(self, demand: list[list[int]], period_s: float = 0.001) -> None:
@@ -49,6 +51,8 @@ class Peer(threading.Thread):
         self.latched: list[tuple[int, tuple[int, ...], tuple[int, ...]]] = []
         self.tick = self.row = 0
         self.playing = False
+        self.at_row: dict[int, Frame] = {}
+        self.rows_at: dict[int, int] = {}
         self.pause_s = 0.0
         self.slow_from = NEVER
         self.lockstep = self.syncing = self.expected = True
@@ -117,6 +121,9 @@ class Peer(threading.Thread):
         for drive, target in zip(self.drives, targets, strict=True):
             drive.received_target = target
             streamed.append((0x200 + drive.node_id, b"\x0f\x00" + target.to_bytes(4, "little", signed=True)))
+        self.rows_at[self.tick] = self.row
+        if self.row in self.at_row:
+            sampled.append(self.at_row.pop(self.row))
         self.row += self.playing
         sync = (0x080, bytes([(self.tick - 1) % 240 + 1]))
         self._transmit(encode([sync, *sampled, *streamed]))
@@ -172,6 +179,16 @@ class Peer(threading.Thread):
         while not condition():
             assert time.monotonic() < deadline_s, f"{what} did not come about"
             time.sleep(0.002)
+
+
+@contextmanager
+def at_rest() -> Iterator[Peer]:
+    """Let a machine that stands be there until the block is left."""
+    peer = Peer(DEMAND_AT_REST)
+    peer.start()
+    yield peer
+    peer.ended.set()
+    peer.join()
 
 
 def write_config(folder: Path, port: int, clock: str = "sync", axes: str = "XY", corrected: bool = True) -> Path:

@@ -15,11 +15,13 @@ from typing import Any
 from fdhil.guard import table
 from fdhil.guard.can_socket import BusDown, CanSocket, Frame
 from fdhil.guard.journal import Journal, Notifier
+from fdhil.guard.peers import Peer, Role
 from fdhil.guard.process import Guard
 from fdhil.guard.settings import Settings
 from tests.guard.machine import DIGEST, FACTS_GIVEN, Drive, commissioned, settings, smooth_path
 
 TOKEN = "the operator's"
+OWNER = Peer(os.getuid(), os.getpid(), Role.COMMISSION)
 DEMAND, OFFSET = smooth_path()
 
 

@@ -59,11 +59,11 @@ def codes(refused: tuple[Alarm, ...] | None) -> set[str]:
 @pytest.mark.fault("E13")
 def test_a_believed_offset_is_ramped_from_its_value() -> None:
     machine = holding(-500, 819)
-    assert may_stand(machine.state, machine.settings) == (None, None)
+    assert may_stand(machine.state) == (None, None)
     machine.until(Mode.ADOPT)
     assert machine.tick > 20  # three TPDOs, not one
     machine.until(Mode.OFF)
-    assert may_stand(machine.state, machine.settings) == (0, 0)
+    assert may_stand(machine.state) == (0, 0)
     assert [drive.offset for drive in machine.drives] == [0, 0]
     assert largest_step(machine, 0) <= machine.settings.axes[0].limits.hard_rate
 
@@ -85,7 +85,7 @@ def test_what_may_not_be_believed_is_frozen_and_told(machine: Bench, told: str) 
     assert machine.state.cause is not None
     assert machine.state.cause.code == "OffsetDoubtful"
     assert told in machine.state.cause.sentence()
-    assert may_stand(machine.state, machine.settings) == tuple(drive.offset for drive in machine.drives)
+    assert may_stand(machine.state) == tuple(drive.offset for drive in machine.drives)
     assert codes(machine.sync(ADOPT).refused) & {"OffsetDoubtful", "NotCommissioned", "RecordVoid"}
     assert "NotOff" in codes(machine.sync(arm_request()).refused)
 
@@ -126,7 +126,7 @@ def test_another_node_in_step_with_the_drive_is_not_believed(phase: int) -> None
         if machine.tick % 10 == phase:
             machine.hear(0x381, struct.pack("<ii", 500, 500))
     assert machine.frames == []
-    assert may_stand(machine.state, machine.settings)[0] != 500
+    assert may_stand(machine.state)[0] != 500
 
 
 def test_an_offset_that_is_never_shown_alike_is_frozen() -> None:
@@ -138,13 +138,27 @@ def test_an_offset_that_is_never_shown_alike_is_frozen() -> None:
     assert machine.frames == []
 
 
+def test_a_drive_that_boots_at_rest_is_read_anew() -> None:
+    """What it held before says nothing: it is known again after three readings, and until then nothing is armed."""
+    machine = bench()
+    machine.settle()
+    while machine.tick % 10 != 3:
+        machine.sync()
+    machine.reboot(0)
+    machine.sync()
+    assert may_stand(machine.state) == (None, None)
+    assert "ReadBackStale" in codes(machine.arm())
+    machine.run(30)
+    assert may_stand(machine.state) == (0, 0)
+
+
 def test_nothing_is_armed_while_the_read_back_is_silent() -> None:
     """A restart with -91.6 um in the drive and its TPDO3 gone: unknown refuses."""
     machine = holding(-300, 0)
     for _ in range(300):
         machine.sync(drop=(0x381,))
     assert machine.mode is Mode.OFF
-    assert may_stand(machine.state, machine.settings) == (None, 0)
+    assert may_stand(machine.state) == (None, 0)
     assert "ReadBackStale" in codes(machine.sync(arm_request(), drop=(0x381,)).refused)
     assert "OffsetDoubtful" in codes(machine.sync(ADOPT, drop=(0x381,)).refused)
     assert machine.frames == []
@@ -175,7 +189,7 @@ def test_a_read_back_that_stops_ends_the_correction() -> None:
     assert machine.frames[-1][1] == (0, 0)
     assert len(machine.frames) > frames + 50
     assert largest_step(machine, begin) <= machine.settings.axes[0].limits.hard_rate
-    assert may_stand(machine.state, machine.settings) == (None, 0)
+    assert may_stand(machine.state) == (None, 0)
 
 
 def test_one_lost_read_back_is_forgiven() -> None:
@@ -207,11 +221,29 @@ def test_after_a_foreign_offset_the_ramp_starts_from_what_is_measured(
     machine.sync()
     begin = len(machine.held)
     assert machine.mode is Mode.RAMP_DOWN
-    assert may_stand(machine.state, machine.settings) == (None, None)
+    assert may_stand(machine.state) == (None, None)
     machine.run(19)
     assert len(machine.frames) == frames  # nothing until it is known
     machine.until(Mode.OFF, 200)
     assert [alarm.code for alarm in machine.alarms] == ["OffsetHijack"] * len(machine.alarms)
+    assert largest_step(machine, begin) <= machine.settings.axes[0].limits.hard_rate
+    assert machine.held[-1] == (0, 0)
+
+
+@pytest.mark.parametrize("mode", [Mode.ADOPT, Mode.RAMP_DOWN])
+@pytest.mark.fault("A19")
+def test_a_foreign_offset_while_it_lands_is_measured_and_landed_from_there(mode: Mode) -> None:
+    machine = holding(600, 0) if mode is Mode.ADOPT else active()
+    if mode is Mode.RAMP_DOWN:
+        machine.sync(Request("disarm"))
+    machine.until(mode)
+    foreign_frame(machine, 300)
+    machine.sync()
+    begin = len(machine.held)
+    assert (machine.mode, machine.state.measuring) == (Mode.RAMP_DOWN, 2)
+    assert machine.state.cause is not None
+    assert machine.state.cause.code == "OffsetHijack"
+    machine.until(Mode.OFF, 200)
     assert largest_step(machine, begin) <= machine.settings.axes[0].limits.hard_rate
     assert machine.held[-1] == (0, 0)
 
@@ -224,7 +256,7 @@ def test_a_foreign_offset_beyond_the_ceiling_freezes() -> None:
     machine.run(100)
     assert machine.mode is Mode.FROZEN
     assert len(machine.frames) == frames
-    assert may_stand(machine.state, machine.settings)[0] == 2000
+    assert may_stand(machine.state)[0] == 2000
     assert machine.state.cause is not None
     assert machine.state.cause.detail.startswith("610.4 um may still be applied")
 
@@ -280,11 +312,11 @@ def test_no_frame_is_beyond_the_compiled_ceiling(monkeypatch: pytest.MonkeyPatch
 
 def test_what_may_stand_while_it_sends_is_what_was_sent_or_shown() -> None:
     machine = active()
-    assert may_stand(machine.state, machine.settings) == machine.frames[-1][1]
+    assert may_stand(machine.state) == machine.frames[-1][1]
     machine.drives[0].scale = 0.5
     while not machine.state.axes[0].echo_misses:
         machine.sync()
-    told = may_stand(machine.state, machine.settings)
+    told = may_stand(machine.state)
     assert told[0] == machine.state.axes[0].read_back != machine.frames[-1][1][0]
 
 
@@ -296,10 +328,10 @@ def test_a_zero_that_was_shown_at_the_end_stays_known() -> None:
     for drive in machine.drives:
         drive.answers = False
     machine.run(50)
-    assert may_stand(machine.state, machine.settings) == (0, 0)
+    assert may_stand(machine.state) == (0, 0)
     machine.inject(0x302, struct.pack("<i", 300))
     machine.sync()
-    assert may_stand(machine.state, machine.settings) == (None, None)
+    assert may_stand(machine.state) == (None, None)
 
 
 # --- out of FROZEN ---
@@ -310,14 +342,14 @@ def test_adopt_leads_out_of_frozen_once_the_drives_were_read() -> None:
     machine.listener.error("off")
     machine.sync()
     begin = len(machine.held)
-    assert may_stand(machine.state, machine.settings)[0] == machine.frames[-1][1][0]
+    assert may_stand(machine.state)[0] == machine.frames[-1][1][0]
     machine.listener.error("active")
     assert "OffsetDoubtful" in codes(machine.sync(ADOPT).refused)
     machine.run(35)
-    assert may_stand(machine.state, machine.settings) == machine.held[-1]
+    assert may_stand(machine.state) == machine.held[-1]
     assert machine.sync(ADOPT).refused == ()
     machine.until(Mode.OFF)
-    assert may_stand(machine.state, machine.settings) == (0, 0)
+    assert may_stand(machine.state) == (0, 0)
     assert largest_step(machine, begin) <= machine.settings.axes[0].limits.hard_rate
 
 
@@ -333,7 +365,7 @@ def test_adopt_of_nothing_is_off_without_a_frame() -> None:
     assert machine.sync(ADOPT).refused == ()
     assert machine.state.mode is Mode.OFF
     assert machine.frames == []
-    assert may_stand(machine.state, machine.settings) == (0, 0)
+    assert may_stand(machine.state) == (0, 0)
 
 
 # --- what voids a record ---

@@ -142,6 +142,13 @@ def test_the_axis_own_speed_and_the_scale_bound_it_too() -> None:
             from_json(altered(**changes))
 
 
+@pytest.mark.parametrize("travel", [None, [-5000, 700_000]])
+def test_the_travel_of_an_axis_is_read_as_it_was_written(travel: list[int] | None) -> None:
+    document = json.loads(to_json(made_settings()))
+    document["axes"][0]["travel"] = travel
+    assert from_json(json.dumps(document)).axes[0].travel == (travel and tuple(travel))
+
+
 @pytest.mark.fault("G11")
 def test_no_value_of_any_kind_in_any_field_is_anything_but_a_refusal() -> None:
     """Every key of the file, at every depth, given what does not belong there."""

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 
+from fdhil.guard.interlocks import Alarm
+from fdhil.guard.path import CorrectedPath
 from fdhil.guard.protocol import Mode
-from fdhil.guard.state import Request
-from tests.guard.machine import Bench, bench, ramp_cycles
+from fdhil.guard.state import Inputs, Request
+from fdhil.guard.transitions import ZEROS
+from tests.guard.machine import DIGEST, Bench, bench, ramp_cycles
 
 
 @pytest.fixture
@@ -55,10 +60,76 @@ def test_path_end_ramps_to_zero_and_off(armed: Bench) -> None:
     armed.until(Mode.ACTIVE)
     armed.until(Mode.OFF)
     assert armed.alarms[-1].code == "Finished"
+    assert armed.state.places == ()
     assert armed.offsets == (0, 0)
     count = len(armed.frames)
     armed.run(50)
     assert len(armed.frames) == count
+
+
+def test_the_last_row_is_sent_and_the_ramp_begins_behind_it(armed: Bench) -> None:
+    """A table that ends while its offset rises: the last row leaves, at its own cycle, then the way to zero begins."""
+    path = armed.path
+    assert path is not None
+    demand, offset = (tuple(column[:200] for column in columns) for columns in (path.demand, path.offset))
+    assert offset[0][-1] > offset[0][-2]
+    armed.path = CorrectedPath(0, demand, offset, True, DIGEST, 1)
+    armed.run(30)
+    armed.play()
+    armed.until(Mode.RAMP_DOWN)
+    sent = {tick: offsets[0] for tick, offsets in armed.frames}
+    assert sent[armed.tick - 1] == offset[0][-1]
+    assert sent[armed.tick] != offset[0][-1]
+    assert armed.drives[0].target == demand[0][-1]
+
+
+def test_what_ended_it_is_told_once_and_by_its_own_name(armed: Bench) -> None:
+    """A change of the state is told in the cycle in which it happens, with its cause; otherwise nothing is."""
+    for kind, code in (("stop", "Stopped"), ("disarm", "Disarmed")):
+        machine = copy.deepcopy(armed)
+        told = [machine.sync().transition for _ in range(5)]
+        assert told == [None] * 5
+        assert machine.sync(Request("stop" if kind == "stop" else "disarm")).transition == (
+            *(Mode.ARMED, Mode.RAMP_DOWN),
+            Alarm(code),
+        )
+        machine.until(Mode.OFF)
+        assert machine.state.cause == Alarm(code)
+        assert machine.state.places == ()
+        assert machine.arm() == ()
+        assert machine.state.cause is None
+
+
+def test_each_landing_sends_its_own_zeros(armed: Bench) -> None:
+    """What the landing before sent does not count: whoever is armed again and disarmed lands anew."""
+    for _ in range(2):
+        armed.run(25)
+        before = len(armed.frames)
+        armed.sync(Request("disarm"))
+        armed.until(Mode.OFF)
+        assert len(armed.frames) - before == ZEROS + 1
+        armed.settle(5)
+        assert armed.arm() == ()
+
+
+def test_how_far_it_has_settled_is_told() -> None:
+    machine = bench()
+    machine.settle(30)
+    machine.drives[0].mode = 1
+    machine.settle(11)
+    machine.drives[0].mode = 8
+    while machine.state.good_for == 0:
+        machine.sync()
+    machine.run(9)
+    (refused,) = machine.arm()
+    assert refused == Alarm("NotSettled", detail="11 so far")
+
+
+def test_the_first_withdrawn_fact_is_the_cause(armed: Bench) -> None:
+    axes, bus = armed.listener.at_sync(bytes([armed.counter + 1]), (armed.tick + 1) * 1e-3, (armed.tick + 1) * 1e-3)
+    withdrawn = (Alarm("ModelStale"), Alarm("PoorSkill"))
+    armed.step(Inputs(True, axes, bus, withdrawn=withdrawn, path=armed.path))
+    assert (armed.mode, armed.state.cause) == (Mode.RAMP_DOWN, Alarm("ModelStale"))
 
 
 @pytest.mark.fault("E18")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from fdhil.guard import core
+from fdhil.guard.conditions import known
 from fdhil.guard.interlocks import Alarm
 from fdhil.guard.path import CorrectedPath, rate_between
 from fdhil.guard.plausibility import observe
@@ -185,6 +186,14 @@ def test_unconfirmed_zeros_freeze_after_fifty() -> None:
     sent = [offsets for _, offsets in machine.frames]
     zeros = next(k for k, offsets in enumerate(reversed(sent)) if offsets != (0, 0))
     assert zeros == 52  # the first of them came in motion
+    assert machine.state.cause == Alarm("EchoMismatch", detail="no zero was read back")
+
+
+def test_a_landing_that_one_reading_confirmed_is_known_to_be_at_zero() -> None:
+    machine = active()
+    machine.sync(Request("disarm"))
+    machine.until(Mode.OFF)
+    assert [known(axis) for axis in machine.state.axes] == [0, 0]
 
 
 def test_a_frame_that_did_not_leave_changes_nothing() -> None:
@@ -208,13 +217,28 @@ def test_a_hold_lasts_ten_cycles_each_time_anew() -> None:
             machine.row += 1
         machine.sync()
         assert machine.state.mode is Mode.HOLD
+        assert machine.state.cause == Alarm("TargetLost", "X")
         machine.until(Mode.ACTIVE, 20)
+        assert machine.state.cause is None
     for _ in range(11):
         machine.sync(nc=False)
         machine.row += 1
     assert machine.state.mode is Mode.HOLD
     assert machine.until(Mode.RAMP_DOWN) == 1
     assert machine.alarms[-1].code == "TargetLost"
+
+
+def test_one_good_cycle_between_two_gaps_is_enough() -> None:
+    """What was found again may be lost again for as long: the gaps do not add up."""
+    machine = active()
+    for _ in range(4):
+        for _ in range(10):  # the first of them latches what was streamed before: it is the good one
+            machine.sync(nc=False)
+            machine.row += 1
+        machine.sync()
+        assert machine.mode is Mode.HOLD
+    machine.until(Mode.ACTIVE, 20)
+    assert {alarm.code for alarm in machine.alarms} == {"TargetLost"}
 
 
 def test_a_gap_before_the_start_holds_nothing_and_ends_after_ten_cycles() -> None:

@@ -15,6 +15,7 @@ from fdhil.guard.protocol import Mode
 from fdhil.guard.settings import to_json
 from tests.guard.machine import FACTS_GIVEN, Bench, arm_request, bench
 from tests.guard.shop import TOKEN, Shop
+from tests.guard.test_faults import Tell
 
 
 def cutting(machine: Bench) -> Bench:
@@ -29,10 +30,11 @@ def cutting(machine: Bench) -> Bench:
     return machine
 
 
-def ends_at_zero_by(machine: Bench, code: str) -> None:
+def ends_at_zero_by(machine: Bench, code: str, since_tick: int, tell: Tell) -> None:
     """Check the class of what ended it, and that it went to zero by ramp and stays off."""
     assert machine.alarms[-1].code == code
     machine.until(Mode.OFF)
+    tell("sync_to_zero", machine.to_zero(since_tick))
     assert [drive.offset for drive in machine.drives] == [0, 0]
     sent = [offsets[0] for _, offsets in machine.frames]
     assert max(abs(b - a) for a, b in itertools.pairwise(sent)) <= machine.settings.axes[0].limits.hard_rate
@@ -41,16 +43,17 @@ def ends_at_zero_by(machine: Bench, code: str) -> None:
 
 
 @pytest.mark.fault("A18")
-def test_a_foreign_node_with_the_drives_id_ends_it() -> None:
+def test_a_foreign_node_with_the_drives_id_ends_it(record_property: Tell) -> None:
     machine = cutting(bench())
+    since = machine.tick
     while machine.mode is Mode.ACTIVE:
         machine.hear(0x281, struct.pack("<Hhh", 0x1237, 0, 7))
         machine.sync()
-    ends_at_zero_by(machine, "ForeignProducer")
+    ends_at_zero_by(machine, "ForeignProducer", since, record_property)
 
 
 @pytest.mark.fault("A22")
-def test_a_heartbeat_that_stops_ends_it() -> None:
+def test_a_heartbeat_that_stops_ends_it(record_property: Tell) -> None:
     machine = bench()
     watched = tuple(replace(axis, heartbeat_timeout_s=0.1) for axis in machine.settings.axes)
     machine.settings = machine.listener.settings = replace(machine.settings, axes=watched)
@@ -68,10 +71,12 @@ def test_a_heartbeat_that_stops_ends_it() -> None:
         beat()
         machine.sync()
     machine.alarms.clear()
+    since = machine.tick
     for _ in range(110):
         machine.sync()
     assert machine.alarms[0].code == "HeartbeatLost"
     machine.until(Mode.OFF)
+    record_property("sync_to_zero", machine.to_zero(since))
     assert [drive.offset for drive in machine.drives] == [0, 0]
 
 
@@ -121,7 +126,7 @@ class LateSync(Bench):
 
 
 @pytest.mark.fault("A8")
-def test_a_sync_that_is_late_once_is_held_and_another_period_ends_it() -> None:
+def test_a_sync_that_is_late_once_is_held_and_another_period_ends_it(record_property: Tell) -> None:
     made = bench(clock="monotonic")
     machine = LateSync(made.settings, made.path, made.demand)
     machine.delay()
@@ -130,15 +135,17 @@ def test_a_sync_that_is_late_once_is_held_and_another_period_ends_it() -> None:
     machine.sync()
     assert machine.mode is Mode.HOLD
     machine.until(Mode.ACTIVE, 40)
+    since = machine.tick
     for _ in range(60):
         machine.late_s += 0.00005  # 5 percent of the period with each
         machine.sync()
     assert machine.state.cause is not None
     assert machine.state.cause.code == "SyncJitter"
-    ends_at_zero_by(machine, "SyncJitter")
+    ends_at_zero_by(machine, "SyncJitter", since, record_property)
 
 
 @pytest.mark.fault("G10")
+@pytest.mark.goal("R16")
 def test_the_operators_token_is_in_nothing_that_is_written(tmp_path: Path) -> None:
     """Neither in the settings, the journal, the status, nor in any answer, right or wrong."""
     shop = Shop(tmp_path)

@@ -17,6 +17,7 @@ from fdhil.guard.state import Request
 from tests.guard.machine import DIGEST, RECORD, Bench, Drive, bench, ramp_cycles
 
 Fault = Callable[[Bench], None]
+Tell = Callable[[str, object], None]
 
 
 def _drive(**changes: object) -> Fault:
@@ -120,9 +121,9 @@ def cutting(prepared: Bench) -> Bench:
 
 @pytest.mark.parametrize("row", RAMPED)
 @pytest.mark.fault("A2", "A6", "A9", "A10", "A15", "A20", "E6", "E9", "E10", "E11", "E12", "E15", "F8", "F15")
-def test_fault_ramps_down_in_time(cutting: Bench, row: str) -> None:
+def test_fault_ramps_down_in_time(cutting: Bench, row: str, record_property: Tell) -> None:
     fault, code, detected = RAMPED[row]
-    limits = cutting.settings.axes[0].limits
+    limits, since = cutting.settings.axes[0].limits, cutting.tick
     fault(cutting)
     for _ in range(detected):
         assert cutting.mode in ON_PATH
@@ -138,6 +139,7 @@ def test_fault_ramps_down_in_time(cutting: Bench, row: str) -> None:
         taken += 1
         assert taken <= rising or max(map(abs, cutting.offsets)) <= before
     assert taken <= ramp_cycles(limits, peak)
+    record_property("sync_to_zero", cutting.to_zero(since))
     cutting.drives = [Drive(d.node_id, queue=d.queue, offset=d.offset) for d in cutting.drives]
     cutting.until(Mode.OFF)
     assert cutting.state.cause is not None
@@ -194,7 +196,7 @@ def test_silence_freezes_a_synchronous_offset(cutting: Bench) -> None:
 
 
 @pytest.mark.fault("A7")
-def test_silence_ramps_an_event_driven_offset() -> None:
+def test_silence_ramps_an_event_driven_offset(record_property: Tell) -> None:
     machine = bench(offset_synchronous=False)
     machine.settle()
     assert machine.arm() == ()
@@ -205,6 +207,8 @@ def test_silence_ramps_an_event_driven_offset() -> None:
     count = len(machine.frames)
     for _ in range(60):
         machine.silence()
+    ramp = [any(offsets) for _, offsets in machine.frames[count:]]
+    record_property("sync_to_zero", 1 + ramp.index(False))  # the steps of the local timer, one a period
     assert machine.state.cause is not None
     assert machine.state.cause.code == "SyncLost"
     assert machine.offsets == (0, 0)
@@ -274,7 +278,9 @@ def test_feed_hold_does_not_last_for_ever() -> None:
 @pytest.mark.parametrize("late", [1, 3, 10])
 def test_missed_cycles_are_counted_and_made_up(cutting: Bench, late: int) -> None:
     for _ in range(late):
+        sent = [axis.sent for axis in cutting.state.axes]
         assert cutting.sync(late=True).offsets is None
+        assert [axis.sent for axis in cutting.state.axes] == [(last[0], *last[:-1]) for last in sent]
     cutting.run(25)
     assert cutting.mode is Mode.ACTIVE
     assert cutting.state.missed == late
@@ -310,7 +316,9 @@ def test_on_a_real_machine_a_late_loop_is_told_before_it_is_armed() -> None:
     assert (machine.state.missed_run, machine.state.good_for) == (11, 0)
 
 
-@pytest.mark.parametrize(("failures", "mode"), [(1, Mode.ACTIVE), (3, Mode.OFF), (6, Mode.FROZEN)])
+@pytest.mark.parametrize(
+    ("failures", "mode"), [(1, Mode.ACTIVE), (2, Mode.ACTIVE), (3, Mode.OFF), (5, Mode.OFF), (6, Mode.FROZEN)]
+)
 @pytest.mark.fault("A5")
 def test_full_transmit_queue(cutting: Bench, failures: int, mode: Mode) -> None:
     for _ in range(failures):
@@ -380,19 +388,22 @@ def test_table_that_breaks_a_limit_at_run_time_is_left(row: int, value: int, cod
     machine.play()
     machine.until(Mode.ACTIVE)
     machine.until(Mode.OFF)
-    assert machine.alarms[-1].code == code
+    assert machine.alarms[-1] == Alarm(code, "X")
     sent = [offsets[0] for _, offsets in machine.frames]
     limits = machine.settings.axes[0].limits
     assert max(abs(b - a) for a, b in itertools.pairwise(sent)) <= limits.hard_rate
 
 
 @pytest.mark.fault("E5")
-def test_table_that_is_swapped_for_another_program_is_left(cutting: Bench) -> None:
+def test_table_that_is_swapped_for_another_program_is_left(cutting: Bench, record_property: Tell) -> None:
     assert cutting.path is not None
+    since = cutting.tick
     cutting.path = CorrectedPath(0, cutting.path.demand, cutting.path.offset, True, "other", 2)
     cutting.sync()
     assert cutting.mode is Mode.RAMP_DOWN
     assert cutting.alarms[-1].code == "ProgramMismatch"
+    cutting.until(Mode.OFF)
+    record_property("sync_to_zero", cutting.to_zero(since))
 
 
 def test_streamed_table_that_runs_dry_is_left_in_time(cutting: Bench) -> None:
@@ -401,6 +412,19 @@ def test_streamed_table_that_runs_dry_is_left_in_time(cutting: Bench) -> None:
     cutting.path = CorrectedPath(0, path.demand, path.offset, False, DIGEST, 2)
     cutting.sync()
     assert cutting.alarms[-1].code == "TableStarved"
+
+
+def test_a_second_of_rows_is_enough_one_less_is_not(cutting: Bench) -> None:
+    assert cutting.path is not None
+    path, row = cutting.path, cutting.state.places[0].row + 1
+    last = path.end - 1
+    for rows, mode in ((1000, Mode.ACTIVE), (999, Mode.RAMP_DOWN)):
+        machine = copy.deepcopy(cutting)
+        more = row + rows - path.end
+        demand, offset = ([[*c, *[c[last]] * more] for c in columns] for columns in (path.demand, path.offset))
+        machine.path = CorrectedPath(0, tuple(demand), tuple(offset), False, DIGEST, 2)
+        machine.sync()
+        assert machine.mode is mode, rows
 
 
 @pytest.mark.fault("E2")
@@ -416,7 +440,7 @@ def test_vibrating_table_is_left_by_its_total_variation() -> None:
     machine.run(30)
     machine.play()
     machine.until(Mode.RAMP_DOWN)
-    assert machine.alarms[-1].code == "OffsetEnergy"
+    assert machine.alarms[-1] == Alarm("OffsetEnergy", "X")
 
 
 @pytest.mark.parametrize("rate", [0.5, 0.9, 1.2])

@@ -8,11 +8,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdhil.guard.feedforward import Feed, FeedforwardLimits, Law, armed, end, hear, move, react, violates
+from fdhil.guard.feedforward import (
+    Feed,
+    FeedforwardLimits,
+    Law,
+    armed,
+    end,
+    hear,
+    move,
+    react,
+    violates,
+    zeroed,
+    zeroing,
+)
 from fdhil.guard.interlocks import Alarm
 from fdhil.guard.protocol import HOLD_CYCLES, FeedMode
 from fdhil.guard.requests import parse_law
-from fdhil.guard.transitions import ZEROS
+from fdhil.guard.transitions import ZEROS, ZEROS_UNCONFIRMED
 from tests.guard.fed import LAW, LIMITS, ONE
 
 
@@ -40,6 +52,13 @@ def test_at_rest_the_law_says_zero() -> None:
     """Weights count from the newest target: rounding of the weights cannot leave an offset on an axis at rest."""
     assert LAW.offsets([123_456] * 3) == (0, 0)
     assert LAW.offsets([10, 0, -10]) == (2000, -20 + 20 + 30)
+    assert LAW.offsets([-10, 0, 10]) == (-2000, 20 - 20 - 30)  # and dry friction acts in full, not more, either way
+
+
+def test_a_law_looks_as_far_back_as_its_longest_weights() -> None:
+    one, three = (1,), (1, 2, 3)
+    for speed, torque, pace in ((three, one, one), (one, three, one), (one, one, three)):
+        assert Law(speed, torque, pace, 0).depth == 4
 
 
 GOOD = {"speed": [1], "torque": [1], "pace": [1], "dry": 1}
@@ -89,6 +108,43 @@ def test_it_fades_in_cycle_by_cycle_and_out_the_same_way() -> None:
         feed = move(feed, [wide], 10)
         assert feed.mode is FeedMode.ENDING
     assert move(feed, [wide], 10).mode is FeedMode.OFF
+
+
+def test_before_it_acts_zeros_are_in_force() -> None:
+    """Of each axis: armed, as many cycles of them as are kept to compare with; and where a drive holds something."""
+    none = ((0, 0), (0, 0))
+    assert armed((LAW, LAW)).sent == (none,) * 4
+    assert zeroing(2, Alarm("StaleOffset")) == Feed(FeedMode.ZEROING, sent=(none,), cause=Alarm("StaleOffset"))
+    feed = armed((LAW, LAW))
+    for k in range(9):
+        feed = feed.send(((k, 0), (0, k)))
+    assert feed.sent == tuple([((k, 0), (0, k)) for k in (8, 7, 6, 5)])
+
+
+def test_what_did_not_leave_is_what_was_sent_before() -> None:
+    first, second, third = ((1, 1),), ((2, 2),), ((3, 3),)
+    assert Feed(sent=(third, second, first)).not_sent().sent == (second, second, first)
+    assert Feed(sent=(third, second)).not_sent().sent == (second, second)
+    assert Feed(sent=(third,)).not_sent().sent == (third,)
+
+
+def test_zeros_end_it_after_more_than_three_that_are_shown_or_fifty_that_are_not() -> None:
+    for confirmed, most in ((True, ZEROS), (False, ZEROS_UNCONFIRMED)):
+        feed = zeroing(1, Alarm("StaleOffset"))
+        for k in range(most):
+            feed = move(feed, [LIMITS], 10, confirmed)
+            assert (feed.mode, feed.zeros, feed.applied) == (FeedMode.ZEROING, k + 1, ((0, 0),))
+        feed = zeroed(feed, confirmed)
+        shown = Alarm("StaleOffset") if confirmed else Alarm("EchoMismatch", detail="no zero was read back")
+        assert (feed.mode, feed.cause) == (FeedMode.OFF, shown)
+
+
+def test_a_limit_that_takes_something_away_is_counted() -> None:
+    """What is just at the limit is not limited, and before all targets were heard nothing is."""
+    assert LAW.offsets((30, 20, 10)) == (2000, 30)
+    for speed, torque, counted in ((2000, 30, 0), (1999, 30, 1), (2000, 29, 1)):
+        assert move(fed(), [FeedforwardLimits(speed, speed, torque, torque)], 10).limited == counted
+    assert move(armed((LAW,)), [FeedforwardLimits(0, 0, 0, 0)], 10).limited == 0
 
 
 def test_nothing_but_zeros_until_every_target_was_heard() -> None:

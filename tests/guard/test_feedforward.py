@@ -15,15 +15,17 @@ import pytest
 from fdhil.guard import table
 from fdhil.guard.control import Client, Closer
 from fdhil.guard.feedforward import Pair, armed, violates
+from fdhil.guard.feeding import go_on
 from fdhil.guard.intake import Intake
 from fdhil.guard.interlocks import FEEDFORWARD_FACTS, Alarm
 from fdhil.guard.journal import Journal
 from fdhil.guard.protocol import FeedMode, Mode
 from fdhil.guard.settings import Pdo, from_json, to_json
-from fdhil.guard.state import Request, initial
+from fdhil.guard.state import AxisInput, BusView, Inputs, Output, Request, initial
 from tests.guard import machine
 from tests.guard.fed import FACTS, LAW, LIMITS, fed_bench, fed_settings, request, switched_on
 from tests.guard.machine import Bench, arm_request
+from tests.guard.shop import OWNER
 
 
 def test_it_is_mute_until_it_is_asked_for() -> None:
@@ -36,6 +38,7 @@ def test_it_is_mute_until_it_is_asked_for() -> None:
     assert all(output.feed is not None for output in bench.outputs[-150:])
     assert all(output.offsets is None for output in bench.outputs)
     assert any(any(pair) for pair in bench.outputs[-1].feed or ())
+    assert {later - sooner for sooner, later in pairwise(bench.heartbeats)} == {20}
     assert len(bench.heartbeats) >= 13
 
 
@@ -288,6 +291,32 @@ def test_a_corrupt_state_sends_zeros() -> None:
     assert bench.sync().feed == ((0, 0), (0, 0))
     bench.run(10)
     assert (bench.state.feed.mode, code_of(bench)) == (FeedMode.OFF, "InternalError")
+    cause = bench.state.feed.cause
+    assert cause is not None
+    assert cause.detail.startswith("feed-forward ((45000, 0), (0, 0)) -> ((4")
+
+
+def test_a_change_is_told_in_the_cycle_in_which_it_happens() -> None:
+    bench = switched_on()
+    bench.sync(Request("disarm"))
+    bench.run(120)
+    told = [output.feed_transition for output in bench.outputs if output.feed_transition is not None]
+    assert told == [(FeedMode.ENDING, FeedMode.OFF)]
+    bench = switched_on()
+    bench.silence()
+    assert bench.outputs[-1].feed_transition == (FeedMode.ON, FeedMode.ZEROING)
+
+
+@pytest.mark.parametrize("sync", [True, False])
+def test_where_nothing_can_be_sent_what_was_sent_last_stays_in_force(sync: bool) -> None:
+    """A late step counts as one more cycle of it, the local timer's as none."""
+    bench = switched_on()
+    before = bench.state.feed._replace(sent=tuple([((k, 0), (0, k)) for k in range(4)]))
+    bench.state = bench.state._replace(feed=before)
+    inputs = Inputs(sync, (AxisInput(target=1), AxisInput(target=2)), BusView(), late=sync)
+    state, output = go_on(bench.state, inputs, (), bench.settings, Output())
+    assert output == Output()
+    assert state.feed.sent == ((before.applied, *before.sent[:-1]) if sync else before.sent)
 
 
 def test_what_acts_cannot_be_adopted() -> None:
@@ -318,7 +347,7 @@ def _answer_to_a_table(folder: Path, mode: FeedMode) -> dict[str, Any]:
         state = state._replace(feed=armed((LAW, LAW))._replace(mode=mode))
         closer = Closer()
         sealed = table.seal(table.encode(list(zeros), zeros, zeros, "digest"))
-        intake.begin(Client(here, 0.0, closer, descriptor=sealed), {}, state)
+        intake.begin(Client(here, 0.0, closer, OWNER, descriptor=sealed), {}, state)
         intake.check(state)
         closer.end()
         return dict(json.loads(there.recv(10_000)))

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from fdhil.guard.limits import OffsetLimits, Travel, approach, brake, follow, stopping, violation
+from fdhil.guard.limits import OffsetLimits, Travel, approach, brake, ceiling, ceilings, follow, stopping, violation
 from fdhil.guard.table import check_rows
 from tests.guard.machine import ramp_cycles
 
@@ -24,6 +24,7 @@ def braking_way(rate: int, acceleration: int) -> int:
 @given(st.integers(0, 500), st.integers(1, 60))
 def test_stopping_is_the_sum_of_what_is_left(rate: int, acceleration: int) -> None:
     assert stopping(rate, acceleration) == braking_way(rate, acceleration)
+    assert type(stopping(rate, acceleration)) is int
 
 
 @given(st.integers(0, 5000), st.integers(1, 60))
@@ -31,6 +32,7 @@ def test_approach_is_the_fastest_rate_that_still_stops(distance: int, accelerati
     rate = approach(distance, acceleration)
     assert rate + stopping(rate, acceleration) <= distance
     assert rate + 1 + stopping(rate + 1, acceleration) > distance
+    assert type(rate) is int
 
 
 def starts(limits: OffsetLimits) -> list[tuple[int, int]]:
@@ -156,15 +158,16 @@ def test_total_variation_is_that_of_any_second() -> None:
     assert set(pieces[11:]) == {"OffsetEnergy"}
 
 
+@pytest.mark.parametrize("window", [10, 20, 100])
 @example([9] * 350)
 @example([k % 19 - 9 for k in range(350)])
 @given(st.lists(st.integers(-9, 9), min_size=1, max_size=350))
-def test_travel_lies_between_nine_tenths_of_a_second_and_a_whole_one(moves: list[int]) -> None:
+def test_travel_lies_between_nine_tenths_of_a_second_and_a_whole_one(window: int, moves: list[int]) -> None:
     travel = Travel()
     for k, move in enumerate(moves):
-        travel = travel.add(move, 100)
-        assert sum(map(abs, moves[max(0, k - 89) : k + 1])) <= travel.total
-        assert travel.total <= sum(map(abs, moves[max(0, k - 99) : k + 1]))
+        travel = travel.add(move, window)
+        assert sum(map(abs, moves[max(0, k + 1 - window * 9 // 10) : k + 1])) <= travel.total
+        assert travel.total <= sum(map(abs, moves[max(0, k + 1 - window) : k + 1]))
 
 
 def test_standing_still_or_moving_inward_is_allowed_outside_the_limit() -> None:
@@ -174,3 +177,29 @@ def test_standing_still_or_moving_inward_is_allowed_outside_the_limit() -> None:
     assert violation(SMALL, -SMALL.offset - 5, 0, -SMALL.offset - 5) is None
     assert violation(SMALL, SMALL.offset + 5, 0, SMALL.offset + 6) == "OffsetLimit"
     assert violation(SMALL, -SMALL.offset - 5, 0, -SMALL.offset - 6) == "OffsetLimit"
+
+
+def test_a_table_that_is_met_is_followed_up_to_the_rounding_and_what_is_not_met_is_approached_within_the_limit() -> (
+    None
+):
+    """On the goal the second difference may be that of a rounded curve; on the way to it, no more than configured."""
+    assert follow(SMALL, 0, 3, 3 + SMALL.hard_acceleration, 3 + SMALL.hard_acceleration) == 3 + SMALL.hard_acceleration
+    assert follow(SMALL, 0, 3, 20, 3 + SMALL.hard_acceleration) == 3 + SMALL.acceleration
+    assert follow(SMALL, 0, -3, 4, 4) == -3 + SMALL.acceleration  # met, but by more than rounding explains
+
+
+@pytest.mark.parametrize(
+    ("increments_per_mm", "rate"), [(24.9, 0), (25.0, 1), (60.0, 1), (100.0, 2), (149.9, 2), (150.0, 3)]
+)
+def test_a_coarse_drive_may_move_one_increment_where_that_is_at_most_twice_the_ceiling(
+    increments_per_mm: float, rate: int
+) -> None:
+    """20 mm/s at 1 ms: 25 increments per mm are half an increment per cycle, 100 are exactly two."""
+    assert ceilings(increments_per_mm, 0.001, 500.0, 4000.0).rate == rate
+
+
+def test_a_ceiling_that_is_a_whole_number_of_increments_is_reached() -> None:
+    """Rounded down, but not by what the arithmetic of floats loses."""
+    assert ceiling(4.0) == 1
+    assert ceiling(1000.0) == 250
+    assert ceilings(1000.0, 0.001, 500.0, 4000.0).variation == 3000

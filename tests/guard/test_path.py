@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from fdhil.guard.interlocks import Alarm
 from fdhil.guard.path import EPS, SEARCH, CorrectedPath, Place, advance, around, rate_between
 from fdhil.guard.protocol import Mode
 from fdhil.guard.state import State, initial
-from fdhil.guard.tracking import STILL_CYCLES, await_start, rest, track
+from fdhil.guard.tracking import await_start, rest, track
 from tests.guard import machine
 
 FIRST = 100
@@ -27,6 +28,16 @@ def test_rows_have_their_number_to_the_last() -> None:
     assert [PATH.has(row) for row in (FIRST - 1, FIRST, END - 1, END)] == [False, True, True, False]
     assert PATH.standing_rows() == FIRST + 2
     assert [PATH.mismatch(row, (0, 0)) for row in (FIRST - 1, END)] == [None, None]
+
+
+@pytest.mark.parametrize("standing", [1, 2, 3, 4])
+def test_the_rows_that_stand_at_the_begin_are_counted_one_by_one(standing: int) -> None:
+    path = CorrectedPath(FIRST, ([7] * standing + [9, 7, 7],), ([0] * (standing + 3),), True, "p")
+    assert path.standing_rows() == FIRST + standing - 1
+    assert [path.stands(FIRST + k) for k in range(-1, standing + 3)] == [
+        *(False, *[True] * (standing - 1)),  # to the next row, not from the one before
+        *(False, False, True, False),
+    ]
 
 
 @pytest.mark.parametrize(("dx", "dy"), [(EPS, 0), (-EPS, 0), (0, EPS), (EPS, -EPS)])
@@ -65,6 +76,11 @@ def test_costs_add_up_and_the_cheapest_is_first() -> None:
     assert advance(flat, (Place(3), Place(5)), (6,)) == (Place(6, 0), Place(4, 2))
 
 
+def test_of_equal_places_the_nearest_is_first() -> None:
+    level = CorrectedPath(0, ([5] * 40,), ([0] * 40,), True, "p")
+    assert [place.row for place in around(level, 20, (5,))[:5]] == [20, 19, 21, 18, 22]
+
+
 @pytest.mark.parametrize("rate", [0.0, 0.1, 0.5, 1.0, 1.5])
 def test_the_rate_is_read_off_the_way_along_the_path(rate: float) -> None:
     last, now = 130.2, 130.2 + rate
@@ -86,6 +102,25 @@ def test_a_rate_is_looked_for_near_the_place_alone(row: int, known: bool) -> Non
     assert (rate_between(PATH, 130, _between(row + 0.5), _between(row + 0.5)) is not None) is known
 
 
+def test_a_rate_is_found_from_the_first_straight_to_the_last() -> None:
+    """Half a row of the last one; a target at the ninth row ahead belongs to the straight behind it."""
+    assert rate_between(PATH, END - 3, _between(END - 2.0), _between(END - 1.5)) == pytest.approx(0.5)
+    assert rate_between(PATH, FIRST + 3, _between(FIRST + 2.0), _between(FIRST + 2.5)) == pytest.approx(0.5)
+    assert rate_between(PATH, 130, _between(138.5), at(139)) is None
+    beside = X[-1] // 2, Y[-1] // 2  # far along the path, and no place between its end and its begin
+    assert rate_between(PATH, FIRST + 3, beside, beside) is None
+
+
+def test_the_rate_is_that_of_the_axis_that_moves_most_wherever_the_others_stand() -> None:
+    """Whichever axis it is, and however far from zero another one stands."""
+    moving = [*range(0, 500, 50)]
+    for still in (10_000, -10_000):
+        for axes in ((moving, [still] * 10), ([still] * 10, moving)):
+            path = CorrectedPath(0, axes, ([0] * 10,) * 2, True, "p")
+            last, now = ([axis[4] + (25 if axis is moving and half else 0) for axis in axes] for half in (False, True))
+            assert rate_between(path, 4, last, now) == 0.5
+
+
 def _between(place: float) -> tuple[int, int]:
     row, part = int(place), place - int(place)
     (x0, y0), (x1, y1) = at(row), at(row + 1)
@@ -103,20 +138,31 @@ def state_at(row: int, *targets: tuple[int, int] | None, **changes: object) -> S
 
 
 def test_the_start_is_the_first_target_that_leaves_ten_cycles_of_rest() -> None:
-    waiting = initial(machine.settings())._replace(mode=Mode.ARMED, start_row=FIRST + 2)
-    for rested, started in ((STILL_CYCLES - 1, False), (STILL_CYCLES, True)):
+    waiting = initial(machine.settings())._replace(mode=Mode.ARMED, start_row=FIRST + 2, cause=Alarm("FeedbackGap"))
+    for rested, started in ((9, False), (10, True)):
         state = waiting._replace(rest=(0, 0), rested_for=rested, targets=(at(FIRST + 3),))
         state, alarm = await_start(state, PATH)
         assert alarm is None
         assert (state.mode is Mode.RAMPING) is started
         assert [place.row for place in state.places] == ([FIRST + 3] if started else [])
+        assert state.anchor == (FIRST + 3 if started else 0)
+        assert state.cause == (None if started else Alarm("FeedbackGap"))
     for stood, started in (((EPS, 0), True), ((EPS + 1, 0), False), ((0, -EPS - 1), False)):
         state = waiting._replace(rest=stood, rested_for=50, targets=(at(FIRST + 3),))
         assert (await_start(state, PATH)[0].mode is Mode.RAMPING) is started, stood
     state = waiting._replace(rest=(0, 0), rested_for=50, targets=((7, 7),))
     state, alarm = await_start(state, PATH)
-    assert alarm is not None
-    assert (state.mode, alarm.code) == (Mode.ARMED, "Misaligned")
+    assert (state.mode, alarm) == (Mode.ARMED, Alarm("Misaligned", detail="the first move leaves the path"))
+
+
+def test_the_first_move_is_looked_for_eight_rows_around_the_one_that_follows_the_rest() -> None:
+    waiting = initial(machine.settings())._replace(mode=Mode.ARMED, start_row=FIRST + 2, rested_for=50)
+    for row, started in ((FIRST + 3 + SEARCH, True), (FIRST + 4 + SEARCH, False)):
+        state, alarm = await_start(waiting._replace(rest=(0, 0), targets=(at(row),)), PATH)
+        assert (state.mode is Mode.RAMPING, alarm is None) == (started, started)
+    for stood, now in (((0, 0), None), (None, at(FIRST + 3))):  # who does not know where it was or is waits
+        unknown = waiting._replace(rest=stood, targets=(now,))
+        assert await_start(unknown, PATH) == (unknown, None)
 
 
 def test_rest_is_counted_from_the_target_that_stands() -> None:
@@ -139,10 +185,26 @@ def test_another_rate_is_told_from_another_path(rate: float, code: str) -> None:
     assert alarm.code == code
 
 
+def test_another_rate_is_told_in_percent_of_the_planned_from_none_to_the_highest() -> None:
+    """160 % is the most that an override gives; who stands between two rows runs at 0 %."""
+    path = CorrectedPath(0, tuple([axis[2:] for axis in (X, Y)]), ([0] * 61,) * 2, True, "p")
+    for targets, told in (
+        (((80, -48), (0, 0)), Alarm("OverrideChanged", detail="160 % of the planned rate")),
+        (((85, -51), (0, 0)), Alarm("Misaligned")),
+        (((25, -15), (25, -15)), Alarm("OverrideChanged", detail="0 % of the planned rate")),
+        (((20, -12), (25, -15)), Alarm("Misaligned")),
+        (((80, -48), None), Alarm("Misaligned")),
+        (((75, -45), (25, -15)), Alarm("Misaligned")),  # at the planned rate, half a row beside
+    ):
+        assert track(state_at(0, *targets), path)[1] == told, targets
+
+
 def test_targets_that_stand_at_the_last_row_are_a_feed_hold() -> None:
     state, alarm = track(state_at(130, at(130, EPS), at(130, EPS)), PATH)
     assert alarm is not None
     assert (alarm.code, state.places, state.resuming) == ("FeedHold", (Place(130),), True)
+    led_on = state_at(133, at(130), at(130), anchor=130)  # by time alone, while targets were missing
+    assert track(led_on, PATH)[0].places == (Place(130),)
     _, alarm = track(state_at(130, at(130, EPS + 1), at(130, EPS + 1)), PATH)
     assert alarm is not None
     assert alarm.code != "FeedHold"
@@ -159,6 +221,8 @@ def test_after_a_feed_hold_the_place_is_looked_for_anew() -> None:
     state, alarm = track(held._replace(resuming=False), PATH)
     assert alarm is not None
     assert state.places[0].row == 131  # time alone moves it, for as long as a hold lasts
+    for targets in (at(131), at(130, 0, 20)):  # found at once, or lost: from there it is a move like any other
+        assert track(state_at(130, targets, at(130), resuming=True), PATH)[0].resuming is False
 
 
 DWELL = CorrectedPath(

@@ -25,6 +25,7 @@ from fdhil.guard.settings import to_json
 from tests.guard import impatient
 from tests.guard.machine import DIGEST, FACTS_GIVEN, LIMITS, commissioned, smooth_path
 from tests.guard.peer import NEVER, Peer, open_bus, write_config
+from tests.listening import tcp_ports
 
 DEMAND, OFFSET = smooth_path(rows=800)
 TOKEN = "the operator's"
@@ -161,6 +162,7 @@ def test_mute_by_default_then_aligned_to_the_cycle_then_off(rig: Rig) -> None:
     client = rig.connect()
     rig.peer.wait(lambda: client.status()["good_for"] > 200, "SYNC")
     assert rig.peer.sent == []
+    assert tcp_ports(rig.process.pid) == set()
     rig.arm()
     rig.peer.playing = True
     rig.peer.wait(lambda: rig.peer.row > 780, "the path")

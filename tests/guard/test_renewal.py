@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 from typing import Any
@@ -9,8 +10,10 @@ from typing import Any
 import pytest
 
 from fdhil.guard import table
+from fdhil.guard.control import Client, Closer
+from fdhil.guard.protocol import Mode
 from tests.guard.machine import DIGEST
-from tests.guard.shop import DEMAND, OFFSET
+from tests.guard.shop import DEMAND, OFFSET, OWNER
 from tests.guard.test_shell import Make, inside, make
 
 __all__ = ["make"]
@@ -94,3 +97,18 @@ def test_a_machine_that_begins_meanwhile_goes_on_with_what_it_has(make: Make) ->
     assert shop.guard.intake.path is not None
     assert before is not None
     inside(shop.offsets())
+
+
+def test_rows_that_are_half_checked_when_it_begins_are_refused(make: Make) -> None:
+    shop = make()
+    shop.arm()
+    intake, state, closer = shop.guard.intake, shop.guard.state, Closer()
+    before = intake.path
+    here, there = socket.socketpair()
+    with here, there:
+        intake.begin(Client(here, 0.0, closer, OWNER, descriptor=renewing(3)), {"renew": True}, state)
+        assert intake.busy
+        intake.check(state._replace(mode=Mode.RAMPING))
+        closer.end()
+        assert json.loads(there.recv(10_000))["code"] == "TableBusy"
+    assert intake.path is before

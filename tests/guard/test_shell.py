@@ -6,7 +6,6 @@ import itertools
 import json
 import os
 import socket
-import struct
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -19,9 +18,10 @@ from fdhil.guard import process, table
 from fdhil.guard.control import MAX_CLIENTS, MAX_LINE_BYTES, Client, Closer, Control
 from fdhil.guard.journal import Journal, Notifier
 from fdhil.guard.landing import land
+from fdhil.guard.peers import Access, Peer
 from tests.guard.fed import FACTS, LAW, fed_settings
 from tests.guard.machine import DIGEST, LIMITS
-from tests.guard.shop import TOKEN, Shop
+from tests.guard.shop import OWNER, TOKEN, Shop
 
 Make = Callable[..., Shop]
 
@@ -408,9 +408,13 @@ def test_a_boot_up_is_told_and_the_comparison_that_follows_is_asked_for(make: Ma
 
 @pytest.fixture
 def desk(tmp_path: Path) -> Iterator[Control]:
-    made = Control(tmp_path)
+    made = Control(tmp_path, Access(), nobody_is_refused)
     yield made
     made.close()
+
+
+def nobody_is_refused(peer: Peer, request: object) -> None:
+    raise AssertionError(f"{peer} asked for {request}")
 
 
 def connected(desk: Control, now_s: float = 0.0) -> socket.socket:
@@ -507,27 +511,9 @@ def test_descriptors_that_nobody_asked_for_are_closed(desk: Control) -> None:
     assert count() == before - 2  # both ends of the client's connection
 
 
-def test_another_user_is_let_in_only_where_the_settings_name_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    user = os.getuid() + 4711
-    real = struct.unpack
-
-    def unpack(layout: str, data: bytes) -> tuple[Any, ...]:
-        return (1, user, 1) if layout == "3i" else real(layout, data)
-
-    monkeypatch.setattr("struct.unpack", unpack)
-    for peer_uid, allowed in ((None, 0), (user + 1, 0), (user, 1)):
-        desk = Control(tmp_path, peer_uid)
-        assert desk.path.stat().st_mode & 0o777 == (0o600 if peer_uid is None else 0o660)
-        connected(desk).close()
-        assert len(desk.clients) == allowed
-        desk.close()
-
-
 def test_a_directory_without_room_for_the_socket_is_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(DeviceError, match="nothing is sent"):
-        Control(tmp_path / "missing")
+        Control(tmp_path / "missing", Access(), nobody_is_refused)
 
 
 def test_accepting_what_has_gone_is_nothing(desk: Control) -> None:
@@ -539,7 +525,7 @@ def test_an_answer_to_who_has_gone_is_dropped() -> None:
     near, far = socket.socketpair()
     far.close()
     closer = Closer()
-    client = Client(near, 0.0, closer)
+    client = Client(near, 0.0, closer, OWNER)
     client.reply({}, ok=True)
     assert client.gone
     client.close()

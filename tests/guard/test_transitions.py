@@ -6,9 +6,10 @@ import pytest
 
 from fdhil.guard.feedforward import Feed, armed
 from fdhil.guard.protocol import AT_REST, CHARGED, IN_CHARGE, LANDING, ON_PATH, SENDING, FeedMode, Mode
-from fdhil.guard.state import initial
-from fdhil.guard.transitions import FEED_SENT, FEED_TRANSITIONS, SENT, TRANSITIONS, Event
+from fdhil.guard.state import Request, initial
+from fdhil.guard.transitions import FEED_SENT, FEED_TRANSITIONS, SENT, TRANSITIONS, ZEROS, ZEROS_UNCONFIRMED, Event
 from tests.guard import machine
+from tests.guard.machine import Bench
 
 WAYS = {(mode, event): after for event, modes, after in TRANSITIONS for mode in modes}
 FEED_WAYS = {(mode, event): after for event, modes, after in FEED_TRANSITIONS for mode in modes}
@@ -79,3 +80,68 @@ def test_the_feed_forward_begins_by_arming_and_zeroing_never_turns_on() -> None:
     assert armed(()).mode is FeedMode.ON
     assert [mode for (mode, _), after in FEED_WAYS.items() if after is FeedMode.ON] == [FeedMode.OFF]
     assert {after for (mode, _), after in FEED_WAYS.items() if mode is FeedMode.ZEROING} == {FeedMode.OFF}
+
+
+@pytest.mark.parametrize("mode", Mode)
+def test_from_every_state_two_events_lead_to_rest_and_none_but_the_operators_leads_away(mode: Mode) -> None:
+    """What is in charge ends, what lands is at rest next, and whoever is at rest stays there until he is asked."""
+    if mode in IN_CHARGE:
+        assert WAYS[mode, Event.END] is Mode.RAMP_DOWN
+    landed = WAYS.get((mode, Event.END), mode)
+    for event in (Event.ZERO_SHOWN, Event.ZERO_NOT_SHOWN, Event.BLOCKED, Event.BLOCKED_AT_ZERO):
+        assert WAYS.get((landed, event), landed) in AT_REST
+    if mode in AT_REST:
+        away = {event for (at, event), after in WAYS.items() if at is mode and after not in AT_REST}
+        assert away <= {Event.ARM, Event.ADOPT}
+
+
+def in_mode(mode: Mode) -> Bench:
+    """A machine whose guard is in a state, all drives but those of ADOPT and FROZEN as they should be."""
+    if mode is Mode.ADOPT:
+        held = machine.bench()
+        held.drives[0].hold(300)
+        held.until(Mode.ADOPT)
+        return held
+    made = machine.bench(amplitude=800)
+    made.settle()
+    if mode is Mode.OFF:
+        return made
+    assert made.arm() == ()
+    if mode is Mode.ARMED:
+        return made
+    made.play()
+    while made.offsets[0] < 600:
+        made.sync()
+    if mode is Mode.HOLD:
+        made.sync(nc=False)
+        made.until(mode)
+    elif mode is Mode.RAMPING:
+        made.sync(late=True)
+    elif mode is Mode.RAMP_DOWN:
+        made.sync(Request("disarm"))
+    elif mode is Mode.FROZEN:
+        made.listener.error("off")
+        made.sync()
+        made.listener.error("active")
+    return made
+
+
+@pytest.mark.parametrize("end", ["daemon lost", "disarm", "stop"])
+@pytest.mark.parametrize("mode", Mode)
+def test_from_every_state_the_drives_come_to_zero_and_nothing_is_sent_any_more(mode: Mode, end: str) -> None:
+    """The core takes the ways of the table: whatever it was doing, all drives hold 0 in time, and the bus is silent."""
+    made = in_mode(mode)
+    assert made.mode is mode
+    if end == "daemon lost":
+        made.main_alive = False
+    else:
+        made.sync(Request("disarm" if end == "disarm" else "stop"))
+    from_here = max(abs(value) for value in made.held[-1])
+    made.run(2 + machine.ramp_cycles(machine.LIMITS, from_here) + ZEROS)
+    rested = made.held[-1]
+    assert rested == (0, 0) or (mode is Mode.FROZEN and rested[0] >= 600)
+    made.until(Mode.FROZEN if mode is Mode.FROZEN else Mode.OFF, ZEROS_UNCONFIRMED)
+    sent = len(made.frames), len(made.heartbeats)
+    made.run(50)
+    assert (len(made.frames), len(made.heartbeats)) == sent
+    assert made.held[-1] == rested

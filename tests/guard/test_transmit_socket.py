@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import socket
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from fdhil.config import CanBus
 from fdhil.errors import ConnectError, ProtocolError
+from fdhil.guard import __main__ as guard_main
+from fdhil.guard.settings import to_json
+from tests.guard.machine import commissioned
+from tests.guard.machine import settings as guard_settings
 from tests.guard.peer import open_bus
 
 
@@ -35,3 +42,78 @@ def test_a_peer_that_is_no_hub(greeting: bytes, error: type[Exception]) -> None:
         with pytest.raises(error):
             open_bus("can0", CanBus(port=server.getsockname()[1]))
         thread.join()
+
+
+def test_a_hub_that_is_not_there() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    with pytest.raises(ConnectError, match=f"no hub answers at 127.0.0.1 port {port} .*start the hub first"):
+        open_bus("can0", CanBus(port=port))
+
+
+class RawSocket:
+    """Stands for CAN_RAW where the kernel has none; tests/socketcan has the real one."""
+
+    def __init__(self, *family: int, up: bool) -> None:
+        self.calls: list[Any] = [family]
+        self.up = up
+
+    def setsockopt(self, level: int, name: int, value: bytes) -> None:
+        self.calls.append((level, name, value))
+
+    def bind(self, address: tuple[str]) -> None:
+        if not self.up:
+            raise OSError(19, "No such device")
+        self.calls.append(address)
+
+    def close(self) -> None:
+        self.calls.append("closed")
+
+
+@pytest.mark.parametrize("up", [True, False])
+def test_a_raw_socket_hears_nothing_before_the_guard_listens_and_is_closed_when_it_is_of_no_use(
+    up: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[RawSocket] = []
+
+    def make(*family: int) -> RawSocket:
+        made.append(RawSocket(*family, up=up))
+        return made[0]
+
+    monkeypatch.setattr(socket, "socket", make)
+    if up:
+        open_bus("can0", CanBus(interface="socketcan", channel="can7"))
+    else:
+        with pytest.raises(ConnectError, match=r"can7 cannot be opened \(No such device\); bring it up"):
+            open_bus("can0", CanBus(interface="socketcan", channel="can7"))
+    family = (socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+    deaf = (socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")
+    assert made[0].calls == [family, deaf, ("can7",) if up else "closed"]
+
+
+def run_main(monkeypatch: pytest.MonkeyPatch, settings: Path, descriptor: int) -> int:
+    """Run the guard's program in this process with these arguments."""
+    monkeypatch.setattr("sys.argv", ["fdhil.guard", "--settings", str(settings), "--descriptor", str(descriptor)])
+    return guard_main.main()
+
+
+def test_settings_that_cannot_be_read_are_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "guard.json").write_text("{")
+    near, far = socket.socketpair()
+    with near, far:
+        assert run_main(monkeypatch, tmp_path / "guard.json", near.fileno()) == 2
+    assert capsys.readouterr().err.startswith("fdhil-guard: ")
+
+
+def test_a_descriptor_that_is_no_socket_is_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = commissioned(guard_settings())
+    (tmp_path / "guard.json").write_text(to_json(replace(settings, run_directory=str(tmp_path))))
+    with (tmp_path / "a file").open("wb") as file:
+        assert run_main(monkeypatch, tmp_path / "guard.json", file.fileno()) == 3
+    told = capsys.readouterr().err
+    assert "cannot be used" in told
+    assert "nothing was sent; start the guard with fdhil-guard" in told

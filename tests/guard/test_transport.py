@@ -261,7 +261,7 @@ def test_controller_states(can_id: int, detail: int, states: list[str]) -> None:
 
 
 def test_settings_survive_their_file() -> None:
-    made = settings(token_sha256="ab" * 32, offset_synchronous=False, daemon_uid=7)
+    made = settings(token_sha256="ab" * 32, offset_synchronous=False, daemon_uid=7, watching=(8, 9))
     assert from_json(to_json(made)) == made
 
 

@@ -33,6 +33,10 @@ class Wire:
         """The last frame of ours did not leave."""
         self._last, self._rate = self._before, 0
 
+    def stood(self, before: int) -> None:
+        """In front of the last frame of ours a cycle was missed: it went on from ``before``, at rest."""
+        self._before, self._rate = before, self._last - before
+
     def nothing(self) -> None:
         """No frame of ours in this cycle."""
         self._rate = 0

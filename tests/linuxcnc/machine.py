@@ -123,19 +123,34 @@ class LinuxCnc:
 
     @contextmanager
     def driving(self, twin: TwinProcess) -> Iterator[None]:
-        """Let what is ordered drive the simulated machine until the end of the block, which ends its demand."""
+        """Let what is ordered drive the simulated machine until the end of the block, which ends its demand.
+
+        What LinuxCNC had ordered when the block was left is all in it, however far behind a busy host is.
+        """
         with (self.folder / "log").open("ab") as log:
             sampling = self._as_nobody("sh", "-c", ROWS, environment=os.environ, log=log, out=subprocess.PIPE)
         assert sampling.stdout is not None
-        pouring = threading.Thread(target=_pour, args=(sampling.stdout, twin), name="demand")
+        poured = Poured()
+        pouring = threading.Thread(target=poured.run, args=(sampling.stdout, twin), name="demand")
         pouring.start()
         try:
             yield
+            poured.wait_for(self._sampled())
         finally:
             _end(sampling)
             pouring.join()
             sampling.stdout.close()
             twin.close_panel()
+
+    def _sampled(self) -> int:
+        """Count the servo cycles that LinuxCNC has queued for whoever reads its demand."""
+        with (self.folder / "log").open("ab") as log:
+            asking = self._as_nobody(
+                "halcmd", "-s", "getp", "sampler.0.sample-num", environment=os.environ, log=log, out=subprocess.PIPE
+            )
+        told, _ = asking.communicate()
+        assert asking.returncode == 0, self._log()
+        return int(told)
 
     def close(self) -> None:
         """End LinuxCNC: its operator leaves, and it cleans up after itself."""
@@ -183,9 +198,30 @@ def _alone() -> IO[bytes]:
     return lock
 
 
-def _pour(rows: IO[bytes], twin: TwinProcess) -> None:
-    for line in rows:
-        twin.send_line(line.decode().rstrip())
+class Poured:
+    """Hands the rows of the demand to the simulated machine, and knows how far it is."""
+
+    def __init__(self) -> None:
+        self._cycle = 0
+        self._news = threading.Condition()
+
+    def run(self, rows: IO[bytes], twin: TwinProcess) -> None:
+        """Hand over each row until there are no more."""
+        for line in rows:
+            twin.send_line(line.decode().rstrip())
+            with self._news:
+                self._cycle = _cycle(line)
+                self._news.notify()
+
+    def wait_for(self, cycle: int) -> None:
+        """Wait until a servo cycle has been handed over."""
+        with self._news:
+            assert self._news.wait_for(lambda: self._cycle >= cycle, PATIENCE_S), (self._cycle, cycle)
+
+
+def _cycle(row: bytes) -> int:
+    time_s = row.split(b",", 1)[0]
+    return 0 if time_s == b"time_s" else round(1000 * float(time_s))
 
 
 def _end(child: subprocess.Popen[bytes]) -> None:

@@ -8,6 +8,7 @@ it. Orders and answers are lines of JSON: ``{"order": "run", "program": "/a/part
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import socket
@@ -42,9 +43,12 @@ class Operator:
         """Poll until something is so."""
         end = time.monotonic() + PATIENCE_S
         while time.monotonic() < end:
-            self.status.poll()
-            if ready(self.status):
-                return
+            with contextlib.suppress(
+                linuxcnc.error
+            ):  # on a busy host the status may be locked for longer than it waits
+                self.status.poll()
+                if ready(self.status):
+                    return
             time.sleep(0.005)
         now = self.status
         state = f"interpreter {now.interp_state}, task {now.exec_state}, queue {now.queue}, paused {now.paused}"

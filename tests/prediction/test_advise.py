@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fdhil.cli.advise import _corrected
 from fdhil.config import MachineConfig
 from fdhil.correction import plan as plan_correction
+from fdhil.correction.advised import corrected_contour_um
 from fdhil.prediction import predict
 from fdhil.prediction.advise import Advice, Held, advise
 from fdhil.prediction.feeds import RAPID, REST, Source, at_shares, highest, program_source, stretches, worst_rows
@@ -52,7 +52,7 @@ def test_a_beyond_the_drives_feed_is_told_with_the_feeds_that_hold() -> None:
     programmed; they keep the tolerance, 5 % more do not."""
     motions = list(interpret(FAST, Budget.of(SHARP.nc)))
     source = program_source(motions, SHARP)
-    advice = advise(source, MODELS, SHARP, 50.0, lambda r: _corrected(r, MODELS, SHARP))
+    advice = advise(source, MODELS, SHARP, 50.0, lambda r: corrected_contour_um(r, MODELS, SHARP))
     assert [a.line for a in advice] == [1, 2, 3, 4, 5, 6]
     assert all(a.load[1] == "current" and a.load[2] > 1.5 for a in advice[:3])
     assert advice[0].cause == "saturation"

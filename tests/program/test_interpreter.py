@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fdhil.errors import ProgramError
+from fdhil.errors import GcodeBudget, ProgramError
 from fdhil.program import Arc, Budget, Dwell, Feed, Motion, Rapid, interpret
 
 
@@ -126,7 +126,7 @@ def test_values_are_computed_before_the_line_sets_parameters() -> None:
 
 @pytest.mark.fault("G6")
 def test_budgets_end_in_an_error_with_its_line() -> None:
-    with pytest.raises(ProgramError, match="raise max_blocks") as caught:
+    with pytest.raises(GcodeBudget, match="raise max_blocks") as caught:
         list(interpret((f"G0 X{i}" for i in range(100)), Budget(max_blocks=10)))
     assert caught.value.line == 11
     assert fault("G0 X" + "[" * 5000).line == 1

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from fdhil.errors import ProgramError
+from fdhil.errors import GcodeBudget, ProgramError
 from fdhil.program import Arc, Budget, Dwell, Feed, Motion, Rapid, interpret
 
 
@@ -127,5 +127,5 @@ def test_a_file_of_one_endless_line_is_refused_at_once(tmp_path: Path) -> None:
     path = tmp_path / "long.ngc"
     with path.open("wb") as file:
         file.truncate(10_000_000_000)  # a sparse file of zero bytes
-    with pytest.raises(ProgramError, match="longer than"):
+    with pytest.raises(GcodeBudget, match="longer than"):
         list(interpret(path))

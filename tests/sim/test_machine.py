@@ -283,6 +283,7 @@ def test_every_fault_ends_without_a_trace(name: str) -> None:
     assert unit.sensor.faults == SensorFaults()
     assert unit.drive.feedback.digital_inputs == 0
     assert unit.sync_on
+    assert twin.machine.wires[unit.bus].idle
     for key in (0x606500, 0x1A0101, 0x1A0102, 0x1A0103):
         assert unit.drive.dictionary.numbers[key] == objects[key]
 

@@ -14,7 +14,8 @@ from pymodbus.client import ModbusTcpClient
 from pymodbus.exceptions import ModbusIOException
 
 from fdhil.errors import ConnectError
-from fdhil.sim.wire.modbus_sensor import BLOCK, SensorServers, VoltageSensor
+from fdhil.sim.wire.modbus_sensor import BLOCK, VoltageSensor
+from fdhil.sim.wire.modbus_tcp import SensorServers
 from tests.sim.bench_twin import TwinInHand, corner, twin_config
 
 

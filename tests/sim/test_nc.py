@@ -169,6 +169,20 @@ def test_stop_brakes_and_gives_up_the_rest() -> None:
     assert not twin.run_until("finished")["stopped"]
 
 
+def test_a_stop_as_a_path_ends_does_not_stop_the_next_one() -> None:
+    """The rest behind a path is shorter than the way to a stop: with it the wish to stop has ended."""
+    twin = TwinInHand(twin_config())
+    twin.switch_on()
+    rows = corner()
+    twin.play(rows)
+    twin.run_until("playing")
+    twin.run(len(rows) + 285)
+    twin.machine.nc.stop()
+    twin.run_until("finished")
+    twin.play(rows[::-1])
+    assert twin.run_until("finished")["stopped"] is False
+
+
 def test_a_drive_fault_stops_the_path_and_switching_on_recovers() -> None:
     twin = TwinInHand(twin_config())
     twin.switch_on()

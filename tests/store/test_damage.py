@@ -6,6 +6,7 @@ import io
 import random
 import shutil
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,12 @@ from fdhil.errors import RecordingError, StoreError
 from fdhil.records import Notice, Parameters, Skill
 from fdhil.store import schema
 from fdhil.store.history import FILE_NAME, History, latest_parameters
-from fdhil.store.rows import Comparison, UsedParameters
+from fdhil.store.rows import Acknowledgement, Comparison, UsedParameters
 from fdhil.store.windows import decode_window, encode_window
 from tests.daemon.machine import config_of
 from tests.store.made import BENCH, STAMP, outcome, published, same, window
 
-TABLES = ("windows", "revisions", "skills", "notices", "comparisons")
+TABLES = ("windows", "revisions", "skills", "notices", "comparisons", "acknowledgements")
 FLIPS_PER_PAGE = 16
 
 
@@ -45,6 +46,7 @@ def filled(folder: Path, wal: Path | None = None) -> bytes:
         used = {"X": UsedParameters(7, BENCH)}
         for k in range(8):
             history.add_comparison(Comparison("a" * 64, "p.ngc", "0123", used, 1.0 + k, (zone,) * 4), STAMP)
+            history.add_acknowledgement(Acknowledgement((k + 1,), "anna", f"seen {k}", STAMP))
         if wal is not None:
             shutil.copytree(folder, wal)
     return (folder / FILE_NAME).read_bytes()
@@ -58,7 +60,8 @@ def contents(history: History) -> dict[str, list[Any]]:
                        r.set.tick, r.set.temperature_c, r.set.config_digest, r.set.covariance.tobytes())
                       for r in history.revisions()],
         "skills": history.skills(),
-        "notices": history.notices(),
+        "notices": [replace(notice, acknowledged=None) for notice in history.notices()],
+        "acknowledgements": history.acknowledgements(),
         "comparisons": history.comparisons("a" * 64, 99),
     }  # fmt: skip
 

@@ -6,6 +6,7 @@ import math
 import sqlite3
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from fdhil.records import LoopEstimate, Notice, Parameters, Reason, Skill, Verdi
 from fdhil.store import history as history_module
 from fdhil.store import schema
 from fdhil.store.history import FILE_NAME, History, latest_parameters
-from fdhil.store.rows import Comparison, Stamp, UsedParameters
+from fdhil.store.rows import Acknowledgement, Comparison, Stamp, StoredNotice, UsedParameters
 from tests.store.made import BENCH, STAMP, outcome, published
 from tests.store.made import window as made_window
 
@@ -69,9 +70,31 @@ def test_skills_and_notices(tmp_path: Path) -> None:
         history.add_skill(Skill("X", 5, 0.25, 1.5, math.nan, 24.0), STAMP)
         history.add_notice(Notice("LoadChanged", "MAJOR", "Jt rose by 13 %", "X", 9), STAMP)
         (skill,) = history.skills("X")
-        assert history.notices() == [(STAMP, Notice("LoadChanged", "MAJOR", "Jt rose by 13 %", "X", 9))]
+        assert history.notices() == [StoredNotice(1, Notice("LoadChanged", "MAJOR", "Jt rose by 13 %", "X", 9), STAMP)]
     assert (skill.rms_um, skill.measured_rms_um) == (0.25, 24.0)
     assert np.isnan(skill.delay_ms)
+
+
+def test_a_notice_comes_back_with_who_answered_for_it(tmp_path: Path) -> None:
+    later = Stamp(STAMP.wall_s + 60.0, "boot-2", 1)
+    with History.open(tmp_path) as history:
+        numbers = [history.add_notice(Notice("BusDown", "MAJOR", f"bus {k}"), STAMP) for k in range(3)]
+        given = Acknowledgement(tuple(numbers[:2]), "anna", "plug was out", later)
+        history.add_acknowledgement(given)
+        history.add_notice(Notice("BusDown", "info", "is back"), STAMP)
+    with History.read(tmp_path) as history:
+        notices = history.notices()
+        assert history.acknowledgements() == [given]
+    assert [notice.acknowledged for notice in notices] == [given, given, None, None]
+    assert [notice.is_open for notice in notices] == [False, False, True, False]  # info asks for nobody
+
+
+def test_the_oldest_acknowledgements_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(history_module, "KEEP_ACKNOWLEDGEMENTS", 2)
+    with History.open(tmp_path) as history:
+        for number in (1, 2, 3):
+            history.add_acknowledgement(Acknowledgement((number,), "anna", "", STAMP))
+        assert [given.notices for given in history.acknowledgements()] == [(2,), (3,)]
 
 
 def test_readers_work_beside_the_writer(tmp_path: Path) -> None:
@@ -126,6 +149,7 @@ def test_an_older_schema_is_brought_up_by_the_writer_and_read_as_it_is(tmp_path:
     with History.read(tmp_path) as history:
         assert [r.set.revision for r in history.revisions()] == [1]
         assert history.comparisons("a" * 64, 5) == []
+        assert history.acknowledgements() == []
     with History.open(tmp_path) as history:
         assert [r.window_ids for r in history.revisions()] == [(4,)]
         history.add_comparison(comparison(), STAMP)
@@ -137,6 +161,11 @@ def test_an_older_schema_is_brought_up_by_the_writer_and_read_as_it_is(tmp_path:
         assert copy.execute("PRAGMA user_version").fetchone() == (number,)
         assert copy.execute("SELECT revision FROM revisions").fetchall() == [(1,)]
         copy.close()
+
+
+def test_a_new_history_keeps_no_copy_of_the_nothing_before_it(tmp_path: Path) -> None:
+    History.open(tmp_path).close()
+    assert [path.name for path in tmp_path.glob("*.schema-*")] == []
 
 
 def test_a_step_that_another_process_made_meanwhile_is_not_made_twice(
@@ -261,3 +290,30 @@ def test_a_row_that_was_damaged_before_its_schema_was_brought_up_stays_so(tmp_pa
         assert [skill.tick for skill in history.skills()] == [5]
         assert history.put_damaged_aside() == "1 of skills (row 2)"
         assert history.loops() == []
+
+
+def test_a_reader_that_comes_again_and_again_looks_at_a_whole_file_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with History.open(tmp_path) as history:
+        history.add_window(outcome(), "w00000001-X.parquet", STAMP)
+    checks: list[bool] = []
+    real = schema.check_file
+
+    def counted(*args: Any, pages: bool = True, **more: Any) -> int:
+        checks.append(pages)
+        return real(*args, pages=pages, **more)
+
+    monkeypatch.setattr(schema, "check_file", counted)
+    checked: set[tuple[int, int]] = set()
+    for _ in range(2):
+        with History.read(tmp_path, checked=checked) as history:
+            assert len(history.windows()) == 1
+    (tmp_path / FILE_NAME).rename(tmp_path / "aside")
+    with History.open(tmp_path):
+        checks.clear()
+    with History.read(tmp_path, checked=checked) as history:
+        assert history.windows() == []
+    with History.read(tmp_path):
+        pass
+    assert checks == [True, True], "a new file is looked at anew, and so is any for who keeps nothing"

@@ -13,7 +13,7 @@ import pytest
 from fdhil.store.windows import WindowStore, list_windows, read_window
 from tests.store.made import same, window
 
-STEPS = 12  # of two windows: open, write in pieces, fsync, and that of the folder
+STEPS = 14  # the folder: open and fsync of the one above; each window: open, write, fsync, rename, and the folder again
 
 
 def write_until_killed(folder: Path, nth: int) -> tuple[int, bool]:

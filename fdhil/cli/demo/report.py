@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdhil.cli.parameter_view import DISPLAY, cell
 from fdhil.config import MachineConfig
 from fdhil.correction import plan as plan_correction
 from fdhil.prediction import predict
@@ -25,6 +24,7 @@ from fdhil.records import (
 )
 from fdhil.report import Page, Section, Table, figures
 from fdhil.report.figures import Curve
+from fdhil.report.parameter_view import DISPLAY, cell
 
 # the named places of the bench path, mm
 POINTS: Mapping[str, tuple[float, float]] = {

@@ -13,6 +13,7 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cli.doctor.trouble import Trouble
+from fdhil.daemon.clock import newest_record_s
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -46,10 +47,10 @@ def doctor(config: Path, offline: bool, as_json: bool) -> int:
 
 def _in_order(config: MachineConfig, offline: bool) -> Iterator[Trouble]:
     """Examine from the cause to what depends on it: this PC, its interfaces, the devices behind them, the guard."""
-    from fdhil.cli.doctor import computer, devices, storage  # late: --help imports nothing heavy
+    from fdhil.cli.doctor import computer, devices, storage, uplink  # late: --help imports nothing heavy
 
     yield from storage.examine_store(config)
-    yield from computer.examine_clock(storage.newest_record_s(config.store.directory))
+    yield from computer.examine_clock(newest_record_s(config.store.directory))
     yield from computer.examine_processors()
     secrets = list(storage.examine_secrets(config))
     yield from secrets
@@ -61,6 +62,7 @@ def _in_order(config: MachineConfig, offline: bool) -> Iterator[Trouble]:
         recorded = {trouble.place for trouble in secrets if trouble.code == storage.RECORD_BAD}
         yield from devices.examine_devices(config, heard, recorded, _progress)
     yield from devices.examine_guard(config)
+    yield from uplink.examine_uplink(config, offline)
 
 
 def _progress(text: str) -> None:

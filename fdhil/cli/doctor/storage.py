@@ -59,14 +59,6 @@ def _history(folder: Path) -> Iterator[Trouble]:
             yield Trouble(error.code, "store", what, "no parameter of before is known", mend)
 
 
-def newest_record_s(folder: Path) -> float | None:
-    """Return when the newest record of the history was written, in s since 1970; None where nothing tells."""
-    with suppress(StoreError), History.read(folder) as history:
-        notices = [stamp.wall_s for stamp, _ in history.notices(limit=1)]
-        return max([*notices, *(window.stamp.wall_s for window in history.windows(limit=1))], default=None)
-    return None
-
-
 def _user() -> str:
     return os.environ.get("USER") or str(os.getuid())
 

@@ -13,7 +13,6 @@ from fdhil.cli.paper.bench import COLD_C, WARM_C, Move, Trouble
 from fdhil.cli.paper.claims import Claim, Picture, Trial
 from fdhil.cli.paper.methods import vector
 from fdhil.cli.paper.scenarios import machine
-from fdhil.cli.parameter_view import DISPLAY
 from fdhil.config import Identification
 from fdhil.identification.estimators import least_squares, maximum_likelihood
 from fdhil.identification.fit import fit
@@ -21,6 +20,7 @@ from fdhil.identification.motion import prepare
 from fdhil.pipeline.analysis import analyse
 from fdhil.records import UNITS, Estimate, Float, Window, WindowOutcome, rms
 from fdhil.report import Table, figures
+from fdhil.report.parameter_view import DISPLAY
 from fdhil.validation.backlash import dead_band
 
 TEMPERATURES_C = (20.0, 20.5, 21.0, 21.5, 22.0)

@@ -20,7 +20,7 @@ from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from fdhil.cia402 import COB_SDO_REQUEST, COB_SDO_RESPONSE
-from fdhil.errors import DeviceTimeout, ProtocolError, SdoAbort
+from fdhil.errors import DeviceTimeout, ProtocolError, SdoAbort, SdoTimeout, SdoToggle, SdoTooLarge
 
 RESPONSE_TIMEOUT_S = 0.5
 QUIET_S = 1.0
@@ -125,10 +125,10 @@ class SdoLink:
                 if time.monotonic() > deadline:
                     self._client.abort(_DEADLINE_ABORT)
                     text = f"{_name(index, sub)} was not finished after {DEADLINE_S:g} s; check the bus load"
-                    raise ProtocolError(self.device, text)
+                    raise SdoTooLarge(self.device, text)
             self._client.abort(_MEMORY_ABORT)
         text = f"{_name(index, sub)} is longer than {MAX_BYTES} bytes; this is no object of a healthy drive"
-        raise ProtocolError(self.device, text)
+        raise SdoTooLarge(self.device, text)
 
     def _guarded(self, index: int, sub: int, call: Any) -> Any:
         """Run a call of the library and translate its errors into one sentence each; quiet first after a time-out."""
@@ -144,7 +144,8 @@ class SdoLink:
             if "No SDO response" in str(error) or "could not be retransmitted" in str(error):
                 self._late = True
                 text = f"{_name(index, sub)} was not answered; check the drive's supply and its node-ID"
-                raise DeviceTimeout(self.device, text) from None
+                raise SdoTimeout(self.device, text) from None
             self._late = True
             text = f"{_name(index, sub)} was answered wrongly ({error}); check that one master asks"
-            raise ProtocolError(self.device, text) from None
+            kind = SdoToggle if "toggle" in str(error).lower() else ProtocolError
+            raise kind(self.device, text) from None

@@ -114,7 +114,7 @@ class SocketcandPort:
                     append(stamp_ns, int(name, 16) if len(name) == 3 else int(name, 16) | EXTENDED_FLAG, data)
                 elif words[1] == "error":
                     append(stamp_ns, int(name, 16) & 0x1FFFFFFF | ERROR_FLAG, data)
-            except (IndexError, ValueError, struct.error):
+            except (IndexError, ValueError, OverflowError, struct.error):
                 self.malformed += 1
 
     def close(self) -> None:

@@ -19,6 +19,7 @@ from fdhil.records import Int, Notice, TickTimes
 
 COUNTER_RANGE = 240
 _SHORT_RANGE = 16  # a counter that begins again so soon cannot tell back from forth
+_STEADY = 0.25  # of a period
 _UNCOUNTED = 8  # SYNCs without a counter, one after the other, until the producer with one is gone
 
 
@@ -140,8 +141,10 @@ class SyncGrid:
             self._range = COUNTER_RANGE
         if counter != 1 or last is None or last < 2:
             return
-        at_once = self._realtime and self._last_ns is not None and t_ns - self._last_ns < 1.5 * self._period_ns
-        if at_once or last == self._wrapped_at:
+        elapsed = (t_ns - self._last_ns) / self._period_ns if self._realtime and self._last_ns is not None else 0.0
+        if abs(elapsed - (1 - last) % self._range) < _STEADY and last != self._range:
+            return  # the end of the turn was lost: so long it takes to go as far as it went before
+        if 0.0 < elapsed < 1.5 or last == self._wrapped_at:
             self._range = last
         self._wrapped_at = last
 

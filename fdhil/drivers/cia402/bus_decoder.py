@@ -83,6 +83,7 @@ class BusDecoder:
             "pdo_short": sum(c.short for c in counters),
             "pdo_long": sum(c.long for c in counters),
             "pdo_duplicates": sum(c.duplicates for c in counters),
+            "pdo_late": sum(c.late for c in counters),
             "pdo_ambiguous": sum(c.ambiguous for c in counters),
             **{f"{axis}.heard": watch.heard for axis, watch in self.watches.items()},
         }

@@ -24,6 +24,7 @@ from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.records import AxisSamples, Bool, Float, Int, Notice, frozen, frozen_ints
 
 _FOREIGN_TICKS = 8
+_OUTAGE = 16  # SYNCs missed in one go: the producer may have begun anew, and nobody knows what the drive heard
 _MISMATCHES = 3
 _READ_BACK_TOLERANCE = 2  # increments: two roundings
 
@@ -166,28 +167,42 @@ class Cia402Decoder:
         """Rows [first, stop); nothing while the demand is not known."""
         heard = self._heard(first, stop)
         grids = {name: dense(self._queues[name], first, stop + 1) for name in self.required}
-        lost = self._count(grids, heard, first)
+        between = self._between(first, stop + 1)
+        lost = self._count(grids, between, first)
         if demand is None:
             return []
         lost += demand.lost + int(np.count_nonzero(~heard))
         certain = demand.certain & heard
         for key, (name, _) in self._places.items():
             back = self._voltage.rows_back if key in self._voltage.keys else 0
-            certain &= grids[name].present[back : back + stop - first]
+            certain &= grids[name].certain(between)[back : back + stop - first]
         if offset is not None:
             certain &= offset.certain
         self.counters.lost += demand.lost
         return [self._record(np.flatnonzero(certain), first, grids, demand, offset, lost)]
 
-    def _count(self, grids: Mapping[str, Dense], heard: Bool, first: int) -> int:
-        """Count what is wrong with the frames of the rows' own ticks; returns the number lost."""
-        rows = heard.size
-        lost = sum(self._queues[name].lost(grid.missing[:rows], heard, first) for name, grid in grids.items())
+    def _between(self, first: int, stop: int) -> Int:
+        """How many periods it is from each SYNC of ticks [first, stop) to the next one heard; 0 for one not heard."""
+        low, high = self._syncs.searchsorted((first, stop))
+        steps = np.diff(self._syncs[low : high + 1])
+        between = np.zeros(stop - first, np.int64)
+        between[self._syncs[low : low + steps.size] - first] = steps
+        return between
+
+    def _count(self, grids: Mapping[str, Dense], between: Int, first: int) -> int:
+        """Count what is wrong with the frames of the rows' own ticks; returns the number lost.
+
+        A SYNC that was lost on the way here was heard by the drive: so many frames are due as SYNCs were sent.
+        """
+        due = np.where(between > _OUTAGE, 1, between)
+        balances = {name: grid.balance(due) for name, grid in grids.items()}
+        lost = sum(self._queues[name].lost(gone, due[:-1], first) for name, (gone, _, _) in balances.items())
         self._irregular()
-        ambiguous = np.zeros(rows, np.bool_)
-        for grid in grids.values():
-            self.counters.duplicates += int(grid.duplicates[:rows].sum())
-            ambiguous |= grid.ambiguous[:rows]
+        self._late({name: int(late.sum()) for name, (_, late, _) in balances.items()})
+        ambiguous = np.zeros(between.size - 1, np.bool_)
+        for name, grid in grids.items():
+            self.counters.duplicates += int(balances[name][2][~grid.ambiguous[:-1]].sum())
+            ambiguous |= grid.ambiguous[:-1]
         self.counters.ambiguous += int(np.count_nonzero(ambiguous))
         self.counters.lost += lost
         self._foreign(ambiguous)
@@ -203,6 +218,16 @@ class Cia402Decoder:
                 f"set the transmission type ({kinds}) to 1, or see whether it still is Operational."
             )
             self._tell("PdoIrregular", "MAJOR", text)
+
+    def _late(self, counts: Mapping[str, int]) -> None:
+        names = ", ".join(f"{name} ({self._queues[name].cob_id:03X})" for name, count in counts.items() if count)
+        if names:
+            self.counters.late += sum(counts.values())
+            text = (
+                f"Drive {self.axis} sent {names} later than the next SYNC; it cannot be told from that one's, so the "
+                "samples of both are left out. See whether the bus is too busy, or the drive too slow for this period."
+            )
+            self._tell("LateFrame", "minor", text)
 
     def _foreign(self, ambiguous: Bool) -> None:
         clean = np.flatnonzero(~ambiguous)

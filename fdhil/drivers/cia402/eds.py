@@ -21,6 +21,7 @@ from fdhil.errors import EdsError
 
 MAX_BYTES = 2 * 1024 * 1024
 MAX_OBJECTS = 6_000  # the library reads this many in a second; real drives have some hundreds
+MAX_SECTIONS, MAX_KEYS = 8_000, 50_000  # with these it is as quick
 MAX_LINE = 4096
 MAX_SUB_INDEX = 254
 
@@ -104,7 +105,7 @@ def _sections(raw: bytes, name: str) -> list[_Section]:
         raise EdsError(name, f"it is larger than {MAX_BYTES >> 20} MiB; this is no EDS file")
     sections: dict[str, _Section] = {}
     current: _Section | None = None
-    objects = 0
+    objects = keys = 0
     for number, line in _lines(raw, name):
         header = _SECTION.match(line)
         if header:
@@ -114,10 +115,12 @@ def _sections(raw: bytes, name: str) -> list[_Section]:
                 objects += bool(_OBJECT.match(title))
             current = sections[title]
         elif current is not None and "=" in line:
+            keys += 1
             key, _, value = line.partition("=")
             _store(current, key.strip(), value, number, name)
-        if objects > MAX_OBJECTS:
-            raise EdsError(name, f"line {number}: it has more than {MAX_OBJECTS} objects; this is no drive's EDS")
+        if objects > MAX_OBJECTS or len(sections) > MAX_SECTIONS or keys > MAX_KEYS:
+            most = f"{MAX_OBJECTS} objects, {MAX_SECTIONS} sections or {MAX_KEYS} keys"
+            raise EdsError(name, f"line {number}: it has more than {most}; this is no drive's EDS")
     if raw.lstrip(b"\xef\xbb\xbf \r\n\t").startswith(b"<"):
         raise EdsError(name, "line 1: it is XML (an XDD, or an ESI of EtherCAT); ask the drive's maker for its EDS")
     if not any(_OBJECT.match(title) for title in sections):

@@ -28,12 +28,13 @@ def decode(entry: PdoEntry, data: Words) -> Int:
 
 @dataclass(slots=True)
 class DecoderCounters:
-    """The counts of a decoder: frames lost, too short, too long, duplicated, and ambiguous ones it put aside."""
+    """The counts of a decoder: frames lost, too short, too long, duplicated, late, and ambiguous ones it put aside."""
 
     lost: int = 0
     short: int = 0
     long: int = 0
     duplicates: int = 0
+    late: int = 0
     ambiguous: int = 0
 
 
@@ -74,16 +75,16 @@ class PdoQueue:
         self.tick = np.concatenate([self.tick, ticked.tick[mine]])
         self.data = np.concatenate([self.data, ticked.data[mine]])
 
-    def lost(self, missing: Bool, due: Bool, first: int) -> int:
-        """Return the frames lost on rows (n,) from tick ``first`` on: those ``missing`` where one was ``due``.
+    def lost(self, missing: Int, due: Int, first: int) -> int:
+        """Return the frames lost on rows (n,) from tick ``first`` on: those ``missing`` of so many that were ``due``.
 
         None is lost before the first one ever, nor while it is not sent with SYNC.
         """
         if self.first_tick is None:
             return 0
         begun = slice(max(0, self.first_tick - first), None)
-        gone = int(np.count_nonzero(missing[begun] & due[begun]))
-        self._due, self._gone = self._due + int(np.count_nonzero(due[begun])), self._gone + gone
+        gone = int(missing[begun].sum())
+        self._due, self._gone = self._due + int(due[begun].sum()), self._gone + gone
         if self._due >= JUDGED_TICKS:
             self.synchronous = self._gone <= MOST * self._due
             self._due = self._gone = 0
@@ -112,18 +113,28 @@ class Dense:
     """A PDO on every tick of [first, first + n): data ``words`` (n,), ``present`` (n,) and ``ambiguous`` (n,).
 
     Of equal frames in one tick the first is used; different ones cannot be told apart (one may be late, one may be
-    another producer's), so none is. ``duplicates`` (n,) counts the equal ones to spare.
+    another producer's), so none is. ``count`` (n,) is how many came.
     """
 
     words: Words
     present: Bool
     ambiguous: Bool
-    duplicates: Int
+    count: Int
 
-    @property
-    def missing(self) -> Bool:
-        """Ticks (n,) in which no frame came at all."""
-        return ~self.present & ~self.ambiguous
+    def certain(self, between: Int) -> Bool:
+        """Ticks (n,) whose frame is theirs, so many periods ``between`` (n,) it and the next SYNC that was heard."""
+        return self.present & ((between <= 1) | (self.count >= between))
+
+    def balance(self, due: Int) -> tuple[Int, Int, Int]:
+        """Return how many are missing, late and to spare, each (n - 1,), where so many were ``due`` (n,).
+
+        A late one came after the next SYNC that was heard: too few before it, too many behind it.
+        """
+        missing, spare = np.maximum(due - self.count, 0), np.where(due > 0, np.maximum(self.count - due, 0), 0)
+        heard = np.flatnonzero(due > 0)
+        late = np.zeros(due.size, np.int64)
+        late[heard[:-1]] = (missing[heard[:-1]] > 0) & (spare[heard[1:]] > 0)
+        return (missing - late)[:-1], late[:-1], spare[:-1]
 
 
 def dense(queue: PdoQueue, first: int, stop: int) -> Dense:
@@ -131,7 +142,7 @@ def dense(queue: PdoQueue, first: int, stop: int) -> Dense:
     n = stop - first
     regular = queue.gapless(first, stop)
     if regular is not None:
-        return Dense(regular, np.ones(n, np.bool_), np.zeros(n, np.bool_), np.zeros(n, np.int64))
+        return Dense(regular, np.ones(n, np.bool_), np.zeros(n, np.bool_), np.ones(n, np.int64))
     tick, data = queue.between(first, stop)
     place = tick - first
     words = np.zeros(n, np.uint64)
@@ -140,8 +151,7 @@ def dense(queue: PdoQueue, first: int, stop: int) -> Dense:
     ambiguous = np.zeros(n, np.bool_)
     if tick.size > np.count_nonzero(count):
         ambiguous[place[data != words[place]]] = True
-    duplicates = np.where(ambiguous, 0, np.maximum(count - 1, 0))
-    return Dense(words, (count > 0) & ~ambiguous, ambiguous, duplicates)
+    return Dense(words, (count > 0) & ~ambiguous, ambiguous, count)
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +174,7 @@ class Setpoint:
         self.held: int | None = None
         self._entry = entry
         self._streaming = False
-        self._held_doubtful = False  # different frames came in its tick: the SYNC between them was lost
+        self._held_crowded = False  # several frames came in its tick: the SYNC between them was lost
         self.shift = delay + 1  # a frame after SYNC j is latched at SYNC j+1 and in force ``delay`` cycles later
         self._reach = delay + 2  # a gap is looked across as far as is known when its row leaves
 
@@ -173,7 +183,7 @@ class Setpoint:
         regular = self.queue.gapless(first - self.shift, stop - self.shift)
         if regular is not None:
             return SetpointRows(decode(self._entry, regular), np.ones(stop - first, np.bool_), 0)
-        ticks, words, doubtful = self._latched()
+        ticks, words, doubtful, crowded = self._latched()
         values = decode(self._entry, words)
         wanted = np.arange(first - self.shift, stop - self.shift)
         at = np.searchsorted(ticks, wanted, side="right") - 1
@@ -190,21 +200,21 @@ class Setpoint:
         certain = ~(gap & (values[following] != value)) & ~(exact & doubtful[now])
         if self.held is None:
             certain &= at >= 0
-        before_gap = np.where(at >= 0, doubtful[now], self._held_doubtful)
+        before_gap = np.where(at >= 0, crowded[now], self._held_crowded)
         lost = int(np.count_nonzero(gap & ~before_gap))
         return SetpointRows(value, certain, lost)
 
-    def _latched(self) -> tuple[Int, Words, Bool]:
-        """Tick and word of the last frame of each tick, and whether different ones came in that tick."""
+    def _latched(self) -> tuple[Int, Words, Bool, Bool]:
+        """Tick and word of the last frame of each tick, whether different ones came in it, and whether several."""
         tick, data = self.queue.tick, self.queue.data
         if tick.size == 0:
-            return tick, data, np.empty(0, np.bool_)
+            return tick, data, np.empty(0, np.bool_), np.empty(0, np.bool_)
         last = np.append(np.flatnonzero(np.diff(tick)), tick.size - 1)
         doubtful = np.zeros(last.size, np.bool_)
         if last.size < tick.size:
             group = np.searchsorted(tick[last], tick)
             doubtful[np.unique(group[data != data[last][group]])] = True
-        return tick[last], data[last], doubtful
+        return tick[last], data[last], doubtful, np.diff(last, prepend=-1) > 1
 
     def forget(self, row: int) -> None:
         """Drop the frames that no row from ``row`` on needs, but hold the newest of them."""
@@ -212,7 +222,6 @@ class Setpoint:
         count = int(np.searchsorted(self.queue.tick, keep))
         if count:
             self.held = int(decode(self._entry, self.queue.data[count - 1 : count])[0])
-            newest = self.queue.data[int(np.searchsorted(self.queue.tick, self.queue.tick[count - 1])) : count]
-            self._held_doubtful = bool((newest != newest[0]).any())
+            self._held_crowded = count > 1 and bool(self.queue.tick[count - 2] == self.queue.tick[count - 1])
             self._streaming = int(self.queue.tick[count - 1]) >= keep - self._reach
             self.queue.forget(keep)

@@ -14,6 +14,15 @@ _READS = (*BIT_READS, READ_HOLDING, READ_INPUT)
 _ECHO_BYTES, _EXCEPTION_BYTES, _LEAST_BYTES = 8, 5, 5
 
 
+def _shifted(crc: int) -> int:
+    for _ in range(8):
+        crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
+    return crc
+
+
+_SHIFTED = tuple(map(_shifted, range(256)))
+
+
 def crc16(data: bytes) -> int:
     """Return the checksum; over a frame with its own behind it is 0.
 
@@ -22,9 +31,7 @@ def crc16(data: bytes) -> int:
     """
     crc = 0xFFFF
     for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
+        crc = crc >> 8 ^ _SHIFTED[(crc ^ byte) & 0xFF]
     return crc
 
 
@@ -65,9 +72,8 @@ def find_answer(data: bytes, unit: int, function: int, count: int) -> bytes | No
     An adapter that hears its own request, and the noise of a driver that is switched on, come before it.
     """
     wanted = answer_bytes(function, count)
-    for at in range(len(data) - _EXCEPTION_BYTES + 1):
-        if data[at] != unit:
-            continue
+    at = -1
+    while 0 <= (at := data.find(unit, at + 1)) <= len(data) - _EXCEPTION_BYTES:
         refused = data[at : at + _EXCEPTION_BYTES]
         if refused[1] == function | ERROR and not crc16(refused):
             return refused[1:-2]
@@ -76,6 +82,17 @@ def find_answer(data: bytes, unit: int, function: int, count: int) -> bytes | No
         if len(frame) == wanted and frame[1] == function and fits and not crc16(frame):
             return frame[1:-2]
     return None
+
+
+def is_damaged(data: bytes, unit: int, function: int, count: int) -> bool:
+    """Whether bytes in which there is no answer are what became of it, so that no other will come.
+
+    Less than a whole frame may be noise, with the answer still to come.
+    """
+    if _whole_frame(data):
+        return data[0] == unit
+    begin = bytes([unit, function, data_bytes(function, count)] if function in _READS else [unit, function])
+    return data.startswith(begin) and len(data) >= answer_bytes(function, count)
 
 
 def fault_in(data: bytes, unit: int, function: int, count: int) -> tuple[str, str]:

@@ -2,6 +2,7 @@
 
 An answer names its unit and function but not what was asked. So what comes unasked is thrown away before the next
 request, and after a request that was not answered in time the line is heard for as long again before anybody asks.
+Noise, or a piece, is no answer: ours may still come, and must not be taken for that of the next request.
 """
 
 from __future__ import annotations
@@ -15,9 +16,17 @@ from weakref import WeakSet
 
 from fdhil.config.sensors import ModbusPlace
 from fdhil.drivers.modbus.line import Answer, DamagedAnswer, ModbusRefused, Request, no_answer
-from fdhil.drivers.modbus.rtu import ERROR, WRITE_REGISTER, answer_bytes, fault_in, find_answer, framed, numbers_in
+from fdhil.drivers.modbus.rtu import (
+    ERROR,
+    WRITE_REGISTER,
+    answer_bytes,
+    fault_in,
+    find_answer,
+    framed,
+    is_damaged,
+    numbers_in,
+)
 from fdhil.drivers.serial.port import SerialPort
-from fdhil.errors import DeviceTimeout
 
 RETRIES = 2
 SILENT_CHARACTERS = 3.5
@@ -25,6 +34,7 @@ SILENT_ABOVE_19200_S = 1.75e-3  # fixed there, "MODBUS over serial line" 2.5.1.1
 FASTEST_BY_CHARACTERS = 19200
 ADAPTER_S = 0.02  # bytes of one frame may come so far apart: a USB adapter hands them over every 16 ms
 _REQUEST_BYTES = 8
+MOST_BYTES = 512  # two frames of the longest: what is kept of what is no answer
 
 
 class RtuLine:
@@ -39,6 +49,7 @@ class RtuLine:
         fast = place.baud_rate > FASTEST_BY_CHARACTERS
         self.silence_s = SILENT_ABOVE_19200_S if fast else SILENT_CHARACTERS * self._port.character_s
         self._busy_until_ns = 0
+        self._owed: Request | None = None
         self._late_until_ns = 0
 
     @property
@@ -65,32 +76,29 @@ class RtuLine:
         raise AssertionError("unreachable")
 
     async def _exchange(self, request: Request) -> Answer:
-        await self._late_answers(request)
+        await self._late_answers(request.name)
         await self._fall_silent()
         body = struct.pack(">BHH", request.function, request.address, request.value)
         frame = framed(request.unit, body)
         sent_ns = self._port.send(request.name, frame)
         self._busy_until_ns = asked_ns = sent_ns + self._port.wire_ns(_REQUEST_BYTES)
-        try:
-            answer, answered_ns = await self._answer(
-                request, asked_ns, b"" if request.function == WRITE_REGISTER else frame
-            )
-        except DeviceTimeout:
-            self._late_until_ns = time.monotonic_ns() + round(request.timeout_s * 1e9)
-            raise
+        echo = b"" if request.function == WRITE_REGISTER else frame
+        answer, answered_ns = await self._answer(request, asked_ns, echo)
         if answer[0] == request.function | ERROR:
             raise ModbusRefused(request.name, request.address, answer[1])
         registers = numbers_in(answer[2:], request.function, request.count) if request.count else ()
         return Answer(registers, min(asked_ns, answered_ns), answered_ns)
 
-    async def _late_answers(self, request: Request) -> None:
+    async def _late_answers(self, name: str) -> None:
         """Hear the line after a request that was not answered, until the late answer is through or time is up."""
-        self.counted["ModbusStale"] += bool(self._port.discard())
-        while time.monotonic_ns() < self._late_until_ns:
-            if await self._port.receive(request.name, self._late_until_ns) is not None:
-                self.counted["ModbusStale"] += 1
-                self._late_until_ns = 0
-        self._late_until_ns = 0
+        stale, data, owed = bool(self._port.discard()), b"", self._owed
+        while owed is not None and time.monotonic_ns() < self._late_until_ns:
+            chunk = await self._port.receive(name, self._late_until_ns)
+            data = (data + (chunk.data if chunk is not None else b""))[-MOST_BYTES:]
+            if find_answer(data, owed.unit, owed.function, owed.count) is not None:
+                break
+        self.counted["ModbusStale"] += stale or bool(data)
+        self._owed = None
 
     async def _fall_silent(self) -> None:
         """Wait until nothing was on the line for 3.5 characters, and forget what was."""
@@ -109,7 +117,9 @@ class RtuLine:
         """
         port, unit, function, count = self._port, request.unit, request.function, request.count
         data, first_ns = b"", 0
-        deadline_ns = asked_ns + round(request.timeout_s * 1e9) + port.wire_ns(answer_bytes(function, count))
+        noise: DamagedAnswer | None = None
+        wanted = answer_bytes(function, count)
+        deadline_ns = asked_ns + round(request.timeout_s * 1e9) + port.wire_ns(wanted)
         pause_ns = round((self.silence_s + ADAPTER_S) * 1e9)
         while True:
             until_ns = min(deadline_ns, time.monotonic_ns() + pause_ns) if data else deadline_ns
@@ -117,19 +127,25 @@ class RtuLine:
             if chunk is not None:
                 first_ns = first_ns or chunk.t_ns - port.wire_ns(len(chunk.data))
                 data = (data + chunk.data).removeprefix(echo)
-                found = find_answer(data, unit, function, count)
+                # what began so early that it was all there before was looked at then: a line may babble for long
+                found = find_answer(data[-(len(chunk.data) + wanted) :], unit, function, count)
                 if found is not None:
                     return found, first_ns
+                data = data[-MOST_BYTES:]
                 continue
-            if not data:
-                raise no_answer(request)
-            kind, text = fault_in(data, unit, function, count)
-            if kind != "ModbusUnit":
-                raise DamagedAnswer(request.name, kind, text)
-            self.counted[kind] += 1  # it may have been asked by another master: ours may still come
+            if data:
+                damaged = DamagedAnswer(request.name, *fault_in(data, unit, function, count))
+                if damaged.kind == "ModbusUnit":
+                    self.counted[damaged.kind] += 1  # it may have been asked by another master: ours may still come
+                elif is_damaged(data, unit, function, count):
+                    raise damaged
+                else:
+                    noise = damaged
+                data, first_ns = b"", 0
             if time.monotonic_ns() >= deadline_ns:
-                raise no_answer(request)
-            data, first_ns = b"", 0
+                self._owed = request
+                self._late_until_ns = time.monotonic_ns() + round(request.timeout_s * 1e9)
+                raise noise or no_answer(request)
 
     def close(self) -> None:
         """Release the device."""

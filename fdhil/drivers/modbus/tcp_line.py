@@ -28,6 +28,10 @@ LIBRARYS_OWN_S = 100.0  # its one time-out for everything is longer than any of 
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
 
+class _Nonsense(ModbusException):
+    """Bytes came that the library cannot read."""
+
+
 class TcpLine:
     """A connection to ``host``:``port``, a sensor or a gateway to several."""
 
@@ -55,6 +59,7 @@ class TcpLine:
             self._client = AsyncModbusTcpClient(
                 self._host, port=self._port, timeout=LIBRARYS_OWN_S, retries=0, reconnect_delay=0
             )
+            _end_waiting_at_nonsense(self._client)
             try:
                 async with asyncio.timeout(timeout_s + CONNECT_S):
                     connected = await self._client.connect()
@@ -70,6 +75,11 @@ class TcpLine:
             asked_ns = time.monotonic_ns()
             answer = await self.answered(self._call(request), request)
             answered_ns = time.monotonic_ns()
+        if answer.function_code != request.function:
+            text = (
+                f"function {answer.function_code} is answered where {request.function} was asked; compare host and port"
+            )
+            raise DamagedAnswer(request.name, "ModbusShape", text)
         came = answer.bits if request.function in BIT_READS else answer.registers
         registers = tuple(map(int, came)) if request.count else ()
         spare = -request.count % 8 if request.function in BIT_READS else 0  # bits come in whole bytes
@@ -100,6 +110,10 @@ class TcpLine:
                 answer = await call
         except TimeoutError:
             raise self._silent(request) from None
+        except _Nonsense:
+            self.close()
+            text = "what came is no answer of Modbus TCP, the connection is made anew; compare host and port"
+            raise DamagedAnswer(request.name, "ModbusShape", text) from None
         except ModbusException as error:
             if not self.connected:
                 raise self._gone(request) from error
@@ -126,3 +140,20 @@ class TcpLine:
         if self._client is not None:
             self._client.close()
             self._client = None
+
+
+def _end_waiting_at_nonsense(client: AsyncModbusTcpClient) -> None:
+    """Have bytes that the library cannot read end the waiting: it raises in the loop, which tells a traceback."""
+    wire = client.ctx
+    read = wire.callback_data
+
+    def taken(data: bytes, addr: tuple[str, int] | None = None) -> int:
+        try:
+            return read(data, addr)
+        except ModbusException as error:
+            if not wire.response_future.done():
+                wire.response_future.set_exception(_Nonsense(str(error)))
+                wire.response_future.exception()  # nobody may wait any more
+            return len(data)
+
+    wire.callback_data = taken  # type: ignore[method-assign] # the library has no place for it

@@ -35,6 +35,8 @@ BLOCK_SAMPLES = 100
 ALL_REGISTERS = FIRST_SAMPLE + BLOCK_SAMPLES
 STATUS_LOST = 2
 STUCK_POLLS = 20
+TEAR = 1 << 16  # the lower word of a count is of another moment than the upper one
+_TEAR_SLACK_S = 0.2  # by which a count may be off from what has passed, and still show that it is torn
 _SETTLE_STEPS = 8
 _SETTLE_STEP_S = 0.01
 _SETTLED_NS = 50_000_000  # a query is placed when so many later SYNCs have shown which stamps around it were late
@@ -96,6 +98,8 @@ class ModbusVoltage:
         self._waiting: deque[tuple[int, int, int]] = deque(maxlen=BLOCK_SAMPLES)
         self._next: int | None = None
         self._still = 0
+        self._counted: tuple[int, int] | None = None
+        self._tears = 0
         self.lost = 0
         self.samples = 0
 
@@ -128,6 +132,9 @@ class ModbusVoltage:
     ) -> list[VoltageSamples | Temperature | Notice]:
         """Place a block on the timelines. Pure but for this object's own memory."""
         out: list[VoltageSamples | Temperature | Notice] = []
+        if self._torn(block, asked_ns):
+            text = f"The {self.name} gave a count whose words are of two moments; this answer is left out."
+            return [Notice("RegisterTear", "minor", text, self.axis)]
         self._clocks(block, asked_ns, answered_ns, ticks)
         block = self._unseen(block)
         out += self._continuity(block)
@@ -136,6 +143,19 @@ class ModbusVoltage:
         if block.volts.size:
             out.append(self._samples(block, ticks))
         return out
+
+    def _torn(self, block: SensorBlock, asked_ns: int) -> bool:
+        """Whether the count is off by 2^16 from what has passed since the last answer; twice running it is so."""
+        if self._counted is None:
+            leap = 0.0
+        else:
+            newest, then_ns = self._counted
+            leap = block.newest - newest - (asked_ns - then_ns) * 1e-9 * block.rate_hz
+        torn = abs(abs(leap) - TEAR) < _TEAR_SLACK_S * block.rate_hz < TEAR and self._tears == 0
+        self._tears = self._tears + 1 if torn else 0
+        if not torn:
+            self._counted = block.newest, asked_ns
+        return torn
 
     def _clocks(self, block: SensorBlock, asked_ns: int, answered_ns: int, ticks: TickClock) -> None:
         if self._host_clock is None or self._tick_clock is None or block.rate_hz != self._rate_hz:

@@ -15,6 +15,7 @@ from fdhil.errors import ConnectError, DeviceTimeout, ProtocolError
 
 MOST_HEAD_BYTES = 1 << 16
 MOST_BYTES = 1 << 24  # of a document
+MOST_DIGITS = 18
 READ_BYTES = 1 << 16
 _STATUS = re.compile(rb"HTTP/1\.[01] (\d{3})")
 
@@ -42,7 +43,7 @@ class Response:
             self.headers[key.strip().lower()] = value.strip()
         self._chunked = "chunked" in self.headers.get("transfer-encoding", "").lower()
         length = self.headers.get("content-length", "")
-        self._left = 0 if self._chunked else int(length) if length.isdecimal() else None
+        self._left = 0 if self._chunked else int(length) if length.isdecimal() and len(length) <= MOST_DIGITS else None
 
     async def _until(self, end: bytes) -> bytes:
         while end not in self._rest:

@@ -25,6 +25,7 @@ MOST_BYTES = 1 << 16
 CONNECT_S = 2.0
 HERE = ("127.0.0.1", "localhost", "::1")
 DISTANT_WINDOW_S = 60.0
+LARGEST = 1 << 60  # of what is counted: ns for 36 years
 NETWORK_NS = 5_000_000  # by which the quickest line of a while may be late
 
 
@@ -90,7 +91,7 @@ class LinuxCnc:
         line = self._waiting.popleft()
         try:
             told = json.loads(line)
-        except ValueError:
+        except (ValueError, RecursionError):
             told = None
         if not isinstance(told, dict):
             raise ProtocolError(self.name, f"said {line[:60]!r}, which is no state; is this port the bridge's?")
@@ -118,7 +119,7 @@ class LinuxCnc:
     def _state(self, told: Mapping[str, Any]) -> NcState:
         """Return the state that one line tells; ProtocolError."""
         try:
-            stamp_ns, error_ns = int(told["stamp_ns"]), int(told["error_ns"])
+            stamp_ns, error_ns = _whole(told["stamp_ns"]), _whole(told["error_ns"])
             if self._distant is not None:
                 stamp_ns -= self._distant.ahead_ns(stamp_ns, time.monotonic_ns())
                 error_ns += NETWORK_NS
@@ -126,16 +127,16 @@ class LinuxCnc:
                 stamp_ns=stamp_ns,
                 error_ns=error_ns,
                 motion=MoveKind(told["motion"]),
-                line=_maybe(told, "line", int),
+                line=_maybe(told, "line", _whole),
                 programmed_feed_mm_min=_maybe(told, "programmed_feed_mm_min", _finite),
                 feed_mm_min=_maybe(told, "feed_mm_min", _finite),
                 feed_override=_maybe(told, "feed_override", _finite),
                 rapid_override=_maybe(told, "rapid_override", _finite),
                 feed_hold=_maybe(told, "feed_hold", bool),
-                tool=_maybe(told, "tool", int),
+                tool=_maybe(told, "tool", _whole),
                 program=_maybe(told, "program", str),
                 demand_mm={str(axis): _finite(mm) for axis, mm in told["mm"].items()},
-                nc_tick=int(told["cycle"]),
+                nc_tick=_whole(told["cycle"]),
                 nc_period_s=self._period_s,
             )
         except (KeyError, ValueError, TypeError, AttributeError, OverflowError) as error:
@@ -147,6 +148,13 @@ class LinuxCnc:
 def _maybe(told: Mapping[str, Any], key: str, kind: Any) -> Any:
     value = told.get(key)
     return None if value is None else kind(value)
+
+
+def _whole(value: Any) -> int:
+    number = int(value)
+    if abs(number) > LARGEST:
+        raise ValueError("a number of more than 18 digits")
+    return number
 
 
 def _finite(value: Any) -> float:

@@ -21,6 +21,7 @@ Shown = bool | int | float | str | tuple[Any, ...] | None
 """A value as an interface shows it; None: it shows none."""
 LARGEST_FEED_MM_MIN = 1e7
 LARGEST_OVERRIDE = 10.0
+LARGEST_COUNT = 10**9 - 1
 TEXT = 400  # characters of a program's name
 _NUMBERED = re.compile(r"^\s*[NO]?0*(\d{1,9})\s*$", re.IGNORECASE)
 
@@ -165,11 +166,11 @@ def _counted(least: int) -> Callable[[Shown], int | None]:
     def check(value: Shown) -> int | None:
         if isinstance(value, str):
             found = _NUMBERED.match(value)
-            return int(found[1]) if found and int(found[1]) >= least else None
+            return int(found[1]) if found and least <= int(found[1]) <= LARGEST_COUNT else None
         number = _number(value)
         if number is None or number != round(number):
             raise ValueError(f"{value!r} is no whole number")
-        return int(number) if number >= least else None
+        return int(number) if least <= number <= LARGEST_COUNT else None
 
     return check
 

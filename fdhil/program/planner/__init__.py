@@ -25,13 +25,13 @@ MAX_ROWS = 10_000_000
 _BLOCK_ROWS = 1 << 16
 
 
-def plan(motions: Iterable[Motion], config: MachineConfig) -> Trajectory:
+def plan(motions: Iterable[Motion], config: MachineConfig, max_rows: int = MAX_ROWS) -> Trajectory:
     """Return the reference that the NC makes of ``motions``; row 0 is the rest at machine zero.
 
     ProgramError for an axis that the machine does not have, a feed of nothing, and a duration of more than
-    ``MAX_ROWS`` SYNC periods.
+    ``max_rows`` SYNC periods.
     """
-    return _trajectory(np.concatenate(list(_parts(motions, config, _BLOCK_ROWS, MAX_ROWS))), 0, config)
+    return _trajectory(np.concatenate(list(_parts(motions, config, _BLOCK_ROWS, max_rows))), 0, config)
 
 
 def stream(

@@ -77,7 +77,8 @@ class PdoEngine:
     """All PDOs of one device. ``drop`` maps TPDO numbers to how many frames are still to be lost, -1 for all.
 
     ``heard`` has the numbers of the RPDOs received since the last SYNC, ``heard_before`` those of the cycle before;
-    ``offset_rpdos`` are those that carry the position offset.
+    ``sent`` and ``sent_before`` are those and what was lost on the way here, by a fault of the bus. ``offset_rpdos``
+    are those that carry the position offset.
     """
 
     def __init__(self, dictionary: Dictionary, changeable: Callable[[], bool], drop: dict[int, int]) -> None:
@@ -88,6 +89,8 @@ class PdoEngine:
         self._tpdos: list[Pdo] = []
         self.heard: set[int] = set()
         self.heard_before: set[int] = set()
+        self.sent: set[int] = set()
+        self.sent_before: set[int] = set()
         self.offset_rpdos: frozenset[int] = frozenset()
         self._register_checks()
 
@@ -97,11 +100,13 @@ class PdoEngine:
         self._tpdos = list(self.configured("tpdo"))
         self.offset_rpdos = frozenset(p.number for p in self._rpdos.values() if _POSITION_OFFSET in p.keys)
         self.heard, self.heard_before = set(), set()
+        self.sent, self.sent_before = set(), set()
 
     def stop(self) -> None:
         """Leave OPERATIONAL."""
         self._rpdos, self._tpdos = {}, []
         self.heard, self.heard_before = set(), set()
+        self.sent, self.sent_before = set(), set()
 
     def configured(self, direction: str) -> Iterator[Pdo]:
         """Yield the PDOs of a direction (``rpdo`` or ``tpdo``) as the dictionary describes them."""
@@ -174,7 +179,13 @@ class PdoEngine:
         pdo.pending = data[: pdo.codec.size]
         pdo.last_s = now_s
         self.heard.add(pdo.number)
+        self.sent.add(pdo.number)
         return None if pdo.synchronous else pdo
+
+    def lost(self, can_id: int) -> None:
+        """An RPDO was sent and did not get here."""
+        if can_id in self._rpdos:
+            self.sent.add(self._rpdos[can_id].number)
 
     def latch(self) -> None:
         """A SYNC: apply what was received since the last one."""
@@ -182,6 +193,7 @@ class PdoEngine:
             if pdo.pending is not None and pdo.synchronous:
                 self.apply(pdo)
         self.heard_before, self.heard = self.heard, set()
+        self.sent_before, self.sent = self.sent, set()
 
     def apply(self, pdo: Pdo) -> None:
         """Write the received values into the dictionary; a value out of its range is not taken."""

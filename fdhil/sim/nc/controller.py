@@ -346,6 +346,7 @@ class NcController:
         return Row(self._position, rapid, stage.playing)
 
     def _at_rest(self) -> None:
+        self._stopping = False  # what was to be stopped has ended
         if not self._hold and self.phase is Phase.READY:
             self._rate.jump(self.override)
         if self._leaving and not any(row.playing for row in self._rows):

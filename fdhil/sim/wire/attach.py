@@ -47,7 +47,15 @@ def _no_bus(name: str, bus: CanBus, error: OSError) -> ConnectError:
     )
 
 
-class SocketCan(Attachment):
+class _Joined(Attachment):
+    """A bus that is not the twin's own: it has told everybody already, and nobody can be sent away."""
+
+    def relay(self, frame: Frame, sender: object) -> None: ...
+
+    def hang_up(self) -> None: ...
+
+
+class SocketCan(_Joined):
     """A CAN interface of the kernel by a raw socket (half the time per frame of a library's message objects)."""
 
     def __init__(self, name: str, bus: CanBus) -> None:
@@ -86,7 +94,9 @@ class SocketCan(Attachment):
             except OSError:  # nothing more, or the interface went down
                 return
             if not can_id & _ERROR_FRAME:
-                handler((can_id & ~_REMOTE_FRAME, b"" if can_id & _REMOTE_FRAME else data[:length]))
+                content = b"" if can_id & _REMOTE_FRAME else data[:length]
+                for frame, _ in self.spoil((can_id & ~_REMOTE_FRAME, content), None):
+                    handler(frame)
 
     def send(self, frames: Sequence[Frame]) -> None:
         self._out.extend(frames)
@@ -108,7 +118,7 @@ class SocketCan(Attachment):
         self._socket.close()
 
 
-class VirtualBus(Attachment):
+class VirtualBus(_Joined):
     """python-can's ``virtual`` bus inside this process; a thread wakes the loop for what comes."""
 
     def __init__(self, bus: CanBus) -> None:
@@ -131,7 +141,8 @@ class VirtualBus(Attachment):
         if self._pipe in ready:
             self._pipe.clear()
         while self._in:
-            handler(self._in.popleft())
+            for frame, _ in self.spoil(self._in.popleft(), None):
+                handler(frame)
 
     def send(self, frames: Sequence[Frame]) -> None:
         self._out.extend(frames)

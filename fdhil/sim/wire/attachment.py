@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from typing import Protocol
 
 from fdhil.sim.frame import Frame
 
 Handler = Callable[[Frame], None]
+Spoil = Callable[[Frame, object], Iterable[tuple[Frame, object]]]
+"""What really comes in place of a frame, each with who sent it."""
 
 
 class Selectable(Protocol):
@@ -25,11 +27,12 @@ class Attachment(ABC):
     """A bus to which the twin is attached; the defaults are those of one that takes everything at once.
 
     ``settings`` are the arguments with which ``can.Bus`` joins. ``senders_left`` counts the parties that left after
-    they had sent frames, as far as the bus can tell.
+    they had sent frames, as far as the bus can tell. ``spoil`` stands between the others and the twin.
     """
 
     settings: dict[str, str | int]
     senders_left = 0
+    spoil: Spoil = staticmethod(lambda frame, sender: ((frame, sender),))
 
     @property
     def congested(self) -> bool:
@@ -51,6 +54,14 @@ class Attachment(ABC):
     @abstractmethod
     def pump(self, ready: Sequence[object], handler: Handler) -> None:
         """Give every frame that the other parties sent to ``handler``."""
+
+    @abstractmethod
+    def relay(self, frame: Frame, sender: object) -> None:
+        """Let the others hear what one of them sent; nothing where the bus has done so by itself."""
+
+    @abstractmethod
+    def hang_up(self) -> None:
+        """Let go of everybody, where that can be done; they may join anew."""
 
     @abstractmethod
     def send(self, frames: Sequence[Frame]) -> None:

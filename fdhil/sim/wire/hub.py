@@ -126,7 +126,15 @@ class Hub(Attachment):
             if client.socket in ready:
                 self._read(client, handler)
 
-    def send(self, frames: Sequence[Frame], sender: _Client | None = None) -> None:
+    def relay(self, frame: Frame, sender: object) -> None:
+        if len(self._clients) > 1:
+            self.send((frame,), sender)
+
+    def hang_up(self) -> None:
+        for client in self._clients:
+            client.gone = True
+
+    def send(self, frames: Sequence[Frame], sender: object = None) -> None:
         """Queue frames to every client but the sender."""
         if not self._clients:
             return
@@ -193,9 +201,9 @@ class Hub(Attachment):
                 self.malformed += 1
                 return
             client.sends = True
-            if len(self._clients) > 1:
-                self.send((frame,), client)
-            handler(frame)
+            for each, sender in self.spoil(frame, client):
+                self.relay(each, sender)
+                handler(each)
         else:
             self._greet(client, [word.decode("ascii", "replace") for word in command.split()[1:]])
 

@@ -1,4 +1,4 @@
-"""Serves the separate voltage sensor of an axis by Modbus TCP, with a small sample memory that can be latched.
+"""The separate voltage sensor of an axis, with a small sample memory that can be latched.
 
 Its own registers, 16 bit, 32 bit values in two with the high word first, the same as input (fc 4) and holding ones (3):
 
@@ -9,33 +9,22 @@ Its own registers, 16 bit, 32 bit values in two with the high word first, the sa
     8-9     slide-way temperature in degC       14      number of samples in the block; 15 is 0
                                                 16-115  samples, int16
 
-Sample c is the mean over [c Ts, (c + 1) Ts) of the sensor's own time, which is the simulated one. Any unit identifier
-is answered, as TCP sensors do. The servers run in a thread of their own.
+Sample c is the mean over [c Ts, (c + 1) Ts) of the sensor's own time, which is the simulated one.
 """
 
 from __future__ import annotations
 
-import asyncio
-import logging
 import struct
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
 
 import numpy as np
-from pymodbus.constants import ExcCodes
-from pymodbus.server import ModbusTcpServer
-from pymodbus.simulator import DataType, SimData, SimDevice
 
-from fdhil.errors import ConnectError
-from fdhil.sim.wire.registers import RegisterMap
 from fdhil.sim.wire.sensor_faults import SensorFaults
 
 REGISTERS = 116
 BLOCK = 100
 TRIGGER, STATUS, FIRST_SAMPLE = 10, 11, 16
-_READS, _WRITES = (3, 4), (6, 16)
-_UNIT_BYTE = 6  # of a Modbus TCP packet
 _NOISE_BLOCK = 1024
 
 
@@ -106,152 +95,3 @@ class VoltageSensor:
 
 def _words(data: bytes) -> list[int]:
     return list(struct.unpack(f">{len(data) // 2}H", data))
-
-
-class _TcpUnit:
-    """A register map as a device of pymodbus."""
-
-    def __init__(self, registers: RegisterMap, faults: SensorFaults) -> None:
-        self._registers, self._faults = registers, faults
-
-    async def access(
-        self,
-        function_code: int,
-        start_address: int,
-        address: int,
-        count: int,
-        current: list[int],
-        values: list[int] | list[bool] | None,
-    ) -> ExcCodes | None:
-        """Serve one request: pymodbus calls it before it reads ``current`` or writes ``values`` into it."""
-        if self._faults.slow_s:
-            await asyncio.sleep(self._faults.slow_s)
-        if self._faults.exception:
-            return ExcCodes(self._faults.exception)
-        if not values and function_code in _WRITES:
-            return None  # a write is read back for its answer
-        if function_code not in (_WRITES if values else _READS):
-            return ExcCodes.ILLEGAL_FUNCTION
-        if values:
-            if list(values) != [1]:
-                return ExcCodes.ILLEGAL_VALUE
-            self._registers.latch()
-        for place, word in self._registers.words().items():
-            if 0 <= place - start_address < len(current):
-                current[place - start_address] = word
-        return None
-
-    def device(self, unit: int) -> SimDevice:
-        """Return the device for pymodbus: only the trigger may be written, other addresses do not exist."""
-        parts, trigger = [], self._registers.trigger
-        for first, count in _stretches(sorted(self._registers.words()), trigger):
-            own = first == trigger
-            parts.append(SimData(first, values=[0] * count, datatype=DataType.REGISTERS, readonly=not own))
-        return SimDevice(id=unit, simdata=parts, action=self.access)
-
-
-def _stretches(addresses: list[int], alone: int | None) -> list[tuple[int, int]]:
-    """Return begin and length of each run of addresses; ``alone`` is one of its own."""
-    runs: list[tuple[int, int]] = []
-    for at in addresses:
-        begin, length = runs[-1] if runs else (at, 0)
-        if runs and at == begin + length and alone not in (at, at - 1):
-            runs[-1] = begin, length + 1
-        else:
-            runs.append((at, 1))
-    return runs
-
-
-class SensorServers:
-    """The Modbus TCP servers of a machine, in one thread; ``ports`` by axis once :meth:`start` has returned."""
-
-    def __init__(
-        self,
-        sensors: Mapping[str, VoltageSensor],
-        addresses: Mapping[str, tuple[str, int]],
-        maps: Mapping[str, RegisterMap] | None = None,
-        units: Mapping[str, int] | None = None,
-    ) -> None:
-        """Serve the sensors that have an address, each with the registers of ``maps`` in place of its own.
-
-        Those with one address are behind a gateway: each answers to its own number of ``units`` only.
-        """
-        self._sensors, self._addresses, self._units = sensors, addresses, units or {}
-        self._maps: Mapping[str, RegisterMap] = sensors if maps is None else maps
-        self._servers: list[ModbusTcpServer] = []
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._run, name="sim-modbus", daemon=True)
-        self.ports: dict[str, int] = {}
-
-    def start(self) -> None:
-        """Open every port; ConnectError when one cannot be had."""
-        # pymodbus logs every exception that it answers as an error with a dump of frames
-        logging.getLogger("pymodbus.logging").setLevel(logging.CRITICAL)
-        self._thread.start()
-        try:
-            asyncio.run_coroutine_threadsafe(self._open(), self._loop).result()
-        except ConnectError:
-            self.stop()
-            raise
-
-    def stop(self) -> None:
-        """Close every port and end the thread."""
-        asyncio.run_coroutine_threadsafe(self._close(), self._loop).result()
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join()
-        self._loop.close()
-
-    def _run(self) -> None:
-        asyncio.set_event_loop(self._loop)
-        self._loop.run_forever()
-
-    async def _open(self) -> None:
-        for axes in self._gateways():
-            port = await self._serve(axes)
-            self.ports |= dict.fromkeys(axes, port)
-
-    def _gateways(self) -> list[list[str]]:
-        """Return the axes by the server that they share; a port that is yet to be chosen is nobody else's."""
-        shared: dict[tuple[str, int | str], list[str]] = {}
-        for axis, (host, port) in self._addresses.items():
-            shared.setdefault((host, port or axis), []).append(axis)
-        return list(shared.values())
-
-    async def _serve(self, axes: list[str]) -> int:
-        """Serve the units of one address and return its port; ConnectError."""
-        host, port = self._addresses[axes[0]]
-        faults = {self._units.get(axis, 0) if len(axes) > 1 else 0: self._sensors[axis].faults for axis in axes}
-        parts = zip(axes, faults.items(), strict=True)
-        devices = [_TcpUnit(self._maps[axis], one).device(unit) for axis, (unit, one) in parts]
-        server = ModbusTcpServer(devices, address=(host, port), trace_packet=_muffled(faults))
-        try:
-            await server.serve_forever(background=True)
-        except RuntimeError:
-            raise ConnectError(
-                f"voltage sensor {axes[0]}",
-                f"TCP port {port} of {host} cannot be had: end the program that holds it, or set "
-                f"axis.{axes[0]}.voltage.port to another one (0 lets the simulator choose one)",
-            ) from None
-        self._servers.append(server)
-        listener = server.transport
-        assert isinstance(listener, asyncio.Server)
-        return int(listener.sockets[0].getsockname()[1])
-
-    async def _close(self) -> None:
-        for server in self._servers:
-            server.serving.cancel()
-            server.close()
-        others = asyncio.all_tasks(self._loop) - {asyncio.current_task(self._loop)}
-        for task in others:
-            task.cancel()
-        await asyncio.gather(*others, return_exceptions=True)
-
-
-def _muffled(faults: Mapping[int, SensorFaults]) -> Callable[[bool, bytes], bytes]:
-    """Return the hook through which every packet goes: a silent sensor sends nothing. 0 is whatever unit."""
-
-    def hook(sending: bool, packet: bytes) -> bytes:
-        told = faults.get(0) or faults.get(packet[_UNIT_BYTE]) if len(packet) > _UNIT_BYTE else None
-        return b"" if sending and told is not None and told.silent else packet
-
-    return hook

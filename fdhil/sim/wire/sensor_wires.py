@@ -7,7 +7,8 @@ from typing import Any
 
 from fdhil.config import MachineConfig, TableEncoder, Thermometer
 from fdhil.errors import ConnectError
-from fdhil.sim.wire.modbus_sensor import SensorServers, VoltageSensor
+from fdhil.sim.wire.modbus_sensor import VoltageSensor
+from fdhil.sim.wire.modbus_tcp import SensorServers
 from fdhil.sim.wire.registers import Joined, OneValue, RegisterMap, map_of, thermometer_map
 from fdhil.sim.wire.serial_lines import Party, RtuUnits, SerialLines, TextInstrument
 

@@ -13,6 +13,7 @@ import struct
 import threading
 import time
 import tty
+from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
@@ -22,26 +23,27 @@ from pymodbus.framer import FramerRTU
 from fdhil.config import Thermometer, Voltage
 from fdhil.errors import ConnectError
 from fdhil.sim.wire.attachment import WakePipe
+from fdhil.sim.wire.modbus_answers import answer, spoilt
 from fdhil.sim.wire.registers import RegisterMap
 from fdhil.sim.wire.sensor_faults import SensorFaults
 
-_READS, _WRITE = (3, 4), 6
 _REQUEST = 8
 _TURN_S = 0.25
+_PIECES_S = 0.005
 _FRAME_END_S = 0.02  # so long a silence ends a frame, whatever of it has come
 
 
 class Party(Protocol):
     """What is connected to a line."""
 
-    def take(self, data: bytes) -> bytes:
-        """Take what came and return what is answered; empty while there is nothing to say."""
+    def take(self, data: bytes) -> list[bytes]:
+        """Take what came and return the pieces of what is answered; none while there is nothing to say."""
 
     def due_s(self) -> float:
         """Return when (monotonic) it tells something by itself; infinite: never."""
 
-    def tell(self) -> bytes:
-        """Return what it tells by itself now."""
+    def tell(self) -> list[bytes]:
+        """Return the pieces of what it tells by itself now."""
 
 
 class RtuUnits:
@@ -51,52 +53,36 @@ class RtuUnits:
         self.units: dict[int, tuple[RegisterMap, SensorFaults]] = {}
         self._begun = b""
         self._last_s = 0.0
-        self._late: tuple[float, bytes] | None = None
+        self._late: deque[tuple[float, list[bytes]]] = deque()
 
-    def take(self, data: bytes) -> bytes:
+    def take(self, data: bytes) -> list[bytes]:
         """Answer a whole request; what another unit is asked is not heard."""
         now_s = time.monotonic()
         self._begun = data if now_s - self._last_s > _FRAME_END_S else self._begun + data
         self._last_s = now_s
         if len(self._begun) < _REQUEST:
-            return b""
+            return []
         request, self._begun = self._begun[:_REQUEST], self._begun[_REQUEST:]
         if _sealed(request[:-2]) != request or request[0] not in self.units:
-            return b""
+            return []
         registers, faults = self.units[request[0]]
-        if faults.silent:
-            return b""
-        answer = _sealed(request[:1] + _answer(registers, faults, request[1:-2]))
+        pieces = spoilt(faults, _framed, request[0], answer(registers, faults, request[1:-2]))
         if not faults.slow_s:
-            return answer
-        self._late = now_s + faults.slow_s, answer
-        return b""
+            return pieces
+        self._late.append((now_s + faults.slow_s, pieces))
+        return []
 
     def due_s(self) -> float:
         """Return when an answer that is late comes."""
-        return self._late[0] if self._late else float("inf")
+        return self._late[0][0] if self._late else float("inf")
 
-    def tell(self) -> bytes:
+    def tell(self) -> list[bytes]:
         """Return the answer that was late."""
-        late, self._late = self._late, None
-        return late[1] if late else b""
+        return self._late.popleft()[1] if self._late else []
 
 
-def _answer(registers: RegisterMap, faults: SensorFaults, body: bytes) -> bytes:
-    """Return function and data of the answer to a request."""
-    function, address, value = struct.unpack(">BHH", body)
-    if faults.exception:
-        return bytes([function | 0x80, faults.exception])
-    if function == _WRITE and address == registers.trigger:
-        registers.latch()
-        return body
-    words = registers.words() if function in _READS else {}
-    if function not in (*_READS, _WRITE):
-        return bytes([function | 0x80, 1])
-    if function == _WRITE or any(at not in words for at in range(address, address + value)):
-        return bytes([function | 0x80, 2])
-    wanted = [words[at] for at in range(address, address + value)]
-    return struct.pack(f">BB{value}H", function, 2 * value, *wanted)
+def _framed(unit: int, body: bytes) -> bytes:
+    return _sealed(bytes([unit]) + body)
 
 
 def _sealed(frame: bytes) -> bytes:
@@ -112,25 +98,25 @@ class TextInstrument:
         self._heard = b""
         self._next_s = float("inf") if settings.query else time.monotonic()
 
-    def take(self, data: bytes) -> bytes:
+    def take(self, data: bytes) -> list[bytes]:
         """Answer each whole question."""
         if not self._query:
-            return b""
+            return []
         *questions, self._heard = (self._heard + data).split(self._query)
-        return b"".join(self.tell() for _ in questions)
+        return [line for _ in questions for line in self.tell()]
 
     def due_s(self) -> float:
         """Return when the next line is due."""
         return self._next_s
 
-    def tell(self) -> bytes:
+    def tell(self) -> list[bytes]:
         """Return a line; nothing while it is silent."""
         while not self._query and self._next_s <= time.monotonic():  # what a busy computer missed is not told
             self._next_s += self._settings.period_s
         if self._faults.silent:
-            return b""
+            return []
         value = (self._read() - self._settings.offset) / self._settings.scale
-        return f"{value:+.4f}\r\n".encode()
+        return [f"{value:+.4f}\r\n".encode()]
 
 
 class Reading(Protocol):
@@ -162,10 +148,12 @@ class _Terminal:
         with contextlib.suppress(OSError):
             self.put(self.party.take(os.read(self.fd, 4096)))
 
-    def put(self, data: bytes) -> None:
-        with contextlib.suppress(OSError):  # nobody reads: what does not fit is lost, as on a line
-            if data:
-                os.write(self.fd, data)
+    def put(self, pieces: list[bytes]) -> None:
+        for place, piece in enumerate(pieces):
+            if place:
+                time.sleep(_PIECES_S)
+            with contextlib.suppress(OSError):  # nobody reads: what does not fit is lost, as on a line
+                os.write(self.fd, piece)
 
     def close(self) -> None:
         with contextlib.suppress(OSError):

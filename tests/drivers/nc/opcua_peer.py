@@ -44,14 +44,16 @@ class _Nodes(dict[ua.NodeId, NodeData]):
         return self[key] if key in self else default  # noqa: SIM401 (it is this that get is made of)
 
 
-class _QuickServer(InternalServer):
-    """The nodes that every server has are made once, not for each: that takes seconds."""
+async def load_once(server: InternalServer, shelf_file: Path | None = None) -> None:
+    """Give a server the nodes that every server has; they are made once, not for each: that takes seconds."""
+    if not _Nodes.made:
+        await InternalServer.load_standard_address_space(server)
+        _Nodes.made.update(server.aspace._nodes)
+    server.aspace._nodes = _Nodes()
 
-    async def load_standard_address_space(self, shelf_file: Path | None = None) -> None:
-        if not _Nodes.made:
-            await super().load_standard_address_space()
-            _Nodes.made.update(self.aspace._nodes)
-        self.aspace._nodes = _Nodes()
+
+class _QuickServer(InternalServer):
+    load_standard_address_space = load_once
 
 
 class OpcUaPeer:

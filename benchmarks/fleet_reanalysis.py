@@ -1,0 +1,115 @@
+"""All stored windows of a fleet again: in one process, and by 1 and 2 workers of a Dask cluster on this computer.
+
+Real PostgreSQL (Debian's) and real workers. ``--windows 2000`` is that many rapids, each another; the results of all
+runs are compared to the last bit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import hashlib
+import tempfile
+import time
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import psycopg
+from psycopg.types.json import Jsonb
+
+from fdhil.config import Identification
+from fdhil.config.fleet import Database, Fleet, Objects
+from fdhil.fleet import migrations, objects, reanalysis
+from fdhil.fleet.changes import changes
+from fdhil.fleet.questions import asking, entered
+from fdhil.fleet.window_work import Method, code_digest
+from fdhil.fleet.workers import workers
+from fdhil.identification.windows import find_windows
+from fdhil.pipeline import analyse
+from fdhil.store.history import described
+from fdhil.store.recording_csv import parse_recording
+from fdhil.store.windows import encode_window
+from studies import bench
+from tests.fleet.servers import Postgres, postgres
+
+BEGIN = datetime(2027, 1, 1, tzinfo=UTC)
+NOISE = 0.003
+CREWS = (0, 1, 2, 2, 1, 0)  # workers; each twice, so that a load that comes or goes meets all alike
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--windows", type=int, default=1000)
+    parser.add_argument("--method", default="maximum_likelihood")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as place, postgres() as database:
+        measure(Path(place), options.windows, options.method, database)
+
+
+def measure(folder: Path, windows: int, method: str, database: Postgres) -> None:
+    """Print what each number of workers takes."""
+    fleet = Fleet(database=Database(connection=database.connection), objects=Objects(directory=folder))
+    stored_bytes = asyncio.run(gathered(fleet, windows))
+    print(f"{windows} windows of {stored_bytes / windows / 1024:.1f} KiB, method {method}")
+    asked = Method(Identification(method=method), {}, folder, code_digest())
+    rates: dict[int, list[float]] = {}
+    digests = set()
+    for count in CREWS:
+        with entered(fleet) as db:
+            db.execute("TRUNCATE fleet.reanalyses CASCADE")
+        begin_s = time.perf_counter()
+        with workers(None, count) as crew:
+            up_s = time.perf_counter() - begin_s
+            revision = reanalysis.reanalyse(fleet, asked, reanalysis.Scope(), crew)
+            took_s = time.perf_counter() - begin_s - up_s
+        with asking(fleet) as db:
+            begin_s = time.perf_counter()
+            told = changes(db, revision, "type")
+            asked_s = time.perf_counter() - begin_s
+        assert told["windows"] == windows
+        digests.add(told["digest"])
+        rates.setdefault(count, []).append(windows / took_s)
+        print(f"{count} workers: up in {up_s:.1f} s, {took_s:.1f} s, the report {asked_s:.2f} s", flush=True)
+    assert len(digests) == 1
+    alone, one, two = (sum(rates[count]) / len(rates[count]) for count in (0, 1, 2))
+    print(f"in one process {alone:.0f} windows/s, by 1 worker {one:.0f}, by 2 workers {two:.0f}: {two / one:.2f} times")
+    print(f"the same bits in all {len(CREWS)} runs")
+
+
+async def gathered(fleet: Fleet, windows: int) -> int:
+    """Bring windows into folder and database as collectors do, analysed by the fast method; return their bytes."""
+    size = 0
+    async with await psycopg.AsyncConnection.connect(fleet.database.connection, autocommit=True) as db:
+        await migrations.bring_up(db)
+        await migrations.add_months(db, {(BEGIN.year, BEGIN.month)})
+        for k, signals in enumerate(recorded(windows)):
+            (window,) = find_windows(parse_recording(bench.as_csv(signals, NOISE, k)))
+            content = encode_window(window, "benchmark")
+            name = hashlib.sha256(content).hexdigest()
+            objects.keep(fleet.objects.directory, name, content)
+            size += len(content)
+            found = analyse(window, Identification(method="least_squares"))
+            record = {
+                "number": k,
+                "accepted": int(found.verdict.accepted),
+                "parameters": described(found),
+                "reasons": [],
+            }
+            at = BEGIN + timedelta(seconds=k)
+            row = (f"mill-{k % 10}", name, at, "0" * 32, k, "X", "window", at, name, Jsonb(record))
+            await db.execute(f"INSERT INTO fleet.records VALUES ({', '.join(['%s'] * len(row))})", row)
+            heard = "INSERT INTO fleet.heard VALUES (%s, 'of', 1, 1, %s, %s) ON CONFLICT DO NOTHING"
+            await db.execute(heard, (row[0], at, at))
+    return size
+
+
+def recorded(count: int) -> Sequence[bench.Signals]:
+    """Return the signals of so many rapids, in either direction in turn; their noise makes each another."""
+    ways = [bench.run(bench.Plant(), bench.shuttle(moves=1, first=first)) for first in (1, -1)]
+    return [ways[k % 2] for k in range(count)]
+
+
+if __name__ == "__main__":
+    main()

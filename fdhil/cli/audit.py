@@ -1,0 +1,60 @@
+"""``fdhil audit``: who asked the machine for what, and whether that list is as it was written."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fdhil import config as machine_config
+
+
+@click.command()
+@click.argument("config", type=click.Path(path_type=Path))
+@click.option("--last", type=click.IntRange(min=1), default=20, show_default=True, help="How many entries to show.")
+@click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
+def audit(config: Path, last: int, as_json: bool) -> int:
+    """Show who asked the machine of CONFIG for what, what he was answered, and whether no line was changed since.
+
+    Exit 1 when a line was changed, left out or moved, or was cut off by a power failure.
+    """
+    machine = machine_config.load(config)
+    from fdhil.daemon.journal import printable
+    from fdhil.store.audit import FILE_NAME, entries
+
+    found = list(entries(machine.store.directory))
+    broken = [number for number, (_, wrong) in enumerate(found, start=1) if wrong]
+    path = machine.store.directory / FILE_NAME
+    if as_json:
+        shown = [{"number": number, **entry} for number, (entry, _) in enumerate(found, start=1)][-last:]
+        document = {"schema": "fdhil-audit-1", "file": str(path), "entries": shown, "of": len(found), "broken": broken}
+        click.echo(json.dumps(document))
+        return 1 if broken else 0
+    for number, (entry, wrong) in list(enumerate(found, start=1))[-last:]:
+        click.echo(printable(_line(number, entry, wrong)))
+    click.echo(_verdict(path, len(found), broken))
+    return 1 if broken else 0
+
+
+def _line(number: int, entry: Mapping[str, Any], wrong: str | None) -> str:
+    if wrong is not None:
+        return f"{number:6d}  NOT AS WRITTEN  {json.dumps(entry)}"
+    who = entry["who"]
+    by = f" for {entry['by']}" if entry.get("by") else ""
+    what = entry.get("asked") or entry.get("answered")
+    told = ", ".join(filter(None, (entry.get("result"), entry.get("text"))))
+    result = f": {told}" if told else " (asked)"
+    program = "".join(f" {entry[key]}" for key in ("axis", "program", "offer") if entry.get(key))
+    return f"{number:6d}  {entry['time']}  {who['user']}{by}  {what}{program}{result}"
+
+
+def _verdict(path: Path, count: int, broken: list[int]) -> str:
+    if not count:
+        return f"{path}: nothing has been asked for yet"
+    if not broken:
+        return f"{path}: {count} entries, each as it was written"
+    causes = "changed, left out or moved, or cut off by a power failure; compare with the daemon's journal"
+    return f"{path}: {len(broken)} of {count} entries are not as written, the first is number {broken[0]}: {causes}"

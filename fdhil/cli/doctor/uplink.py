@@ -1,0 +1,104 @@
+"""Examines what goes to the works: how much waits, where it is noted how far it is, the server; nothing is sent."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import time
+from collections.abc import Iterator
+from datetime import datetime
+from urllib.parse import urlsplit
+
+from fdhil.cli.doctor.storage import may_write
+from fdhil.cli.doctor.trouble import Trouble
+from fdhil.config import MachineConfig
+from fdhil.config.credentials import password_of, secret_in, tls_of
+from fdhil.config.uplink import Uplink
+from fdhil.errors import ConnectError, StoreError
+from fdhil.store.outbox import POSITION_FILE, OutboxReader, Position, read_position
+
+PLACE = "uplink"
+LONGEST_WAIT_S = 3600.0  # that is usual
+CALL_S = 3.0
+LARGEST_GREETING = 1 << 16  # bytes
+
+
+def examine_uplink(config: MachineConfig, offline: bool) -> Iterator[Trouble]:
+    """Tell what keeps the machine's records from the works; nothing where there is no [uplink]."""
+    if config.uplink is None:
+        return
+    yield from _folder(config)
+    yield from _outbox(config)
+    try:
+        tls_of(config.uplink, "NATS server", "uplink")
+        password_of(config.uplink, "NATS server", "uplink")
+        secret_in(config.uplink.credentials_file, "NATS server", "[uplink] credentials_file")
+    except ConnectError as error:
+        what, _, mend = str(error).partition("; ")
+        yield Trouble("UplinkCredentials", PLACE, what, "nothing is sent", mend)
+    if not offline:
+        yield from _server(config.uplink)
+
+
+def _folder(config: MachineConfig) -> Iterator[Trouble]:
+    folder = config.uplink_directory
+    base = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    if not base.is_dir() or (not may_write(base) and base.stat().st_uid == os.getuid()):
+        mend = "give the user of fdhil uplink the right to write there, or correct [uplink] directory"
+        yield Trouble("UplinkFolder", PLACE, f"{base} may not be written", "nothing is sent", mend)
+    elif (folder / POSITION_FILE).exists() and read_position(folder) == Position():
+        what = f"{folder / POSITION_FILE} cannot be read, or is damaged"
+        means = "all that is still in the outbox is sent again, and known again; none is let go meanwhile"
+        yield Trouble("UplinkPosition", PLACE, what, means, "restart fdhil uplink, which writes it anew", False)
+
+
+def _outbox(config: MachineConfig) -> Iterator[Trouble]:
+    try:
+        with OutboxReader(config.store.directory) as reader:
+            position = reader.start(read_position(config.uplink_directory))
+            waiting, first = reader.waiting(position.entry), reader.entries(position.entry, 1)
+            dropped = reader.dropped
+    except StoreError as error:
+        if error.code == "SchemaVersion":  # of a damaged one the store's own trouble tells
+            what, _, mend = str(error).partition(": ")
+            yield Trouble("UplinkOutbox", PLACE, what, "nothing is sent", mend)
+        return
+    since_s = first[0].row.get("wall_s", 0.0) if first else time.time()
+    if time.time() - since_s > LONGEST_WAIT_S:
+        what = f"{waiting} records wait, the oldest since {datetime.fromtimestamp(since_s):%Y-%m-%d %H:%M}"
+        mend = "look whether fdhil uplink runs (systemctl status fdhil-uplink), and at its log"
+        yield Trouble("UplinkWaits", PLACE, what, "the works does not see them; the machine keeps them", mend)
+    if dropped:
+        means = "the works will not see them, and counts them as missing; the machine's history has them"
+        mend = "raise keep_unsent in [uplink] where the server is away for longer"
+        what = f"{dropped} records were let go unsent, as more than keep_unsent waited"
+        yield Trouble("UplinkDropped", PLACE, what, means, mend, False)
+
+
+def _server(settings: Uplink) -> Iterator[Trouble]:
+    """Tell where nobody answers as a NATS server with JetStream does; it speaks first, and nothing is sent."""
+    for server in settings.servers:
+        means = "nothing is sent by it" + ("; what is recorded waits" if len(settings.servers) == 1 else "")
+        try:
+            greeting = _greeting(server)
+        except (OSError, ValueError) as error:
+            what = f"{server} does not answer as a NATS server: {error}"
+            mend = "check server in [uplink], the network, and whether it runs"
+            yield Trouble("UplinkServer", PLACE, what, means, mend)
+            continue
+        if not greeting.get("jetstream"):
+            mend = "add jetstream {} to the server's configuration"
+            yield Trouble("UplinkServer", PLACE, f"{server} runs without JetStream", means, mend)
+
+
+def _greeting(server: str) -> dict[str, object]:
+    """Return what a server says of itself to whoever comes; OSError, ValueError."""
+    place = urlsplit(server)
+    address = (place.hostname or "", place.port or 4222)
+    with socket.create_connection(address, CALL_S) as caller, caller.makefile("rb") as words:
+        line = words.readline(LARGEST_GREETING)
+    if not line.startswith(b"INFO "):
+        raise ValueError("it says nothing of the kind")
+    told = json.loads(line[5:])
+    return told if isinstance(told, dict) else {}

@@ -1,0 +1,57 @@
+"""Shows on the terminal how the drives are, and which notices wait for somebody."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+
+from fdhil.cli.status_view import narrow_table, open_console
+from fdhil.report.history_trends import moved, slope_rows
+
+SHOWN_OPEN, SHOWN_DONE = 10, 5
+
+
+def show_health(told: Mapping[str, Mapping[str, Any]], console: Console | None = None) -> None:
+    """Print slopes, limits and changes of every axis, where there are any."""
+    out = console or open_console()
+    for axis, its in told.items():
+        if rows := slope_rows(its):
+            table = narrow_table(f"axis {axis}: slopes")
+            for text in ("parameter", "per kelvin of\nthe slide-way", "per day", "maintenance limit"):
+                table.add_column(text)
+            for row in rows:
+                table.add_row(*row)
+            out.print(table)
+        for change in its["changes"]:
+            at = change["time"][:16].replace("T", " ")
+            out.print(f"axis {axis}, window {change['window']} at {at}: {change['cause']}", highlight=False)
+            out.print(f"  {moved(change)}", highlight=False)
+
+
+def show_notices(notices: Sequence[Mapping[str, Any]], console: Console | None = None) -> None:
+    """Print which notices wait to be acknowledged, and who acknowledged the last ones."""
+    out = console or open_console()
+    waiting = [notice for notice in notices if notice["acknowledged"] is None]
+    done = [notice for notice in notices if notice["acknowledged"] is not None]
+    if waiting:
+        out.print(f"notices that wait to be acknowledged (fdhil acknowledge): {len(waiting)}", highlight=False)
+    for notice in waiting[-SHOWN_OPEN:]:
+        out.print(escape(_line(notice)), highlight=False)
+    for notice in done[-SHOWN_DONE:]:
+        given = notice["acknowledged"]
+        note = f": {given['note']}" if given["note"] else ""
+        text = f"{_line(notice)}\n    acknowledged by {given['who']} on {_minute(given['time'])}{note}"
+        out.print(escape(text), highlight=False)
+
+
+def _line(notice: Mapping[str, Any]) -> str:
+    where = f"{notice['axis']}: " if notice["axis"] else ""
+    number = "" if notice["number"] is None else f"{notice['number']:>5}  "
+    return f"{number}{_minute(notice['time'])}  {notice['severity']:5}  {where}{notice['code']}: {notice['text']}"
+
+
+def _minute(time: str) -> str:
+    return time[:16].replace("T", " ")

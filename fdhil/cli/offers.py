@@ -1,0 +1,135 @@
+"""``fdhil offers``: what the works offers to change at this machine, and the operator's answer."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from fdhil import config as machine_config
+from fdhil.cli.audited import audited
+from fdhil.cli.fleet import with_extra
+from fdhil.config import MachineConfig
+from fdhil.errors import ConfigError, ConfigFault
+
+if TYPE_CHECKING:
+    from fdhil.fleet.offered import Judged
+
+CONFIG = click.argument("config", type=click.Path(path_type=Path))
+OFFER = click.argument("offer", type=click.Path(path_type=Path))
+AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
+BY = click.option("--by", required=True, help="Who answers: your name, which the works is told.")
+MOST_BY, MOST_REASON = 64, 200
+
+
+@click.group()
+def offers() -> None:
+    """Look at the changes of the configuration that the works offers, and accept or reject them.
+
+    An offer is signed, comes by fdhil uplink or as a file, and does nothing by itself. Needs the extra 'fleet'.
+    """
+
+
+@offers.command("list")
+@CONFIG
+@click.argument("files", nargs=-1, type=click.Path(path_type=Path))
+@AS_JSON
+def list_(config: Path, files: tuple[Path, ...], as_json: bool) -> int:
+    """Show the offers for the machine of CONFIG.
+
+    And those of FILES: what each would change, and what that costs. Nothing is changed. Exit 1 when one of FILES cannot
+    be accepted.
+    """
+    machine_config.load(config)
+    with with_extra():
+        from fdhil.fleet.offered import judge, present
+    from fdhil.cli import offers_view
+    from fdhil.store.offers import lying
+
+    machine = present(config)
+    found = [judge(place, machine) for place in (*lying(machine.config.offers_directory), *files)]
+    offers_view.tell(found, machine.config, as_json)
+    return 1 if any(each.wrong for each in found if each.place in files) else 0
+
+
+@offers.command()
+@CONFIG
+@OFFER
+@BY
+@click.option("--loosens", "may_loosen", is_flag=True, help="A limit may be loosened, where the offer does that.")
+@AS_JSON
+def accept(config: Path, offer: Path, by: str, may_loosen: bool, as_json: bool) -> None:
+    """Write what OFFER changes into CONFIG.
+
+    The old file is kept beside it. OFFER is a name of the list, or a file. Signature, time, version and the new
+    configuration are looked at once more. A daemon that runs goes on as it is until it is started anew; nothing is
+    armed by it. Exit 1 when the offer is not accepted: nothing was changed.
+    """
+    machine = machine_config.load(config)
+    by, place = _signed(by), _place(machine, offer)
+    with with_extra():
+        from fdhil.fleet.offered import accept as write
+    from fdhil.cli import offers_view
+
+    with audited(machine, "accept an offer", offer=str(offer), by=by) as ended:
+        done = write(place, config, by, may_loosen)
+        ended["text"] = offers_view.in_short(done)
+    offers_view.accepted(done, machine, config, as_json)
+
+
+@offers.command()
+@CONFIG
+@OFFER
+@BY
+@click.option("--reason", required=True, help="Why not, for the works.")
+@AS_JSON
+def reject(config: Path, offer: Path, by: str, reason: str, as_json: bool) -> None:
+    """Note that OFFER is not wanted, and why.
+
+    The works is told; nothing else is changed at the machine of CONFIG.
+    """
+    machine = machine_config.load(config)
+    by, place, reason = _signed(by), _place(machine, offer), _text("--reason", reason, MOST_REASON)
+    with with_extra():
+        from fdhil.fleet.offered import reject as note
+    with audited(machine, "reject an offer", offer=str(offer), by=by) as ended:
+        done = note(place, config, by, reason)
+        ended["text"] = reason
+    _tell_rejected(done, as_json)
+
+
+def _tell_rejected(done: Judged, as_json: bool) -> None:
+    if as_json:
+        click.echo(json.dumps({"schema": "fdhil-offer-rejected-1", "offer": str(done.offer)}))
+        return
+    click.echo(f"{done.offer} is rejected; nothing was changed")
+
+
+def _signed(by: str) -> str:
+    return _text("--by", by, MOST_BY)
+
+
+def _text(option: str, text: str, most: int) -> str:
+    """Return a text in one line; ConfigError where it is none, or too long."""
+    from fdhil.daemon.journal import printable
+
+    if not text.strip() or len(text) > most:
+        raise ConfigError(option, [ConfigFault(option, "is empty or too long", f"at most {most} characters")])
+    return printable(text.strip())
+
+
+def _place(machine: MachineConfig, offer: Path) -> Path:
+    """Return the file of an offer: the newest of that name which lies here, or the file that was named."""
+    from fdhil.store.offers import lying
+
+    if offer.suffix == ".offer" or offer.name != str(offer):
+        return offer
+    lie = lying(machine.offers_directory)
+    of_name = {version: path for path, (name, version) in lie.items() if name == str(offer)}
+    if not of_name:
+        names = ", ".join(sorted({name for name, _ in lie.values()})) or "none"
+        fault = ConfigFault(str(offer), "is no offer that lies here", f"these do: {names}; or name a file, *.offer")
+        raise ConfigError("OFFER", [fault])
+    return of_name[max(of_name)]

@@ -1,0 +1,59 @@
+"""``fdhil publish``: tells a network of the shop floor what the daemon knows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import click
+
+from fdhil import config as machine_config
+from fdhil import tables
+from fdhil.config import MachineConfig
+from fdhil.errors import FdhilError
+
+EXTRAS: Mapping[str, str] = {"prometheus": "web", "mtconnect": ""}  # the others are called as their protocol
+
+
+@click.command()
+@click.argument("protocol", type=click.Choice(list(tables.PUBLISHERS)))
+@click.argument("config", type=click.Path(path_type=Path))
+@click.option(
+    "--devices",
+    type=click.Path(path_type=Path),
+    help="With mtconnect: write the Devices.xml that its agent needs to this file, and stop.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Write each line of the log as a JSON object to stdout.")
+def publish(protocol: str, config: Path, devices: Path | None, as_json: bool) -> None:
+    """Publish over PROTOCOL what the daemon of CONFIG knows: parameters with intervals, verdicts, alarms, offsets.
+
+    A process of its own for each protocol, which only asks the daemon for its status: nothing that comes over the
+    network reaches the machine. [publish.PROTOCOL] of CONFIG says where; by default no other computer can reach it.
+    While the daemon is silent no value is told, and it is asked on. Stops on SIGTERM or Ctrl-C.
+    """
+    if devices is not None and protocol != "mtconnect":
+        raise click.UsageError("--devices is of use with mtconnect alone")
+    machine = machine_config.load(config)
+    if devices is not None:
+        _write_devices(machine, devices)
+        return
+    from fdhil.daemon import journal
+    from fdhil.shopfloor.process import run
+
+    try:
+        publisher = tables.load(tables.PUBLISHERS, protocol)
+    except ImportError as error:
+        extra = EXTRAS.get(protocol, protocol)
+        what = f"fdhil publish {protocol} needs the library {error.name}, which is not installed"
+        raise FdhilError(f"{what}: pip install 'fdhil[{extra}]'") from None
+    with journal.lines_as_json(as_json):
+        run(publisher, machine)
+
+
+def _write_devices(machine: MachineConfig, file: Path) -> None:
+    from fdhil.shopfloor.mtconnect import devices
+    from fdhil.store.output import open_output
+
+    with open_output(file) as written:
+        written.write(devices(machine).encode())
+    click.echo(f"{file}: every data item of {machine.machine.name}; start the agent anew, it reads it once", err=True)

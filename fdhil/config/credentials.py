@@ -1,0 +1,75 @@
+"""What a client of a server needs to prove who it is, and to know whom it talks to: keys, and the files they name.
+
+The files are read each time a server is entered, and are in no message.
+"""
+
+from __future__ import annotations
+
+import ssl
+from pathlib import Path
+from typing import Self
+
+from pydantic import Field, model_validator
+
+from fdhil.config.section import SectionWithFiles
+from fdhil.errors import ConnectError
+
+
+class Credentials(SectionWithFiles):
+    """The keys that name user and files, for each section of a server that is entered."""
+
+    user: str | None = Field(None, min_length=1, description="the server's user; left out: none, or by the certificate")
+    password_file: Path | None = Field(None, description="file with the user's password, mode 0600")
+    tls_ca_file: Path | None = Field(
+        None,
+        description="who signs the server's certificate (PEM), to encrypt and to check it; left out: neither; "
+        "/etc/ssl/certs/ca-certificates.crt is whom Debian trusts",
+    )
+    tls_certificate_file: Path | None = Field(None, description="our own certificate (PEM), where the server wants one")
+    tls_key_file: Path | None = Field(None, description="its private key (PEM, without a password), mode 0600")
+
+    @model_validator(mode="after")
+    def _belong_together(self) -> Self:
+        if (self.tls_certificate_file is None) != (self.tls_key_file is None):
+            raise ValueError("tls_certificate_file: it comes with its tls_key_file, and the key with its certificate")
+        if self.tls_certificate_file is not None and self.tls_ca_file is None:
+            raise ValueError("tls_certificate_file: it needs a tls_ca_file; without one TLS is not spoken")
+        if (self.user is None) != (self.password_file is None):
+            raise ValueError("user: a user comes with the password_file, and the file with its user")
+        return self
+
+
+def password_of(settings: Credentials, server: str, section: str) -> str | None:
+    """Return the user's password; ConnectError where its file cannot be read."""
+    return secret_in(settings.password_file, server, f"[{section}] password_file")
+
+
+def secret_in(path: Path | None, server: str, key: str) -> str | None:
+    """Return what is in a file, None where none is named; ConnectError where it cannot be read."""
+    try:
+        return None if path is None else path.read_text("utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        assert path is not None
+        raise _fault(server, key, path, error) from None
+
+
+def tls_of(settings: Credentials, server: str, section: str) -> ssl.SSLContext | None:
+    """Return how TLS is spoken, the server's certificate checked; ConnectError with the file that cannot be used."""
+    if settings.tls_ca_file is None:
+        return None
+    try:
+        context = ssl.create_default_context(cafile=settings.tls_ca_file)
+    except (OSError, ssl.SSLError) as error:
+        raise _fault(server, f"[{section}] tls_ca_file", settings.tls_ca_file, error) from None
+    if settings.tls_certificate_file is not None:
+        try:
+            context.load_cert_chain(settings.tls_certificate_file, settings.tls_key_file, password=lambda: "")
+        except (OSError, ssl.SSLError) as error:
+            key = f"[{section}] tls_certificate_file"
+            raise _fault(server, key, settings.tls_certificate_file, error) from None
+    return context
+
+
+def _fault(server: str, key: str, path: Path, error: Exception) -> ConnectError:
+    cause = (isinstance(error, OSError) and error.strerror) or type(error).__name__
+    return ConnectError(server, f"{key} {path} cannot be used: {cause}; fdhil's user must be able to read it")

@@ -1,0 +1,83 @@
+"""The configuration of what gathers the history of many machines: a file of its own, on a server of the works."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from pydantic import Field, field_validator
+
+from fdhil.config.reading import load_as
+from fdhil.config.section import Section
+from fdhil.config.uplink import NatsServer
+from fdhil.config.web import Web
+
+NAME = r"^[A-Za-z0-9_-]{1,64}$"
+
+
+class Server(NatsServer):
+    """[server]: the NATS server whose JetStream carries what the machines tell."""
+
+
+class Stream(Section):
+    """[stream]: what the server keeps until it is in the database; it is made at the first start."""
+
+    name: str = Field("fdhil", pattern=NAME, description="name of the stream")
+    replicas: int = Field(1, ge=1, le=5, description="servers of the cluster that keep each message")
+    max_bytes: int = Field(
+        10 << 30, ge=1 << 16, le=1 << 50, description="room for what waits; when it is used up the machines keep theirs"
+    )
+    duplicate_window_s: float = Field(
+        600.0, ge=1, le=86_400, description="how long the server itself knows a message again; the database always does"
+    )
+
+
+class Database(Section):
+    """[database]: the PostgreSQL database of the history."""
+
+    connection: str = Field(
+        "dbname=fdhil", max_length=1000, description="libpq's connection string; the password is in a file (~/.pgpass)"
+    )
+
+    @field_validator("connection")
+    @classmethod
+    def _without_a_password(cls, text: str) -> str:
+        if re.search(r"\bpassword\s*=|//[^/@]*:[^/@]*@", text):
+            raise ValueError("must not hold a password: name a passfile, or use ~/.pgpass or the server's peer login")
+        return text
+
+
+class Objects(Section):
+    """[objects]: the recorded windows, one file each, named by their content."""
+
+    directory: Path = Field(
+        Path("fdhil-windows"), description="their folder, which all collectors share; relative to this file's folder"
+    )
+
+
+class Retention(Section):
+    """[retention]: for how long fdhil fleet retain keeps what was told; without a number: for good."""
+
+    record_months: int | None = Field(None, ge=1, le=1200, description="whole months of records before this one")
+    window_months: int | None = Field(
+        None, ge=1, le=1200, description="months of recorded windows; what was found in them stays with the records"
+    )
+
+
+class Fleet(Section):
+    """The whole file."""
+
+    server: Server = Server()
+    stream: Stream = Stream()
+    database: Database = Database()
+    objects: Objects = Objects()
+    retention: Retention = Retention()
+    web: Web = Web()
+
+
+def load(path: Path) -> Fleet:
+    """Read the configuration of a fleet; ConfigError with every fault, its path and a suggestion."""
+    fleet = load_as(Fleet, path, "a fleet's config")
+    objects = fleet.objects.model_copy(update={"directory": path.parent / fleet.objects.directory})
+    placed = {"server": fleet.server.placed(path.parent), "web": fleet.web.placed(path.parent)}
+    return fleet.model_copy(update={**placed, "objects": objects})

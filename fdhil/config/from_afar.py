@@ -1,0 +1,82 @@
+"""What a works may offer to change in a machine's configuration, what it never may, and which change loosens a limit.
+
+This is the one place. A key that neither table names is refused, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+# key, or all keys of a table -> whether a larger value lets more through than before
+FROM_AFAR: Mapping[str, bool] = {
+    "axis.*.nominal.*": False,
+    "axis.*.regulators.*": False,
+    "axis.*.resonance_hz": False,
+    "axis.*.resonance_damping": False,
+    "axis.*.max_jerk_mm_s3": False,
+    # the offset's own limits are also a share of these two
+    "axis.*.rapid_speed_mm_s": True,
+    "axis.*.max_acceleration_mm_s2": True,
+    "axis.*.correction.*": True,
+    "axis.*.feedforward.*": True,
+    "correction.*": True,
+    "identification.*": False,
+    "identification.tolerance_um": True,
+    "maintenance.*": True,
+    "nc.profile": False,
+    "nc.smoothing_s": False,
+    "nc.corner": False,
+    "nc.rapid_stop": False,
+    "nc.settle_s": False,
+    "nc.end_rest_s": False,
+}
+_BUILT = "how this machine is built and wired is known at the machine alone"
+_SENDING = "what sends set-points or a heartbeat is set up at the machine alone"
+_TRUST = "who may ask, listen, log in and be trusted is decided at the machine alone"
+_FILES = "files, sockets and budgets are those of this computer"
+NEVER: Mapping[str, str] = {
+    "machine": _BUILT,
+    "axis": _BUILT,
+    "axis.*.setpoints": _SENDING,
+    "bus": _BUILT,
+    "g0": _BUILT,
+    "nc_source": _BUILT,
+    "nc": _FILES,
+    "store": _FILES,
+    "guard": _SENDING,
+    "play": _SENDING,
+    "access": _TRUST,
+    "web": _TRUST,
+    "publish": _TRUST,
+    "uplink": _TRUST,
+    "offers": _TRUST,
+    "sim": "the simulated machine belongs to who simulates it",
+}
+
+
+def never(path: str) -> str:
+    """Return why a key, as ``axis.X.drive.sign``, is never taken from afar; empty where it may be."""
+    if _rule(path) is not None:
+        return ""
+    parts = _pattern(path).split(".")
+    tables = (".".join(parts[:count]) for count in range(len(parts), 0, -1))
+    return next((NEVER[table] for table in tables if table in NEVER), "no offer may change it")
+
+
+def loosens(path: str, old: Any, new: Any) -> bool:
+    """Whether a change lets more through than before; where that cannot be told it does."""
+    if not _rule(path) or old == new:
+        return False
+    return old is None or new is None or new > old
+
+
+def _rule(path: str) -> bool | None:
+    pattern = _pattern(path)
+    table, _, _ = pattern.rpartition(".")
+    return FROM_AFAR.get(pattern, FROM_AFAR.get(f"{table}.*"))
+
+
+def _pattern(path: str) -> str:
+    top, *rest = path.split(".")
+    return ".".join([top, "*", *rest[1:]]) if top == "axis" and rest else path

@@ -1,0 +1,41 @@
+"""[offers]: whose signed offers an operator of this machine may accept."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import AfterValidator, Field
+
+from fdhil.config.section import SectionWithFiles
+
+_OF_THE_WORKS = 14 << 3  # the first byte of such a key, an O in its text, so that no user's key of a server is one
+
+
+def key_bytes(text: str) -> bytes:
+    """Return the 32 bytes of a public key (Ed25519) in NATS' notation; ValueError where it is none of a works."""
+    try:
+        raw = base64.b32decode(text)
+    except binascii.Error:
+        raw = b""
+    if len(raw) != 35 or raw[0] != _OF_THE_WORKS or binascii.crc_hqx(raw[:33], 0) != int.from_bytes(raw[33:], "little"):
+        raise ValueError("is no key of a works, or was mistyped: `fdhil fleet key` there tells it, an O and 55 letters")
+    return raw[1:33]
+
+
+def _is_key(text: str) -> str:
+    key_bytes(text)
+    return text
+
+
+class Offers(SectionWithFiles):
+    """[offers]: signed changes of this file that a works offers (needs the extra fleet); each is accepted by hand."""
+
+    trust: tuple[Annotated[str, AfterValidator(_is_key)], ...] = Field(
+        (), max_length=20, description="public keys of a works whose offers may be accepted; left out: none"
+    )
+    directory: Path | None = Field(
+        None, description="where fdhil uplink puts the offers that it fetched; left out: offers in the uplink's folder"
+    )

@@ -1,0 +1,75 @@
+"""[uplink]: what a machine tells the history of a works, and over which server."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Literal, Self
+from urllib.parse import urlsplit
+
+from pydantic import Field, StringConstraints, model_validator
+
+from fdhil.config.credentials import Credentials
+from fdhil.config.section import AxisName
+from fdhil.config.web import is_loopback
+
+Label = Annotated[str, StringConstraints(min_length=1, max_length=100, pattern=r"^[^\x00-\x1f]*$")]
+LabelName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
+Labels = Mapping[LabelName, Label]
+
+
+class NatsServer(Credentials):
+    """What is needed to reach a NATS server."""
+
+    server: str = Field(
+        "nats://127.0.0.1:4222",
+        pattern=r"^(nats|tls)://[^/@,\s]+(,(nats|tls)://[^/@,\s]+)*$",
+        description="the NATS server with JetStream; several of one cluster with commas: each try enters one of them",
+    )
+
+    credentials_file: Path | None = Field(
+        None, description="goes before user and password: NATS' own .creds file, or the seed of an nkey; mode 0600"
+    )
+
+    @property
+    def servers(self) -> tuple[str, ...]:
+        """Each server of the cluster."""
+        return tuple(self.server.split(","))
+
+    @model_validator(mode="after")
+    def _encrypted(self) -> Self:
+        hosts = [urlsplit(server).hostname or "" for server in self.servers]
+        if self.tls_ca_file is None and not all(map(is_loopback, hosts)):
+            raise ValueError("server: beyond this computer it needs a tls_ca_file; else all could be read on the way")
+        return self
+
+
+class Uplink(NatsServer):
+    """[uplink]: what fdhil uplink sends to the history of many machines (needs the extra fleet); left out: nothing."""
+
+    machine: str = Field(
+        "",
+        pattern=r"^([A-Za-z0-9_-]{1,64})?$",
+        description="this machine's name there; left out: made of [machine] name",
+    )
+    windows: Literal["all", "refused", "some", "none"] = Field(
+        "refused", description="which recorded windows are sent whole; what was found in them is told of each"
+    )
+    every_window: int = Field(10, ge=1, le=1_000_000, description="with windows = some: every so many-th of an axis")
+    keep_unsent: int = Field(
+        500_000, ge=1_000, le=100_000_000, description="records kept while they cannot be sent; the oldest go first"
+    )
+    directory: Path | None = Field(
+        None, description="where fdhil uplink notes how far it is; left out: <store directory>/uplink"
+    )
+    labels: Labels = Field(
+        default_factory=dict, description="what to compare machines by, as type, works, lubricant: any names and texts"
+    )
+    axis_labels: Mapping[AxisName, Labels] = Field(
+        default_factory=dict, description="the same of single axes, as screw or motor, by the axis' letter"
+    )
+
+    def name_of(self, machine: str) -> str:
+        """Return this machine's name in the works: what is set, else ``machine`` without what a subject cannot have."""
+        return self.machine or re.sub(r"[^A-Za-z0-9_-]", "_", machine)[:64]

@@ -1,0 +1,112 @@
+"""Who may log in: a file of names, roles and scrypt hashes of passwords, and the checking of them.
+
+Parameters of scrypt: N = 2^15, r = 8, p = 1 (32 MiB, about 0.1 s), after RFC 7914 and OWASP's password storage
+cheat sheet. The file is written whole and is readable by its owner and group alone.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import hmac
+import json
+import os
+import secrets
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+
+from fdhil.errors import ConfigError, ConfigFault
+
+Role = Literal["watch", "operate"]
+COST, BLOCK, LANES = 2**15, 8, 1
+SCRYPT_BYTES = 64 * 1024 * 1024
+SHORTEST_PASSWORD, LONGEST_PASSWORD = 10, 200
+MAX_FILE = 256 * 1024
+NAME = r"^[A-Za-z0-9][A-Za-z0-9._@-]{0,63}$"
+UserName = Annotated[str, StringConstraints(pattern=NAME)]
+
+
+class User(BaseModel):
+    """One user: the role, and the hash of the password with its salt, both base64."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    role: Role
+    salt: str = Field(min_length=8, max_length=100)
+    scrypt: str = Field(min_length=40, max_length=100)
+
+
+class Users(BaseModel):
+    """The file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    users: Mapping[UserName, User] = {}
+
+
+def hashed(password: str, role: Role) -> User:
+    """Return a user with this password, under a salt of its own."""
+    salt = secrets.token_bytes(16)
+    return User(role=role, salt=_text(salt), scrypt=_text(_scrypt(password, salt)))
+
+
+NOBODY = User(role="watch", salt=base64.b64encode(bytes(16)).decode(), scrypt=base64.b64encode(bytes(32)).decode())
+"""Stands for a user that there is not, so that a wrong name takes as long as a wrong password."""
+
+
+def matches(user: User | None, password: str) -> bool:
+    """Whether the password is the user's (blocking, a tenth of a second whatever the answer)."""
+    against = user or NOBODY
+    found = _scrypt(password, base64.b64decode(against.salt))
+    return hmac.compare_digest(found, base64.b64decode(against.scrypt)) and user is not None
+
+
+def read_users(path: Path) -> Mapping[str, User]:
+    """Return who may log in; ConfigError where the file cannot be read, is none, or is open to others."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError as error:
+        raise _fault(path, f"cannot be read: {error.strerror}", "make it with fdhil web-user CONFIG NAME") from None
+    with os.fdopen(descriptor, "rb") as file:
+        if stat.S_IMODE(os.fstat(descriptor).st_mode) & 0o007:
+            raise _fault(path, "is open to every user of this computer", f"chmod 0640 {path}")
+        raw = file.read(MAX_FILE + 1)
+    try:
+        return Users.model_validate_json(raw).users
+    except ValidationError:  # its message would show what stands in the file
+        raise _fault(path, "is no users file", "make it anew with fdhil web-user CONFIG NAME") from None
+
+
+def write_users(path: Path, users: Mapping[str, User]) -> None:
+    """Write the file whole, with the mode and owner that it had, or 0600; OSError."""
+    text = json.dumps({"users": {name: user.model_dump() for name, user in users.items()}}, indent=1) + "\n"
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    descriptor = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+    try:
+        with os.fdopen(descriptor, "w") as file:
+            if path.exists():
+                before = path.stat()
+                os.fchmod(descriptor, stat.S_IMODE(before.st_mode) & 0o660)
+                if (before.st_uid, before.st_gid) != (os.getuid(), os.getgid()):
+                    os.fchown(descriptor, before.st_uid, before.st_gid)
+            file.write(text)
+            file.flush()
+            os.fsync(descriptor)
+        beside.replace(path)
+    except OSError:
+        beside.unlink(missing_ok=True)
+        raise
+
+
+def _scrypt(password: str, salt: bytes) -> bytes:
+    return hashlib.scrypt(password.encode(), salt=salt, n=COST, r=BLOCK, p=LANES, maxmem=SCRYPT_BYTES, dklen=32)
+
+
+def _text(raw: bytes) -> str:
+    return base64.b64encode(raw).decode()
+
+
+def _fault(path: Path, what: str, suggestion: str) -> ConfigError:
+    return ConfigError("web.users_file", [ConfigFault(str(path), what, suggestion)])

@@ -1,0 +1,106 @@
+"""Advises feeds without and with the correction: what the path may be run at, and how that is told as JSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from fdhil.config import MachineConfig
+from fdhil.correction.planning import plan
+from fdhil.prediction.advise import Advice, Held, advise
+from fdhil.prediction.feeds import Source, program_source
+from fdhil.prediction.inverse_dynamics import required
+from fdhil.prediction.retime import demand_sources
+from fdhil.program import Motion
+from fdhil.records import Float, Parameters, Trajectory
+
+
+def sources(
+    motions: Sequence[Motion] | None,
+    reference: Trajectory,
+    models: Mapping[str, Parameters],
+    config: MachineConfig,
+    tolerance_um: float,
+) -> tuple[Source, Source | None]:
+    """Return what makes the path at other feeds; of a demand (``motions`` None) a sure one and a hopeful one."""
+    if motions is None:
+        return demand_sources(reference, models, config, tolerance_um)
+    return program_source(list(motions), config), None
+
+
+def advised(
+    sure: Source,
+    hopeful: Source | None,
+    models: Mapping[str, Parameters],
+    config: MachineConfig,
+    tolerance_um: float,
+) -> tuple[tuple[Advice, ...], dict[float, Advice] | None]:
+    """Return the advice by the sure source, and by the start of each stretch that by the hopeful one.
+
+    The correction is tried where every axis may have one.
+    """
+    corrects = all(config.axis[axis].correction is not None for axis in models)
+    judge = (lambda slower: corrected_contour_um(slower, models, config)) if corrects else None
+    advice = advise(sure, models, config, tolerance_um, judge)
+    if not hopeful:
+        return advice, None
+    return advice, {a.start_s: a for a in advise(hopeful, models, config, tolerance_um, judge)}
+
+
+def corrected_contour_um(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> Float:
+    """Contour error (n,) with the correction; where it is refused, inf in the rows at fault, the others unknown."""
+    planned = plan(reference, models, config)
+    if not planned.refused:
+        return planned.after.contour_um
+    before, fault = planned.before, np.zeros(reference.time_s.size, dtype=np.bool_)
+    for zone in before.zones:
+        if zone.cause == "saturation":
+            fault |= (reference.time_s >= zone.start_s) & (reference.time_s < zone.end_s)
+    for axis in reference.axes:
+        asked = required(reference.position_mm[axis], models[axis], config.axis[axis], reference.dt_s)
+        limits = config.axis[axis].correction
+        room_um = limits.max_offset_um if limits else 0.0
+        fault |= (np.maximum(*asked) > 1.0) | (np.abs(before.error_um[axis]) > room_um)
+    return np.where(fault, np.inf, np.nan) if fault.any() else before.contour_um
+
+
+def entry(advice: Advice, most: Mapping[float, Advice] | None) -> dict[str, Any]:
+    """Return the advice for one stretch as JSON has it; ``most`` is that by the hopeful source."""
+    axis, what, share = advice.load
+    asked = {"axis": axis, "what": what, "share": share}
+    told = {
+        "line": advice.line,
+        "start_s": round(advice.start_s, 6),
+        "end_s": round(advice.end_s, 6),
+        "where": advice.where,
+        "cause": advice.cause,
+        "axis": advice.axis,
+        "error_um": advice.error_um,
+        "load": asked,
+        "beyond": asked if share > 1.0 else None,
+        "feed_mm_min": advice.feed_mm_min,
+        **_held("", advice.plain, advice.feed_mm_min),
+        **_held("corrected_", advice.corrected, advice.feed_mm_min),
+    }
+    if most is not None:
+        other = most.get(advice.start_s, advice)
+        told["hopeful_feed_mm_min"] = _feed(other.plain, advice.feed_mm_min)
+        told["corrected_hopeful_feed_mm_min"] = _feed(other.corrected, advice.feed_mm_min)
+    return told
+
+
+def _held(name: str, held: Held | None, feed_mm_min: float) -> dict[str, float | None]:
+    return {
+        f"{name}feed_share": None if held is None else held.share,
+        f"{name or 'advised_'}feed_mm_min": _feed(held, feed_mm_min),
+        f"{name}tried_feed_mm_min": None if held is None else held.tried * feed_mm_min,
+        f"{name}run_feed_mm_min": None if held is None else held.run * feed_mm_min,
+        f"{name}left_um": None if held is None or not math.isfinite(held.left_um) else held.left_um,
+    }
+
+
+def _feed(held: Held | None, feed_mm_min: float) -> float | None:
+    return None if held is None or held.share is None else held.share * feed_mm_min

@@ -1,0 +1,162 @@
+"""Tells the samples of the axes to whoever looks on: one JSON object per line over the control socket.
+
+A viewer costs the daemon a line per block of samples, made once for all of them, and nothing that it could lose: each
+viewer has room for so many lines, and what finds none is skipped and told. Nothing waits for a viewer.
+
+The lines: ``begin`` says the period, the axes and the order of the signals; ``samples`` has the first ``tick`` of a
+block, ``ticks`` after it where some are missing, and ``values``, float32 (5, n), NaN where a drive tells no voltage;
+``voltage`` is that of a sensor of its own, by the host's clock, to which ``times`` lays the ticks; ``temperature`` is
+one reading; ``skipped`` counts the lines that this viewer lost; ``alive`` is said when there is nothing else to say.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import json
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from fdhil.arming.answers import Answer, refusal
+from fdhil.config import MachineConfig
+from fdhil.records import AxisSamples, Temperature, TickTimes, VoltageSamples
+
+SIGNALS = ("voltage_v", "current_a", "speed_rad_s", "following_error_um", "offset_um")
+MAX_VIEWERS = 4
+MAX_WAITING = 400  # lines of one viewer: five seconds of four axes
+ALIVE_S = 1.0
+DEAD_S = 60.0  # who reads nothing for so long has gone
+BUFFER = 64 * 1024  # bytes of one viewer in the socket's own buffer
+
+
+class _Viewer:
+    """The lines that one viewer has yet to get."""
+
+    def __init__(self) -> None:
+        self._lines: deque[bytes] = deque()
+        self._skipped = 0
+        self.waiting = asyncio.Event()
+
+    def put(self, line: bytes) -> None:
+        """Take a line in, or skip it and count that."""
+        if len(self._lines) >= MAX_WAITING:
+            self._skipped += 1
+        else:
+            self._lines.append(line)
+            self.waiting.set()
+
+    def taken(self) -> bytes:
+        """Return all that waits, and behind it how much was skipped; a word of life when there is nothing."""
+        lines = list(self._lines)
+        if self._skipped:
+            lines.append(_line({"live": "skipped", "lines": self._skipped}))
+        self._lines.clear()
+        self._skipped = 0
+        self.waiting.clear()
+        return b"".join(lines) or _line({"live": "alive"})
+
+
+class LiveStream:
+    """What passes, for viewers that come and go."""
+
+    def __init__(self, config: MachineConfig) -> None:
+        self._begin = {"sync_period_s": config.machine.sync_period_s, "axes": list(config.axis), "signals": SIGNALS}
+        self._by_the_clock = any(axis.voltage.separate for axis in config.axis.values())
+        self._temperatures: dict[str, bytes] = {}
+        self._viewers: set[_Viewer] = set()
+
+    def begin(self) -> Answer:
+        """Return the answer that opens a stream, or why there is none."""
+        if len(self._viewers) >= MAX_VIEWERS:
+            return refusal("Busy", f"{MAX_VIEWERS} others look on", "close one of them; `fdhil web` needs a single one")
+        return {"ok": True, "live": "begin", **self._begin}
+
+    def take(self, record: object) -> None:
+        """Hand a record on to all who look; what cannot be drawn against time is not told."""
+        if isinstance(record, Temperature):
+            self._temperatures[record.axis] = _line(
+                {"live": "temperature", "axis": record.axis, "place": record.place, "celsius": record.celsius}
+            )
+        line = self._line_of(record) if self._viewers else None
+        if line is not None:
+            for viewer in self._viewers:
+                viewer.put(line)
+
+    def _line_of(self, record: object) -> bytes | None:
+        """Return what is told of a record; a block may be empty, where no sample of it is whole."""
+        if isinstance(record, Temperature):
+            return self._temperatures[record.axis]
+        if isinstance(record, AxisSamples) and record.tick.size:
+            return _line(_samples(record))
+        if isinstance(record, VoltageSamples) and record.t_ns.size:
+            return _line(_voltage(record))
+        if isinstance(record, TickTimes) and record.tick.size and self._by_the_clock:
+            ends = {"tick": record.tick[[0, -1]].tolist(), "t_ns": record.t_ns[[0, -1]].tolist()}
+            return _line({"live": "times", **ends})
+        return None
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Tell one viewer what passes until it leaves; TimeoutError when it reads nothing for a minute."""
+        if len(self._viewers) >= MAX_VIEWERS:
+            return  # others who came at the same time have the places
+        writer.transport.set_write_buffer_limits(BUFFER)
+        viewer = _Viewer()
+        for line in self._temperatures.values():
+            viewer.put(line)
+        self._viewers.add(viewer)
+        try:
+            while not reader.at_eof():
+                writer.write(viewer.taken())
+                async with asyncio.timeout(DEAD_S):
+                    await writer.drain()
+                if not viewer.waiting.is_set():
+                    await _set_within(viewer.waiting, ALIVE_S)
+        finally:
+            self._viewers.discard(viewer)
+
+
+async def _set_within(event: asyncio.Event, limit_s: float) -> None:
+    """Wait until an event is set, at most so long."""
+    try:
+        async with asyncio.timeout(limit_s):
+            await event.wait()
+    except TimeoutError:
+        pass
+
+
+def _samples(block: AxisSamples) -> dict[str, Any]:
+    voltage = np.full(block.tick.size, np.nan) if block.voltage_v is None else block.voltage_v
+    error_um = (block.demand_mm - block.position_mm) * 1e3
+    values = np.stack([voltage, block.current_a, block.speed_rad_s, error_um, block.offset_mm * 1e3])
+    after = block.tick - block.tick[0]
+    whole = int(after[-1]) == block.tick.size - 1
+    return {
+        "live": "samples",
+        "axis": block.axis,
+        "tick": int(block.tick[0]),
+        "lost": block.lost,
+        **({} if whole else {"ticks": packed(after, "<i4")}),
+        "values": packed(values, "<f4"),
+    }
+
+
+def _voltage(block: VoltageSamples) -> dict[str, Any]:
+    values = {"t_ns": packed(block.t_ns, "<i8"), "values": packed(block.voltage_v, "<f4")}
+    return {"live": "voltage", "axis": block.axis, **values}
+
+
+def packed(values: np.ndarray[Any, Any], kind: str) -> str:
+    """Return numbers as base64 of their bytes in the type ``kind``."""
+    return base64.b64encode(np.ascontiguousarray(values, kind).tobytes()).decode()
+
+
+def unpacked(text: str, kind: str) -> np.ndarray[Any, Any]:
+    """Return the numbers (n,) of base64 of their bytes in the type ``kind``; ValueError for what is none."""
+    return np.frombuffer(base64.b64decode(text, validate=True), kind)
+
+
+def _line(told: Mapping[str, Any]) -> bytes:
+    return json.dumps(told).encode() + b"\n"

@@ -1,0 +1,116 @@
+"""Keeps which notices wait for somebody to acknowledge them, and who acknowledged the others."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from fdhil.arming.answers import refusal
+from fdhil.daemon.journal import printable
+from fdhil.errors import FdhilError
+from fdhil.records import Notice
+from fdhil.store.history import RECENT_NOTICES
+from fdhil.store.notice_document import acknowledgement_document, notice_document
+from fdhil.store.rows import Acknowledgement, Stamp, StoredNotice
+
+NEWEST = RECENT_NOTICES
+TOLD_OPEN = 20  # in the status
+LAST_STORED = 100  # notices whose numbers the status can name
+MOST_WHO, MOST_NOTE = 64, 200  # characters
+
+
+class NotAcknowledged(FdhilError):
+    """A request to acknowledge that cannot be met; ``answer`` says why."""
+
+    def __init__(self, code: str, text: str, advice: str) -> None:
+        super().__init__(text)
+        self.answer = refusal(code, text, advice)
+
+
+class NoticeBook:
+    """The newest notices of the history. Safe to call from several threads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._known: dict[int, StoredNotice] = {}
+        self._last: deque[tuple[Notice, int]] = deque(maxlen=LAST_STORED)
+
+    def begin(self, notices: Sequence[StoredNotice]) -> None:
+        """Start from what the history has, oldest first."""
+        with self._lock:
+            self._known = {notice.number: notice for notice in notices if notice.notice.severity != "info"}
+
+    def stored(self, notice: Notice, number: int, stamp: Stamp) -> None:
+        """Note that a notice was stored."""
+        with self._lock:
+            self._last.append((notice, number))
+            if notice.severity != "info":
+                self._known[number] = StoredNotice(number, notice, stamp)
+                for old in list(self._known)[:-NEWEST]:
+                    del self._known[old]
+
+    def chosen(self, request: Mapping[str, Any]) -> list[int]:
+        """Return the open notices that a request names; NotAcknowledged where it names none that there is."""
+        numbers, up_to = request.get("notices"), request.get("up_to")
+        with self._lock:
+            waiting = [number for number, notice in self._known.items() if notice.is_open]
+            if isinstance(up_to, int) and _is_number(up_to) and numbers is None:
+                return [number for number in waiting if number <= up_to]
+            if not (isinstance(numbers, list) and numbers and all(map(_is_number, numbers)) and up_to is None):
+                text = "the request names no notices"
+                raise NotAcknowledged("BadRequest", text, "give 'notices' (a list of numbers) or 'up_to' (a number)")
+            if unknown := [number for number in numbers if number not in self._known]:
+                text = f"there is no notice {', '.join(map(str, unknown[:5]))} that asks to be acknowledged"
+                raise NotAcknowledged("NoSuchNotice", text, "fdhil status shows the numbers of those that do")
+        return [number for number in waiting if number in set(numbers)]
+
+    def acknowledged(self, given: Acknowledgement) -> None:
+        """Note that notices were acknowledged."""
+        with self._lock:
+            for number in given.notices:
+                if number in self._known:
+                    self._known[number] = replace(self._known[number], acknowledged=given)
+
+    def told(self, notice: Notice) -> dict[str, Any]:
+        """Return the number of a notice in the history (None: not stored, yet) and its acknowledgement."""
+        with self._lock:
+            number = next((number for known, number in reversed(self._last) if known is notice), None)
+            known = self._known.get(number) if number is not None else None
+        return {"number": number, "acknowledged": acknowledgement_document(known.acknowledged if known else None)}
+
+    def status(self) -> dict[str, Any]:
+        """Return what waits to be acknowledged: how many, how many of them MAJOR, and the newest, oldest first."""
+        with self._lock:
+            waiting = [notice for notice in self._known.values() if notice.is_open]
+        major = sum(notice.notice.severity == "MAJOR" for notice in waiting)
+        return {
+            "count": len(waiting),
+            "MAJOR": major,
+            "newest": [notice_document(notice) for notice in waiting[-TOLD_OPEN:]],
+        }
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def acknowledgement_of(request: Mapping[str, Any], numbers: Sequence[int]) -> Acknowledgement:
+    """Return who acknowledges what, now; NotAcknowledged where nobody answers for it."""
+    who, note = request.get("by"), request.get("note", "")
+    if not isinstance(who, str) or not who.strip() or len(who) > MOST_WHO:
+        text = "nobody answers for the acknowledgement"
+        raise NotAcknowledged("BadRequest", text, f"give a name of at most {MOST_WHO} characters as 'by'")
+    if not isinstance(note, str) or len(note) > MOST_NOTE:
+        text = "the note is no text, or too long"
+        raise NotAcknowledged("BadRequest", text, f"give a text of at most {MOST_NOTE} characters as 'note'")
+    return Acknowledgement(tuple(numbers), printable(who.strip()), printable(note.strip()), Stamp.now())
+
+
+def counted(numbers: Sequence[int]) -> str:
+    """Return how many notices these are, and which in few words."""
+    if len(numbers) == 1:
+        return f"notice {numbers[0]}"
+    return f"{len(numbers)} notices" + (f" (number {min(numbers)} to {max(numbers)})" if numbers else "")

@@ -1,0 +1,97 @@
+"""Says what this process uses of its computer: memory, descriptors, threads, each beside what it may use (Linux).
+
+The bound is the tightest of what systemd set (MemoryMax, TasksMax) and the process' own limit (LimitNOFILE).
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+from dataclasses import dataclass
+from pathlib import Path
+
+from fdhil.records import Notice
+
+HIGH, LOW = 0.8, 0.7  # share of what is allowed at which it is told, and below which it is over
+CGROUPS = Path("/sys/fs/cgroup")
+
+
+@dataclass(frozen=True, slots=True)
+class Use:
+    """One thing that is used: how much, and how much may be, None without a bound."""
+
+    name: str
+    used: int
+    allowed: int | None
+
+    @property
+    def share(self) -> float:
+        """The part of what is allowed; 0 without a bound."""
+        return self.used / self.allowed if self.allowed else 0.0
+
+
+def uses(process: Path = Path("/proc/self"), cgroups: Path = CGROUPS) -> tuple[Use, ...]:
+    """Return memory in bytes, descriptors and threads of this process; of what cannot be looked at, nothing.
+
+    To look takes a descriptor: where there is none left, just that is returned.
+    """
+    try:
+        return _uses(process, cgroups)
+    except OSError as error:
+        most = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+        return (Use("descriptors", most, most),) if error.errno in (errno.EMFILE, errno.ENFILE) else ()
+
+
+def _uses(process: Path, cgroups: Path) -> tuple[Use, ...]:
+    group = cgroups / _group_of(process)
+    resident = int((process / "statm").read_text("ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    descriptors = sum(1 for _ in (process / "fd").iterdir())
+    threads = sum(1 for _ in (process / "task").iterdir())
+    most = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    return (
+        Use("memory_bytes", resident, _bound(group / "memory.max")),
+        Use("descriptors", descriptors, most if most != resource.RLIM_INFINITY else None),
+        Use("threads", threads, _bound(group / "pids.max")),
+    )
+
+
+def _group_of(process: Path) -> str:
+    """The process' control group, by the unified hierarchy; that of all where it is in none."""
+    for line in (process / "cgroup").read_text("utf-8").splitlines():
+        if line.startswith("0::/"):
+            return line[4:]
+    return ""
+
+
+def _bound(file: Path) -> int | None:
+    try:
+        text = file.read_text("ascii").strip()
+    except OSError:
+        return None
+    return int(text) if text.isdecimal() else None
+
+
+class ResourceWatch:
+    """Tells once that something is nearly used up, and once that it is no longer."""
+
+    def __init__(self) -> None:
+        self._high: set[str] = set()
+
+    def look(self, found: tuple[Use, ...]) -> list[Notice]:
+        """Return what there is to say of what is used now."""
+        told: list[Notice] = []
+        for use in found:
+            if use.share >= HIGH and use.name not in self._high:
+                self._high.add(use.name)
+                told.append(Notice("ResourceHigh", "minor", f"the daemon uses {_said(use)}"))
+            elif use.share < LOW and use.name in self._high:
+                self._high.discard(use.name)
+                told.append(Notice("ResourceHigh", "info", f"the daemon uses {_said(use)} again"))
+        return told
+
+
+def _said(use: Use) -> str:
+    if use.name == "memory_bytes":
+        return f"{use.used / 1e6:.0f} MB of {(use.allowed or 0) / 1e6:.0f} MB of memory"
+    return f"{use.used} of {use.allowed} {use.name}"

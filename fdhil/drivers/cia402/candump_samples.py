@@ -1,0 +1,56 @@
+"""Reads what the drives did from a candump log of their buses, such as a black box, as the daemon heard it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from fdhil.config import MachineConfig
+from fdhil.drivers.can.frames import Frames, frames_of
+from fdhil.drivers.cia402.bus_decoder import BusDecoder
+from fdhil.errors import RecordingError
+from fdhil.records import AxisSamples
+
+LARGEST_LOG = 64 * 1024 * 1024
+BLOCK_FRAMES = 4096
+_LINE = re.compile(rb"\((\d{1,12})\.(\d{6})\) (\S{1,32}) ([0-9A-F]{3}|[0-9A-F]{8})#([0-9A-F]{0,16})")
+
+
+def samples_of_log(log: bytes, config: MachineConfig) -> dict[str, AxisSamples]:
+    """Return by axis what was sampled in a log. RecordingError when it is no log of candump, or has no frame.
+
+    A SYNC of which no sample came is not there: nothing is made up.
+    """
+    blocks: dict[str, list[AxisSamples]] = {axis: [] for axis in config.axis}
+    for bus, frames in _frames(log).items():
+        decoder = BusDecoder(bus, config)
+        for start in range(0, frames.size, BLOCK_FRAMES):
+            block = frames[start : start + BLOCK_FRAMES]
+            for record in decoder.feed(block, int(block["t_ns"][-1])):
+                if isinstance(record, AxisSamples):
+                    blocks[record.axis].append(record)
+    return {axis: _joined(axis, found) for axis, found in blocks.items() if found}
+
+
+def _frames(log: bytes) -> dict[str, Frames]:
+    """Return the frames of each bus, in their order."""
+    if len(log) > LARGEST_LOG:
+        raise RecordingError(f"the log has more than {LARGEST_LOG >> 20} MiB, nothing of it is read; cut it")
+    rows: dict[str, list[tuple[int, int, bytes]]] = {}
+    for seconds, micros, bus, can_id, data in _LINE.findall(log):
+        stamp_ns = (int(seconds) * 1_000_000 + int(micros)) * 1000
+        row = (stamp_ns, int(can_id, 16), bytes.fromhex(data.decode("ascii")) if len(data) % 2 == 0 else b"")
+        rows.setdefault(bus.decode("ascii", "replace"), []).append(row)
+    if not rows:
+        raise RecordingError("this is no log of candump, or nothing was on the bus")
+    return {bus: frames_of(found) for bus, found in rows.items()}
+
+
+def _joined(axis: str, blocks: Sequence[AxisSamples]) -> AxisSamples:
+    columns = ("tick", "demand_mm", "position_mm", "speed_rad_s", "current_a", "offset_mm", "statusword")
+    joined = {name: np.concatenate([getattr(block, name) for block in blocks]) for name in columns}
+    voltages = [block.voltage_v for block in blocks if block.voltage_v is not None]
+    voltage = np.concatenate(voltages) if len(voltages) == len(blocks) else None
+    return AxisSamples(axis, voltage_v=voltage, lost=sum(block.lost for block in blocks), **joined)

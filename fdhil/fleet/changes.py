@@ -1,0 +1,93 @@
+"""Tells what a re-analysis changed: of each kind, axis and parameter how far it moved, and whose verdict is another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, LiteralString
+
+from fdhil.errors import StoreError
+from fdhil.fleet.sets import Db
+from fdhil.records import INTERVAL_95, unit_of
+
+MOST_LISTED = 1000  # windows with another verdict, or that could not be read: they are counted all
+# of machines as they told it last; an axis' own label goes before its machine's
+_LABELLED: LiteralString = """
+WITH of AS MATERIALIZED (
+  SELECT r.*, coalesce(m.about->'axis_labels'->r.axis->>%(by)s, m.about->'labels'->>%(by)s, '') AS label
+  FROM fleet.reanalysed r JOIN fleet.machines m USING (machine) WHERE revision = %(revision)s)
+"""
+_COUNTS: LiteralString = """
+SELECT count(*) AS windows, count(error) AS unreadable, count(*) FILTER (WHERE NOT configured) AS without_config,
+  encode(sha256(convert_to(string_agg(digest, '' ORDER BY machine, window_name), 'UTF8')), 'hex') AS digest
+FROM (SELECT machine, window_name, digest, result#>>'{error,text}' AS error,
+        (result->>'configured')::boolean AS configured
+      FROM fleet.reanalysed_windows WHERE revision = %(revision)s) AS results
+"""
+
+
+def _number(value: LiteralString) -> LiteralString:
+    """Return the SQL of a JSON value as a number; NULL for what a machine told that is none."""
+    size = f"abs(({value})::numeric)"
+    fits = f"jsonb_typeof({value}) = 'number' AND ({size} = 0 OR {size} BETWEEN 1e-100 AND 1e100)"
+    return f"CASE WHEN {fits} THEN ({value})::float8 END"
+
+
+def _of_type(value: LiteralString, kind: LiteralString, empty: LiteralString) -> LiteralString:
+    return f"CASE WHEN jsonb_typeof({value}) = '{kind}' THEN {value} ELSE '{empty}' END"
+
+
+# of windows that are believed before and after; ``off`` 1 is the end of the new 95 % interval
+_MOVED: LiteralString = (
+    f""", each AS MATERIALIZED (
+  SELECT label, axis, b.key AS parameter, {_number("b.value->'value'")} AS before,
+    {_number("parameters->b.key->'value'")} AS now, {_number("parameters->b.key->'std'")} * %(interval)s AS half
+  FROM of, jsonb_each({_of_type("parameters_before", "object", "{}")}) b
+  WHERE accepted AND accepted_before),
+moved AS (SELECT *, now - before AS by FROM each)
+"""
+    """SELECT label, axis, parameter, count(by) AS windows,
+  percentile_cont(0.5) WITHIN GROUP (ORDER BY by / nullif(abs(before), 0)) AS change,
+  percentile_cont(0.5) WITHIN GROUP (ORDER BY abs(by) / nullif(half, 0)) AS off, max(abs(by) / nullif(half, 0)) AS most,
+  count(*) FILTER (WHERE abs(by) > half) AS outside
+FROM moved GROUP BY label, axis, parameter HAVING count(by) > 0 ORDER BY label, axis, parameter
+"""
+)
+_WHY: LiteralString = _of_type("CASE WHEN accepted THEN reasons_before ELSE reasons END", "array", "[]")
+_VERDICTS: LiteralString = f"""
+SELECT label, axis, accepted, split_part(reason, ':', 1) AS reason, count(*) AS windows FROM of
+  LEFT JOIN LATERAL jsonb_array_elements_text({_WHY})
+    WITH ORDINALITY AS why (reason, place) ON place = 1
+WHERE accepted <> accepted_before GROUP BY label, axis, accepted, split_part(reason, ':', 1)
+ORDER BY label, axis, accepted, windows DESC
+"""
+_LISTED: LiteralString = f"""
+SELECT machine, axis, number, window_name, recorded_at, accepted, error, {_WHY} AS reasons FROM of
+WHERE accepted <> accepted_before OR error IS NOT NULL ORDER BY machine, axis, number LIMIT %(most)s
+"""
+
+
+def changes(db: Db, revision: int, by: str) -> dict[str, Any]:
+    """Return what a revision changed against what the machines found themselves, in groups of machines by a label.
+
+    ``digest`` is that of all results in order: the same bits have the same. StoreError where there is no such revision.
+    """
+    asked = {"revision": revision, "by": by, "interval": INTERVAL_95, "most": MOST_LISTED}
+    method = db.execute("SELECT method FROM fleet.reanalyses WHERE revision = %(revision)s", asked).fetchone()
+    if method is None:
+        raise StoreError(f"there is no re-analysis {revision}; fdhil fleet reanalyse makes one", "NoHistory")
+    counts = db.execute(_COUNTS, asked).fetchone()
+    assert counts is not None
+    moved = db.execute(_LABELLED + _MOVED, asked).fetchall()
+    return {
+        "revision": revision,
+        "method": method["method"],
+        **counts,
+        "by": by,
+        "moved": [row | {"unit": unit_of(row["parameter"])} for row in moved],
+        "verdicts": db.execute(_LABELLED + _VERDICTS, asked).fetchall(),
+        "listed": [_plain(row) for row in db.execute(_LABELLED + _LISTED, asked)],
+    }
+
+
+def _plain(row: Mapping[str, Any]) -> dict[str, Any]:
+    return dict(row) | {"recorded_at": row["recorded_at"].isoformat(timespec="seconds")}

@@ -1,0 +1,187 @@
+"""Brings offers from the works to the machines, and the machines' answers back: by JetStream, fetched, never pushed.
+
+A stream keeps one message for each machine: all the offers that are open for it. ``fdhil uplink`` asks for that message
+now and then (a direct get, for which its user needs the right to ask for its own subject and no other), lays what is
+signed by a trusted key into its folder, and takes away what the works does not offer any more. It accepts nothing.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+import nats.js.errors
+from nats.js import JetStreamContext
+from nats.js.api import DiscardPolicy, Header, StorageType, StreamConfig
+
+from fdhil.config import MachineConfig
+from fdhil.daemon import journal
+from fdhil.errors import StoreError
+from fdhil.fleet.message import Message, of_answer
+from fdhil.fleet.offer import LARGEST, Offer, OfferRefused, read
+from fdhil.fleet.transport import ERRORS, cause_of
+from fdhil.store.atomic import make_folder, store_error, write_file
+from fdhil.store.offers import Answer, file_name, lying, read_answers
+
+STREAM = "fdhil-offers"
+PREFIX = "fdhil.offers.v1"
+FETCH_S = 60.0
+MOST_OPEN = 20  # offers for one machine
+MOST_BYTES = 1 << 30
+TRIES = 5  # where two persons publish at once
+
+
+def subject_of(machine: str) -> str:
+    """Return the subject whose last message has the offers for a machine."""
+    return f"{PREFIX}.{machine}"
+
+
+def parted(message: bytes) -> Iterator[bytes]:
+    """Yield the documents of a message: two lines each."""
+    lines = message[: MOST_OPEN * LARGEST].split(b"\n")
+    for first, second in zip(lines[0::2], lines[1::2], strict=False):
+        yield first + b"\n" + second + b"\n"
+
+
+# at the works --------------------------------------------------------------------------------------------------
+
+
+async def prepare(stream: JetStreamContext, replicas: int) -> None:
+    """Make the stream of the offers where there is none; ERRORS."""
+    wanted = StreamConfig(
+        name=STREAM,
+        subjects=[f"{PREFIX}.*"],
+        max_msgs_per_subject=1,
+        discard=DiscardPolicy.NEW,
+        storage=StorageType.FILE,
+        max_bytes=MOST_BYTES,
+        num_replicas=replicas,
+        allow_direct=True,
+    )
+    try:
+        await stream.stream_info(STREAM)
+    except nats.js.errors.NotFoundError:
+        await stream.add_stream(wanted)
+
+
+async def publish(stream: JetStreamContext, machine: str, document: bytes, offer: Offer) -> None:
+    """Add an offer to those that are open for a machine, in the place of an older one of its name; ERRORS."""
+    await _change(stream, machine, offer.name, [document])
+
+
+async def withdraw(stream: JetStreamContext, machine: str, name: str) -> None:
+    """Take the offer of a name from those that are open for a machine; ERRORS."""
+    await _change(stream, machine, name, [])
+
+
+async def _change(stream: JetStreamContext, machine: str, name: str, new: list[bytes]) -> None:
+    for _ in range(TRIES):
+        sequence, before = await _open_for(stream, machine)
+        kept = [each for each in parted(before) if _stays(each, name)][: MOST_OPEN - 1]
+        headers = {Header.EXPECTED_LAST_SUBJECT_SEQUENCE.value: str(sequence)}
+        try:
+            await stream.publish(subject_of(machine), b"".join([*kept, *new]), headers=headers)
+            return
+        except nats.js.errors.APIError as error:
+            if error.err_code != 10071:  # somebody else has published in between
+                raise
+    raise nats.js.errors.Error("others publish offers for this machine all the time; try again")
+
+
+def _stays(document: bytes, name: str) -> bool:
+    """Whether what is open stays: what is over, or of this name, goes, whoever signed it."""
+    try:
+        other = read(document, {_signer(document)})
+    except OfferRefused:
+        return False
+    return other.name != name and other.expires_s > time.time()
+
+
+def _signer(document: bytes) -> str:
+    words = document.partition(b"\n")[2].split(b" ")
+    return words[1].decode("ascii", "replace") if len(words) > 1 else ""
+
+
+async def _open_for(stream: JetStreamContext, machine: str) -> tuple[int, bytes]:
+    """Return what is open for a machine, and the number of that message in the stream; ERRORS."""
+    try:
+        message = await stream.get_last_msg(STREAM, subject_of(machine), direct=True)
+    except nats.js.errors.NotFoundError:
+        return 0, b""
+    return message.seq or 0, message.data or b""
+
+
+# at the machine ------------------------------------------------------------------------------------------------
+
+
+class Letterbox:
+    """Fetches the offers for a machine, and tells what its operator answered; nothing without [offers] trust."""
+
+    def __init__(self, config: MachineConfig) -> None:
+        self._config = config
+        self._machine = config.works_name
+        self._next_s = 0.0
+        self._told = 0
+        self._complained = ""
+
+    async def look(self, stream: JetStreamContext, store: str) -> list[Message]:
+        """Fetch what is offered, once a minute, and return the answers that are not told yet, as messages."""
+        if not self._config.offers.trust or time.monotonic() < self._next_s:
+            return []
+        self._next_s = time.monotonic() + FETCH_S
+        complaint = ""
+        try:
+            _, message = await _open_for(stream, self._machine)
+            self._lay(list(parted(message)))
+        except ERRORS as error:
+            complaint = f"no offers can be fetched: {cause_of(error)}; those that lie here stay"
+        except StoreError as error:
+            complaint = str(error)
+        if complaint and complaint != self._complained:
+            journal.write_line(complaint, "minor")
+        self._complained = complaint
+        return [of_answer(asdict(each), self._machine, store) for each in self._answers()]
+
+    def told(self, count: int) -> None:
+        """Note that so many answers more are told."""
+        self._told += count
+
+    def _answers(self) -> list[Answer]:
+        try:
+            answers = read_answers(self._config.store.directory)
+            self._told = min(self._told, len(answers))  # the file was begun anew
+            return answers[self._told :]
+        except StoreError as error:
+            journal.write_line(str(error), "minor")
+            return []
+
+    def _lay(self, documents: list[bytes]) -> None:
+        """Make the folder have these documents and no others; StoreError."""
+        folder = self._config.offers_directory
+        wanted: dict[Path, bytes] = {}
+        for document in documents:
+            try:
+                offer = read(document, self._config.offers.trust)
+            except OfferRefused as error:
+                journal.write_line(f"an offer is not taken in: {error}", "minor")
+                continue
+            wanted[folder / file_name(offer.name, offer.version)] = document
+        try:
+            make_folder(folder)
+            for gone in lying(folder).keys() - wanted.keys():
+                gone.unlink(missing_ok=True)
+        except OSError as error:
+            raise store_error(folder, error) from None
+        for path, document in wanted.items():
+            if not _is(path, document):
+                write_file(path, document)
+                journal.write_line(f"an offer of the works lies in {path}; see it with fdhil offers list")
+
+
+def _is(path: Path, document: bytes) -> bool:
+    try:
+        return path.read_bytes() == document
+    except OSError:
+        return False

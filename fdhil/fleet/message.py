@@ -1,0 +1,249 @@
+"""One message: what a machine's history has of some records, in the order in which they were recorded.
+
+The subject, ``fdhil.v1.MACHINE.records``, says which machine tells: a server lets each publish under its own name
+alone. Of each record there is a line that says what it is, a line of JSON with what the history has of it, and behind
+them its recorded window where that is told. A record has the digest of its row, so that what was sent twice is known
+again. Messages of one machine put together are a message.
+
+The first line is ``fdhil-record-1 STORE AXIS KIND DIGEST SEQUENCE SECONDS BYTES``: the digest of the machine's history
+file; the axis, or ``-``; the digest of the row; its place in the outbox; when it was recorded (UNIX); and how long the
+window is, or ``-``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+from fdhil.fleet import shapes
+from fdhil.store.outbox import Entry
+
+SCHEMA = "fdhil-record-1"
+PREFIX = "fdhil.v1"
+SUBJECTS = f"{PREFIX}.>"
+ABOUT = "about"
+OFFER = "offer"
+LARGEST_RECORD = 1 << 20  # bytes of JSON
+MOST_DEPTH = 20  # of lists in lists
+_SUBJECT = re.compile(r"fdhil\.v1\.([A-Za-z0-9_-]{1,64})\.records")
+_HEAD = re.compile(
+    rb"fdhil-record-1 ([0-9a-f]{32}) ([A-Z]|-) ([a-z]{1,20}) ([0-9a-f]{64}) (\d{1,18}) (\d{1,10}\.\d{6}) (\d{1,9}|-)\n"
+)
+MANY_DIGITS = 200 * b"0"
+_ONLY_DIGITS = bytes.maketrans(b"123456789E", b"000000000e")
+_JSON_COLUMNS = {"reasons", "parameters", "covariance", "window_ids", "terms", "warnings", "friction", "nc", "gains",
+                 "notices"}  # fmt: skip
+_NOT_TOLD = {"id", "digest", "wall_s", "boot", "monotonic_ns", "told"}
+
+
+class BadMessage(ValueError):
+    """A record that is none of ours, or damaged; it is kept aside."""
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """What is published: some records of one machine."""
+
+    subject: str
+    payload: bytes
+
+    @property
+    def identity(self) -> str:
+        """What makes the same message, sent twice, one."""
+        return f"{self.subject}:{hashlib.sha256(self.payload).hexdigest()}"
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """What a collector takes out of a message; ``text`` is ``record`` as JSON, ``payload`` all of it as it came."""
+
+    machine: str
+    store: str
+    sequence: int
+    message: str
+    axis: str
+    kind: str
+    recorded_at: datetime
+    record: Mapping[str, Any]
+    text: str
+    window: bytes | None
+    payload: bytes
+
+    @property
+    def window_name(self) -> str | None:
+        """The name of the window among the objects: the SHA-256 of its content."""
+        return None if self.window is None else hashlib.sha256(self.window).hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class Unread:
+    """A part of a message that is no record, and why."""
+
+    reason: str
+    payload: bytes
+
+
+def of_entry(entry: Entry, machine: str, store: str, window: bytes | None) -> Message:
+    """Return the message of an entry of the outbox; one whose row is not there any more is of no known time (1970)."""
+    record = {name: _told(name, value) for name, value in entry.row.items() if name not in _NOT_TOLD}
+    if "id" in entry.row:
+        record["number"] = str(entry.row["id"])
+    if entry.left_out:
+        record["left_out"] = json.dumps(entry.left_out)
+    text = "{" + ", ".join(f'"{name}": {value}' for name, value in record.items()) + "}"
+    recorded_s = entry.row.get("wall_s", 0.0)
+    head = f"{store} {entry.axis or '-'} {entry.kind} {entry.message} {entry.number} {recorded_s:.6f}"
+    return _message(machine, head, text, window)
+
+
+def of_machine(about: Mapping[str, Any], machine: str, store: str, wall_s: float) -> Message:
+    """Return the message that says what a machine is."""
+    head = f"{store} - {ABOUT} {digest_of(about, wall_s)} 0 {wall_s:.6f}"
+    return _message(machine, head, json.dumps(about), None)
+
+
+def joined(messages: Iterable[Message], most_bytes: int) -> Iterator[tuple[Message, int]]:
+    """Yield messages of one machine put together, none over ``most_bytes`` that is more than one, and of how many."""
+    parts: list[Message] = []
+    size = 0
+    for message in messages:
+        if parts and size + len(message.payload) > most_bytes:
+            yield _together(parts), len(parts)
+            parts, size = [], 0
+        parts.append(message)
+        size += len(message.payload)
+    if parts:
+        yield _together(parts), len(parts)
+
+
+def _together(parts: list[Message]) -> Message:
+    return Message(parts[0].subject, b"".join(part.payload for part in parts))
+
+
+def of_answer(answer: Mapping[str, Any], machine: str, store: str) -> Message:
+    """Return the message that says what was answered to an offer of the works."""
+    head = f"{store} - {OFFER} {digest_of(answer)} 0 {answer['at_s']:.6f}"
+    return _message(machine, head, json.dumps(answer), None)
+
+
+def digest_of(*what: Any) -> str:
+    """Return the SHA-256 of plain JSON."""
+    return hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+
+
+def _message(machine: str, head: str, text: str, window: bytes | None) -> Message:
+    lines = f"{SCHEMA} {head} {'-' if window is None else len(window)}\n{text}\n".encode()
+    return Message(f"{PREFIX}.{machine}.records", lines if window is None else lines + window)
+
+
+def _told(name: str, value: Any) -> str:
+    """Return a column's value as JSON; what is no number is null."""
+    if name in _JSON_COLUMNS and isinstance(value, str):
+        if "NaN" not in value and "Infinity" not in value:
+            return value
+        value = json.loads(value)
+    return json.dumps(_finite(value))
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _finite(each) for key, each in value.items()}
+    return [_finite(each) for each in value] if isinstance(value, list) else value
+
+
+def decode(subject: str, payload: bytes) -> list[Record | Unread]:
+    """Return the records of a message, checked so that a database takes them, and what is none."""
+    found = _SUBJECT.fullmatch(subject)
+    if found is None:
+        return [Unread("its subject is none of a machine's records", payload)]
+    told: list[Record | Unread] = []
+    at = 0
+    while at < len(payload) or not told:
+        try:
+            head, line, end = _next(payload, at)
+        except BadMessage as error:  # where the next one begins is not known
+            return [*told, Unread(str(error), payload[at:])]
+        try:
+            told.append(_record(found[1], head, payload[head.end() : line], payload[line + 1 : end], payload[at:end]))
+        except BadMessage as error:
+            told.append(Unread(str(error), payload[at:end]))
+        at = end
+    return told
+
+
+def _next(payload: bytes, at: int) -> tuple[re.Match[bytes], int, int]:
+    """Return what the record that begins at ``at`` is, and where its own line and all of it end."""
+    head = _HEAD.match(payload, at)
+    if head is None:
+        raise BadMessage(f"it does not begin as a {SCHEMA} does")
+    line = payload.find(b"\n", head.end())
+    if line < 0:
+        raise BadMessage("it is cut off")
+    if line - at > LARGEST_RECORD:
+        raise BadMessage(f"its record is larger than {LARGEST_RECORD >> 10} KiB")
+    end = line + 1 + (0 if head[7] == b"-" else int(head[7]))
+    if end > len(payload):
+        raise BadMessage("its window is cut off")
+    return head, line, end
+
+
+def _record(machine: str, head: re.Match[bytes], line: bytes, window: bytes, payload: bytes) -> Record:
+    try:
+        text = line.decode()
+        record = _DECODER.decode(text)
+    except BadMessage:
+        raise
+    except (ValueError, RecursionError):
+        raise BadMessage("it is no JSON") from None
+    if not isinstance(record, dict):
+        raise BadMessage("it has no record")
+    if "\\u" in text or text.count("[") + text.count("{") > MOST_DEPTH:  # else there is nothing to find
+        _check(record, MOST_DEPTH)
+    digits = line.translate(_ONLY_DIGITS, b"+")
+    if b"e000" in digits or MANY_DIGITS in digits:  # a number that no float holds looks like this
+        _check_numbers(record)
+    store, axis, kind, message, sequence, recorded_s, window_bytes = head.groups()
+    kind = kind.decode()
+    if fault := shapes.fault(kind, record):
+        raise BadMessage(fault)
+    return Record(
+        machine, store.decode(), int(sequence), message.decode(), "" if axis == b"-" else axis.decode(), kind,
+        datetime.fromtimestamp(float(recorded_s), UTC), record, text, None if window_bytes == b"-" else window, payload,
+    )  # fmt: skip
+
+
+def _no_number(name: str) -> None:
+    raise BadMessage(f"it holds {name}")
+
+
+_DECODER = json.JSONDecoder(parse_constant=_no_number)
+
+
+def _check_numbers(record: Mapping[str, Any]) -> None:
+    try:
+        json.dumps(record, allow_nan=False)
+    except ValueError:
+        raise BadMessage("it holds a number beyond all bounds") from None
+
+
+def _check(value: Any, depth: int) -> None:
+    """Refuse what PostgreSQL's jsonb does not take."""
+    if depth == 0:
+        raise BadMessage(f"it is nested deeper than {MOST_DEPTH}")
+    if isinstance(value, dict):
+        for key, each in value.items():
+            _check(key, depth - 1)
+            _check(each, depth - 1)
+    elif isinstance(value, list):
+        for each in value:
+            _check(each, depth - 1)
+    elif isinstance(value, str) and ("\x00" in value or any("\ud800" <= letter <= "\udfff" for letter in value)):
+        raise BadMessage("it holds a character that no database takes")

@@ -1,0 +1,185 @@
+"""The tables and views of the history of many machines, in PostgreSQL's schema ``fleet``, and how they come there.
+
+``records`` has all that was told, one row a message, partitioned by the month in which it was recorded; a row is known
+again by machine, message and time. Times outside of the years that have partitions are in ``records_other``. Other
+programs read the views.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from datetime import UTC, datetime
+from typing import Any, LiteralString
+
+import psycopg
+from psycopg import sql
+from psycopg.rows import tuple_row
+
+from fdhil.errors import StoreError
+
+FIRST_YEAR, LAST_YEAR = 2020, 2099  # of the partitions: a wrong clock makes no others
+LOCK = 7_170_018  # of the advisory lock under which the schema changes
+_FIRST: LiteralString = """
+CREATE TABLE fleet.records (
+  machine text NOT NULL, message text NOT NULL, recorded_at timestamptz NOT NULL, store text NOT NULL,
+  sequence bigint NOT NULL, axis text NOT NULL, kind text NOT NULL, stored_at timestamptz NOT NULL, window_name text,
+  record jsonb NOT NULL, PRIMARY KEY (machine, message, recorded_at)) PARTITION BY RANGE (recorded_at);
+CREATE TABLE fleet.records_other PARTITION OF fleet.records DEFAULT;
+CREATE INDEX records_told ON fleet.records (machine, axis, kind, stored_at, sequence);
+CREATE INDEX records_kind ON fleet.records (kind, recorded_at);
+CREATE TABLE fleet.heard (machine text NOT NULL, store text NOT NULL, records bigint NOT NULL,
+  last_sequence bigint NOT NULL, first_stored_at timestamptz NOT NULL, last_stored_at timestamptz NOT NULL,
+  PRIMARY KEY (machine, store));
+CREATE TABLE fleet.refused (received_at timestamptz NOT NULL DEFAULT now(), subject text NOT NULL, reason text NOT NULL,
+  payload bytea NOT NULL);
+"""
+_VIEWS: LiteralString = """
+CREATE VIEW fleet.machines AS
+  SELECT h.machine, sum(h.records)::bigint AS records, max(h.last_stored_at) AS last_stored_at,
+    sum(h.last_sequence - h.records)::bigint AS missing, count(*) AS stores,
+    (SELECT a.record FROM fleet.records a WHERE a.machine = h.machine AND a.axis = '' AND a.kind = 'about'
+     ORDER BY a.stored_at DESC LIMIT 1) AS about
+  FROM fleet.heard h GROUP BY h.machine;
+CREATE VIEW fleet.parameter_sets AS
+  SELECT machine, axis, recorded_at, stored_at, store, sequence, (record->>'revision')::bigint AS revision,
+    (record->>'R')::float8 AS "R", (record->>'L')::float8 AS "L", (record->>'K')::float8 AS "K",
+    (record->>'Jt')::float8 AS "Jt", (record->>'ft')::float8 AS "ft", (record->>'Cd')::float8 AS "Cd",
+    record->'covariance' AS covariance, record->'terms' AS terms, (record->>'windows')::bigint AS windows,
+    (record->>'temperature_c')::float8 AS temperature_c, record->>'config_digest' AS config_digest
+  FROM fleet.records WHERE kind = 'parameters' AND record ? 'revision';
+CREATE VIEW fleet.newest_parameter_sets AS
+  SELECT DISTINCT ON (machine, axis) * FROM fleet.parameter_sets
+  ORDER BY machine, axis, stored_at DESC, sequence DESC;
+CREATE VIEW fleet.windows AS
+  SELECT machine, axis, recorded_at, stored_at, store, sequence, (record->>'number')::bigint AS number,
+    (record->>'accepted')::int = 1 AS accepted, (record->>'fit_percent')::float8 AS fit_percent,
+    record->'reasons' AS reasons, record->'parameters' AS parameters, (record->>'direction')::int AS direction,
+    (record->>'temperature_c')::float8 AS temperature_c, (record->>'unexplained_um')::float8 AS unexplained_um,
+    window_name
+  FROM fleet.records WHERE kind = 'window' AND record ? 'accepted';
+CREATE VIEW fleet.skills AS
+  SELECT machine, axis, recorded_at, stored_at, store, sequence, (record->>'rms_um')::float8 AS rms_um,
+    (record->>'max_um')::float8 AS max_um, (record->>'delay_ms')::float8 AS delay_ms,
+    (record->>'measured_rms_um')::float8 AS measured_rms_um
+  FROM fleet.records WHERE kind = 'skill' AND record ? 'rms_um';
+CREATE VIEW fleet.notices AS
+  SELECT machine, axis, recorded_at, stored_at, store, sequence, (record->>'number')::bigint AS number,
+    record->>'code' AS code, record->>'severity' AS severity, record->>'text' AS text
+  FROM fleet.records WHERE kind = 'notice' AND record ? 'code';
+CREATE VIEW fleet.acknowledgements AS
+  SELECT machine, recorded_at, stored_at, store, sequence, record->'notices' AS notices, record->>'who' AS who,
+    record->>'note' AS note
+  FROM fleet.records WHERE kind = 'acknowledgement' AND record ? 'who';
+"""
+# a revision belongs to one method; what each of its windows says now is beside what its machine found
+_REANALYSES: LiteralString = """
+CREATE INDEX records_window ON fleet.records (window_name, machine) WHERE window_name IS NOT NULL;
+CREATE TABLE fleet.reanalyses (revision integer GENERATED ALWAYS AS IDENTITY PRIMARY KEY, digest text NOT NULL UNIQUE,
+  method jsonb NOT NULL, begun_at timestamptz NOT NULL DEFAULT now());
+CREATE TABLE fleet.reanalysed_windows (revision integer NOT NULL REFERENCES fleet.reanalyses ON DELETE CASCADE,
+  machine text NOT NULL, window_name text NOT NULL, digest text NOT NULL, result jsonb NOT NULL,
+  done_at timestamptz NOT NULL DEFAULT now(), PRIMARY KEY (revision, machine, window_name));
+CREATE VIEW fleet.reanalysed AS
+  SELECT a.revision, w.machine, w.axis, w.recorded_at, w.stored_at, w.number, a.window_name,
+    w.accepted AS accepted_before, (a.result->>'accepted')::boolean AS accepted,
+    (a.result->>'fit_percent')::float8 AS fit_percent, (a.result->>'unexplained_um')::float8 AS unexplained_um,
+    w.reasons AS reasons_before, a.result->'reasons' AS reasons, w.parameters AS parameters_before,
+    a.result->'parameters' AS parameters, (a.result->>'configured')::boolean AS configured,
+    a.result#>>'{error,text}' AS error
+  FROM fleet.reanalysed_windows a JOIN fleet.windows w USING (machine, window_name);
+"""
+# the roll-out: what was offered to whom, stage by stage, and what the machines answered
+_ROLL_OUT: LiteralString = """
+CREATE TABLE fleet.offers (
+  name text NOT NULL, version integer NOT NULL, stage integer NOT NULL, change text NOT NULL, machines text[] NOT NULL,
+  opened_at timestamptz NOT NULL DEFAULT now(), opened_by text NOT NULL, despite text NOT NULL, document bytea NOT NULL,
+  PRIMARY KEY (name, version, stage));
+CREATE VIEW fleet.offer_answers AS
+  SELECT machine, recorded_at, stored_at, record->>'name' AS name, (record->>'version')::bigint AS version,
+    (record->>'stage')::bigint AS stage, record->>'document' AS document, record->>'answer' AS answer,
+    record->>'by' AS answered_by, record->>'reason' AS reason, record->>'config_digest' AS config_digest
+  FROM fleet.records WHERE kind = 'offer' AND record ? 'answer';
+"""
+# of records that are not kept any more, ``kept`` has what is needed for good; ``dropped`` has their numbers, so that
+# none comes back when it is sent again
+_SISTERS: LiteralString = """
+CREATE TABLE fleet.services (machine text NOT NULL, axis text NOT NULL, serviced_at timestamptz NOT NULL,
+  note text NOT NULL, entered_at timestamptz NOT NULL DEFAULT now(), PRIMARY KEY (machine, axis, serviced_at));
+CREATE TABLE fleet.kept (LIKE fleet.records, PRIMARY KEY (machine, axis, kind));
+CREATE TABLE fleet.dropped (machine text NOT NULL, store text NOT NULL, sequences int8multirange NOT NULL,
+  PRIMARY KEY (machine, store));
+CREATE FUNCTION fleet.time_of(recorded_at timestamptz, stored_at timestamptz) RETURNS timestamptz IMMUTABLE LANGUAGE sql
+  AS $$ SELECT CASE WHEN recorded_at < '2020-01-01Z' THEN stored_at ELSE least(recorded_at, stored_at) END $$;
+CREATE VIEW fleet.told AS SELECT * FROM fleet.records UNION ALL SELECT * FROM fleet.kept;
+CREATE OR REPLACE VIEW fleet.machines AS
+  SELECT h.machine, sum(h.records)::bigint AS records, max(h.last_stored_at) AS last_stored_at,
+    sum(h.last_sequence - h.records)::bigint AS missing, count(*) AS stores,
+    (SELECT a.record FROM fleet.told a WHERE a.machine = h.machine AND a.axis = '' AND a.kind = 'about'
+     ORDER BY a.stored_at DESC LIMIT 1) AS about
+  FROM fleet.heard h GROUP BY h.machine;
+CREATE OR REPLACE VIEW fleet.parameter_sets AS
+  SELECT machine, axis, recorded_at, stored_at, store, sequence, (record->>'revision')::bigint AS revision,
+    (record->>'R')::float8 AS "R", (record->>'L')::float8 AS "L", (record->>'K')::float8 AS "K",
+    (record->>'Jt')::float8 AS "Jt", (record->>'ft')::float8 AS "ft", (record->>'Cd')::float8 AS "Cd",
+    record->'covariance' AS covariance, record->'terms' AS terms, (record->>'windows')::bigint AS windows,
+    (record->>'temperature_c')::float8 AS temperature_c, record->>'config_digest' AS config_digest,
+    fleet.time_of(recorded_at, stored_at) AS at
+  FROM fleet.told WHERE kind = 'parameters' AND record ? 'revision';
+CREATE OR REPLACE VIEW fleet.newest_parameter_sets AS
+  SELECT DISTINCT ON (machine, axis) * FROM fleet.parameter_sets
+  ORDER BY machine, axis, stored_at DESC, sequence DESC;
+CREATE VIEW fleet.axes AS
+  SELECT s.machine, s.axis, min(s.at) AS first_at, max(s.at) AS last_at, count(*) AS sets,
+    (SELECT max(v.serviced_at) FROM fleet.services v WHERE v.machine = s.machine AND v.axis IN ('', s.axis)
+      AND v.serviced_at <= now()) AS serviced_at
+  FROM fleet.parameter_sets s GROUP BY s.machine, s.axis;
+CREATE VIEW fleet.labels AS
+  SELECT m.machine, ''::text AS axis, l.key AS label, l.value AS text
+  FROM fleet.machines m, jsonb_each_text(coalesce(m.about->'labels', '{}')) l
+  UNION ALL SELECT m.machine, x.key, l.key, l.value
+  FROM fleet.machines m, jsonb_each(coalesce(m.about->'axis_labels', '{}')) x, jsonb_each_text(x.value) l;
+CREATE VIEW fleet.loops AS
+  SELECT machine, axis, recorded_at, stored_at, store, sequence, record->>'structure' AS structure,
+    record->'accepted' = '1' AS accepted, record->'gains' AS gains, record->'covariance' AS covariance,
+    record->'unexplained_um' AS unexplained_um, record->'reasons' AS reasons
+  FROM fleet.records WHERE kind = 'loops' AND record ? 'structure';
+"""
+# what leads from each version to the next, in order: a new one is added at the end, an old one never changes
+_STEPS: tuple[LiteralString, ...] = (_FIRST, _VIEWS, _REANALYSES, _ROLL_OUT, _SISTERS)
+VERSION = len(_STEPS)
+
+
+async def bring_up(db: psycopg.AsyncConnection[Any]) -> None:
+    """Make the schema, or take an older one to the present; all of it or nothing. StoreError when it is a newer one."""
+    async with db.transaction():
+        await db.execute("SELECT pg_advisory_xact_lock(%s)", (LOCK,))
+        await db.execute("CREATE SCHEMA IF NOT EXISTS fleet")
+        await db.execute("CREATE TABLE IF NOT EXISTS fleet.schema_version (version integer NOT NULL)")
+        row = await (
+            await db.cursor(row_factory=tuple_row).execute("SELECT version FROM fleet.schema_version")
+        ).fetchone()
+        version = int(row[0]) if row else 0
+        if version > VERSION:
+            text = f"the database has the fleet's schema {version}, this fdhil knows {VERSION}; use a newer fdhil"
+            raise StoreError(text, "SchemaVersion")
+        for step in _STEPS[version:]:
+            await db.execute(step)
+        if version < VERSION:
+            await db.execute("DELETE FROM fleet.schema_version")
+            await db.execute("INSERT INTO fleet.schema_version VALUES (%s)", (VERSION,))
+
+
+async def add_months(db: psycopg.AsyncConnection, months: set[tuple[int, int]]) -> None:
+    """Make the partitions of these months (year, month) where there are none yet."""
+    for year, month in sorted(months):
+        if not FIRST_YEAR <= year <= LAST_YEAR:
+            continue
+        name = sql.Identifier("fleet", f"records_{year}_{month:02d}")
+        end = datetime(year + month // 12, month % 12 + 1, 1, tzinfo=UTC)
+        statement = sql.SQL("CREATE TABLE IF NOT EXISTS {} PARTITION OF fleet.records FOR VALUES FROM ({}) TO ({})")
+        async with db.transaction():
+            await db.execute("SELECT pg_advisory_xact_lock(%s)", (LOCK,))
+            # a collector that went on while its partition was dropped has left rows of it in ``records_other``
+            with suppress(psycopg.errors.CheckViolation):
+                async with db.transaction():
+                    await db.execute(statement.format(name, datetime(year, month, 1, tzinfo=UTC), end))

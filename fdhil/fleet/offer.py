@@ -1,0 +1,185 @@
+"""An offer: a change of configurations that a works has signed, as two lines of text.
+
+The first line is the offer as canonical JSON, the second says who signed it and has the signature (Ed25519) over the
+bytes of the first. There is one way to write an offer, so that no byte of it can be changed without being seen.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import secrets
+import stat
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Annotated, Self
+
+import nkeys
+from nacl.exceptions import CryptoError
+from nacl.signing import VerifyKey
+from pydantic import Field, FiniteFloat, StringConstraints, ValidationError, model_validator
+
+from fdhil.config.fleet import NAME as MACHINE
+from fdhil.config.from_afar import never
+from fdhil.config.offers import key_bytes
+from fdhil.config.reading import checked_value
+from fdhil.config.section import Section
+from fdhil.config.uplink import Label, Labels
+from fdhil.errors import ConfigError, ConfigFault, FdhilError
+from fdhil.store.offers import NAME
+
+SCHEMA = "fdhil-offer-1"
+LARGEST = 512 * 1024  # bytes of an offer
+LARGEST_KEY = 200
+_SIGNED = re.compile(rf"{SCHEMA} (O[A-Z2-7]{{55}}) ([0-9a-f]{{128}})".encode())
+
+Value = bool | int | FiniteFloat | str | tuple[int | FiniteFloat, ...]
+Path_ = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]+(\.([A-Za-z0-9_]+|\*))+$", max_length=100)]
+Machine = Annotated[str, StringConstraints(pattern=MACHINE)]
+
+
+class OfferRefused(FdhilError):
+    """An offer is not accepted, and nothing was changed; the sentence says why."""
+
+    exit_code = 1
+
+
+class Change(Section):
+    """What is offered, to whom: ``values`` by their keys, ``axis.*`` for each axis that has the ``axis_labels``."""
+
+    name: str = Field(pattern=f"^{NAME}$")
+    version: int = Field(ge=1, le=999_999_999)
+    text: Label
+    labels: Labels = Field(default_factory=dict, max_length=50)
+    axis_labels: Labels = Field(default_factory=dict, max_length=50)
+    values: Mapping[Path_, Value] = Field(min_length=1, max_length=500)
+
+    @model_validator(mode="after")
+    def _may_be_offered(self) -> Self:
+        faults = [f"{path}: {why}" for path in self.values if (why := never(path))]
+        if any(path.startswith("axis.*.") for path in self.values) and not self.axis_labels:
+            faults.append("axis_labels: axis.* stands for the axes with these labels; say which")
+        if faults:
+            raise ValueError("\n".join(faults))
+        return self
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of what is offered to whom."""
+        told = self.model_dump_json(include=set(Change.model_fields))
+        return hashlib.sha256(told.encode()).hexdigest()
+
+
+class Offer(Change):
+    """What is signed: ``machines`` are those of its stage, empty: all with the ``labels``; times are s since 1970."""
+
+    stage: int = Field(1, ge=1, le=1000)
+    machines: tuple[Machine, ...] = Field((), max_length=20_000)
+    by: Label
+    made_s: int = Field(ge=0, le=1 << 40)
+    expires_s: int = Field(ge=0, le=1 << 40)
+
+    @model_validator(mode="after")
+    def _is_for_somebody(self) -> Self:
+        if not self.machines and not self.labels:
+            raise ValueError("it names neither machines nor labels")
+        return self
+
+    def __str__(self) -> str:
+        return f"{self.name} version {self.version}"
+
+
+def canonical(offer: Offer) -> bytes:
+    """Return the one line of an offer."""
+    return json.dumps(offer.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+
+
+def sign(offer: Offer, key: Path) -> bytes:
+    """Return the signed document; ConfigError where the key's file cannot be used or a value cannot be."""
+    for path, value in offer.values.items():
+        checked_value(path.replace("axis.*.", "axis.X."), value)
+    pair = _pair(key)
+    line = canonical(offer)
+    signature = pair.sign(_told(line)).hex()
+    document = line + f"\n{SCHEMA} {pair.public_key.decode()} {signature}\n".encode()
+    read(document, {pair.public_key.decode()})
+    return document
+
+
+def read(document: bytes, trusted: Collection[str]) -> Offer:
+    """Return the offer of a document that was signed with a trusted key, and not changed since; OfferRefused."""
+    line, _, rest = document.partition(b"\n")
+    found = _SIGNED.fullmatch(rest.removesuffix(b"\n"))
+    if len(document) > LARGEST or found is None or not rest.endswith(b"\n"):
+        raise OfferRefused("it is no offer of a works, or was cut off; have the file written again")
+    key = found[1].decode()
+    if key not in trusted:
+        text = f"it is signed with {key}, which is no key of [offers] trust"
+        raise OfferRefused(f"{text}; ask the works by another way whether that key is theirs before you list it")
+    try:
+        VerifyKey(key_bytes(key)).verify(_told(line), bytes.fromhex(found[2].decode()))
+    except (CryptoError, ValueError):
+        raise OfferRefused("it was changed after it was signed; nothing in it can be believed") from None
+    return _parsed(line)
+
+
+def _parsed(line: bytes) -> Offer:
+    try:
+        offer = Offer.model_validate_json(line)
+    except (ValidationError, RecursionError) as error:
+        raise OfferRefused(f"this fdhil cannot read it: {_first(error)}") from None
+    if canonical(offer) != line:
+        raise OfferRefused("it is not written as offers are")
+    return offer
+
+
+def _first(error: ValidationError | RecursionError) -> str:
+    if isinstance(error, RecursionError):
+        return "it is nested without end"
+    told = error.errors(include_url=False, include_input=False)[0]
+    place = ".".join(map(str, told["loc"]))
+    return f"{place}: {told['msg']}".removeprefix(": ").removeprefix("Value error, ").replace("\n", "; ")[:300]
+
+
+def _told(line: bytes) -> bytes:
+    """Return what the signature is over: no other document of this key is one."""
+    return SCHEMA.encode() + b"\n" + line
+
+
+def make_key(path: Path) -> str:
+    """Make a key's file, mode 0600, and return the public key; OSError, FileExistsError where there is one."""
+    seed = nkeys.encode_seed(secrets.token_bytes(32), nkeys.PREFIX_BYTE_OPERATOR)
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    with os.fdopen(descriptor, "wb") as file:
+        file.write(seed + b"\n")
+        file.flush()
+        os.fsync(descriptor)
+    return public_key(path)
+
+
+def public_key(path: Path) -> str:
+    """Return the public key that belongs to a key's file; ConfigError."""
+    return str(_pair(path).public_key.decode())
+
+
+def _pair(path: Path) -> nkeys.KeyPair:
+    try:
+        with path.open("rb") as file:
+            mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
+            seed = file.read(LARGEST_KEY).strip()
+    except OSError as error:
+        raise _key_fault(path, f"cannot be read: {error.strerror}", "fdhil fleet key makes one") from None
+    if mode & 0o077:
+        raise _key_fault(path, "may be read by others, who could sign in your name", f"chmod 0600 {path}")
+    try:
+        pair = nkeys.from_seed(seed)
+        key_bytes(pair.public_key.decode())
+    except (nkeys.NkeysError, ValueError, TypeError, IndexError):
+        raise _key_fault(path, "is no key to sign with", "fdhil fleet key makes one") from None
+    return pair
+
+
+def _key_fault(path: Path, what: str, advice: str) -> ConfigError:
+    return ConfigError("key", [ConfigFault(str(path), what, advice)])

@@ -1,0 +1,294 @@
+"""What an offer of a works would change at this machine, and the operator's answer to it.
+
+Nothing here is done by itself: an offer lies in its folder until an operator accepts or rejects it by name. What is
+accepted is looked at again then; the new configuration takes the old one's place whole, and the old one is kept beside
+it. A daemon that runs goes on with the configuration that it has read.
+"""
+
+from __future__ import annotations
+
+import copy
+import fcntl
+import hashlib
+import os
+import stat
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from fdhil import config as machine_config
+from fdhil.config import MachineConfig, parse, toml_document, unlikely
+from fdhil.config.editing import NotEditable, edited
+from fdhil.config.from_afar import loosens
+from fdhil.errors import ConfigError, OutputError, StoreError
+from fdhil.fleet.guard_limits import guard_limits
+from fdhil.fleet.offer import LARGEST, Offer, OfferRefused, read
+from fdhil.store.atomic import write_file
+from fdhil.store.offers import Answer, add_answer, lying, newest_accepted, read_answers
+
+CAUSES = {
+    "DiskFull": "the disk is full; free some of it",
+    "ReadOnlyStore": "you may not write in its folder, or the disk is read-only; try with sudo",
+}
+AHEAD_S = 86_400.0  # by which the works' clock may be ahead of the machine's
+
+
+@dataclass(frozen=True, slots=True)
+class Changed:
+    """One value that an offer changes here."""
+
+    path: str
+    old: Any
+    new: Any
+    loosens: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A document as this machine sees it: ``wrong`` says why it cannot be accepted, empty: it can.
+
+    ``text`` and ``config`` are the configuration after it; of no changes, as it is.
+    """
+
+    place: Path
+    document: str
+    offer: Offer | None
+    wrong: str
+    answers: Sequence[Answer] = ()
+    changes: Sequence[Changed] = ()
+    text: str = ""
+    config: MachineConfig | None = None
+    doubts: Sequence[str] = ()
+    of_guard: Sequence[Changed] = ()
+
+    @property
+    def loosens(self) -> Sequence[Changed]:
+        """What lets more through than before: keys, and what follows from them for the guard."""
+        return [each for each in (*self.changes, *self.of_guard) if each.loosens]
+
+
+@dataclass(frozen=True, slots=True)
+class Present:
+    """The machine as it is now: its file and what that says, its answers so far, the newest version of each offer."""
+
+    file: Path
+    raw: bytes
+    config: MachineConfig
+    answers: Sequence[Answer]
+    newest: Mapping[str, int]
+    now_s: float
+
+    @property
+    def labels(self) -> Mapping[str, str]:
+        """What the machine is compared with others by."""
+        return self.config.uplink.labels if self.config.uplink else {}
+
+    def axes(self, labels: Mapping[str, str]) -> list[str]:
+        """Return the axes that have all these labels."""
+        told = self.config.uplink.axis_labels if self.config.uplink else {}
+        return [axis for axis in self.config.axis if labels.items() <= dict(told.get(axis, {})).items()]
+
+
+def present(file: Path, now_s: float | None = None) -> Present:
+    """Return the machine of a configuration; ConfigError, StoreError where its answers cannot be read."""
+    config = machine_config.load(file)
+    raw, answers = file.read_bytes(), read_answers(config.store.directory)
+    return Present(file, raw, config, answers, _newest(config), time.time() if now_s is None else now_s)
+
+
+def _newest(config: MachineConfig) -> Mapping[str, int]:
+    """Return the newest version of each offer that lies here and is believed."""
+    newest: dict[str, int] = {}
+    for place in lying(config.offers_directory):
+        with suppress(OfferRefused, OSError):
+            offer = read(_content(place), config.offers.trust)
+            newest[offer.name] = max(offer.version, newest.get(offer.name, 0))
+    return newest
+
+
+def _content(place: Path) -> bytes:
+    """Return what stands in a file, one byte more than an offer has at most; OfferRefused where it is no file."""
+    descriptor = os.open(place, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe would be waited for
+    with os.fdopen(descriptor, "rb") as file:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OfferRefused("it is no file; have it written again")
+        return file.read(LARGEST + 1)
+
+
+def judge(place: Path, machine: Present) -> Judged:
+    """Look at the document of a file; OSError where it cannot be read."""
+    judged = Judged(place, "", None, "")
+    try:
+        document = _content(place)
+        judged = replace(judged, document=hashlib.sha256(document).hexdigest())
+        offer = read(document, machine.config.offers.trust)
+        judged = replace(judged, offer=offer, answers=[each for each in machine.answers if _is_of(each, offer)])
+        _require_in_force(offer, machine)
+        _require_for(offer, machine)
+        return _weighed(judged, offer, machine)
+    except OfferRefused as error:
+        return replace(judged, wrong=str(error))
+
+
+def _is_of(answer: Answer, offer: Offer) -> bool:
+    return (answer.name, answer.version) == (offer.name, offer.version)
+
+
+def _require_in_force(offer: Offer, machine: Present) -> None:
+    """OfferRefused where an offer is over, or older than what is known."""
+    day = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(offer.expires_s))
+    if machine.now_s >= offer.expires_s:
+        raise OfferRefused(f"it was valid until {day}; ask the works for a newer one")
+    if offer.made_s > machine.now_s + AHEAD_S:
+        raise OfferRefused("it was made later than this PC's clock says that it is; set the clock")
+    accepted = newest_accepted(machine.answers, offer.name)
+    if offer.version < accepted:
+        raise OfferRefused(f"version {accepted} of it was accepted, and an older one never follows")
+    newest = machine.newest.get(offer.name, 0)
+    if offer.version < newest:
+        raise OfferRefused(f"the works has offered version {newest} in its place")
+
+
+def _require_for(offer: Offer, machine: Present) -> None:
+    """OfferRefused where an offer is for other machines."""
+    name = machine.config.works_name
+    if offer.machines and name not in offer.machines:
+        raise OfferRefused(f"stage {offer.stage} of it is for other machines than {name}")
+    for label, text in offer.labels.items():
+        if machine.labels.get(label) != text:
+            raise OfferRefused(f"it is for machines whose label {label} is {text!r}; [uplink] labels says what this is")
+
+
+def _weighed(judged: Judged, offer: Offer, machine: Present) -> Judged:
+    """Return what an offer changes; OfferRefused where the configuration would be none, or cannot be edited."""
+    values = dict(_values(offer, machine))
+    document = copy.deepcopy(toml_document(machine.raw, str(machine.file)))
+    for path, value in values.items():
+        _put(document, path, value)
+    try:
+        new = parse(document, str(offer), machine.file.parent)
+        found = {path: (_at(machine.config, path), _at(new, path)) for path in values}
+        changes = [Changed(p, old, now, loosens(p, old, now)) for p, (old, now) in found.items() if old != now]
+        text = machine.raw.decode()
+        if changes:
+            text = edited(text, {each.path: values[each.path] for each in changes}, str(offer))
+    except ConfigError as error:
+        raise OfferRefused(f"with it the configuration could not be used: {error}") from None
+    except NotEditable as error:
+        raise OfferRefused(f"{machine.file} cannot be edited by line: {error}") from None
+    doubts = [text for text in unlikely(new) if text not in unlikely(machine.config)]
+    of_guard = list(_loosened(machine.config, new)) if changes else []
+    return replace(judged, changes=changes, text=text, config=new, doubts=doubts, of_guard=of_guard)
+
+
+def _loosened(old: MachineConfig, new: MachineConfig) -> Iterator[Changed]:
+    """Yield the limits of the guard that become larger."""
+    before = guard_limits(old)
+    for name, value in guard_limits(new).items():
+        if name not in before or value > before[name]:
+            yield Changed(f"the guard: {name}", before.get(name), value, True)
+
+
+def _values(offer: Offer, machine: Present) -> Iterator[tuple[str, Any]]:
+    """Yield the keys of this machine with their values; OfferRefused where it has no such axis or table."""
+    for path, value in offer.values.items():
+        top, _, rest = path.partition(".*.")
+        paths = [f"{top}.{axis}.{rest}" for axis in machine.axes(offer.axis_labels)] if rest else [path]
+        if not paths:
+            raise OfferRefused("no axis of this machine has the labels that it is for; [uplink] axis_labels has them")
+        for each in paths:
+            table = each.rpartition(".")[0]
+            if _at(machine.config, table) is None:
+                raise OfferRefused(f"there is no [{table}] here, and only who stands at the machine switches that on")
+            yield each, value
+
+
+def _at(found: Any, path: str) -> Any:
+    for part in path.split("."):
+        found = found.get(part) if isinstance(found, Mapping) else getattr(found, part, None)
+    return found
+
+
+def _put(document: dict[str, Any], path: str, value: Any) -> None:
+    *outer, key = path.split(".")
+    for name in outer:
+        document = document.setdefault(name, {})
+    document[key] = value
+
+
+def accept(place: Path, file: Path, by: str, may_loosen: bool) -> Judged:
+    """Write the configuration that an offer asks for, keep the old one beside it, and note who accepted it.
+
+    OfferRefused; OutputError where the configuration cannot be written: it is as it was. StoreError where the answer
+    cannot be noted; accepted once more it changes nothing, and is noted.
+    """
+    with _alone(file):
+        judged = judge(place, present(file))
+        if judged.wrong or judged.offer is None or judged.config is None:
+            raise OfferRefused(f"{place.name} is not accepted: {judged.wrong}")
+        if judged.loosens and not may_loosen:
+            keys = "; ".join(each.path for each in judged.loosens)
+            raise OfferRefused(f"{judged.offer} is not accepted: it loosens {keys}; if that is meant, add --loosens")
+        if judged.changes:
+            _replace(file, judged)
+        if judged.changes or "accepted" not in [each.answer for each in judged.answers[-1:]]:
+            _note(judged, judged.config, "accepted", by, "")
+        return judged
+
+
+def reject(place: Path, file: Path, by: str, reason: str) -> Judged:
+    """Note who rejected an offer, and why; OfferRefused where it is none of a works that is trusted."""
+    with _alone(file):
+        machine = present(file)
+        judged = judge(place, machine)
+        if judged.offer is None:
+            raise OfferRefused(f"{place.name}: {judged.wrong}")
+        _note(judged, machine.config, "rejected", by, reason)
+        return judged
+
+
+def kept_file(file: Path, offer: Offer) -> Path:
+    """Return where the configuration that was before an offer is kept."""
+    return file.with_name(f"{file.name}.before-{offer.name}-{offer.version}")
+
+
+def _replace(file: Path, judged: Judged) -> None:
+    assert judged.offer is not None
+    file = file.resolve()
+    old, new, like = file.read_bytes(), judged.text.encode(), file.stat()
+    try:
+        write_file(kept_file(file, judged.offer), old, like)
+        write_file(file, new, like)
+    except StoreError as error:
+        stands = (
+            "is as it was" if file.read_bytes() == old else "is the new one, but a power cut may bring the old back"
+        )
+        cause = CAUSES.get(error.code, str(error))
+        raise OutputError(f"{file} could not be written: {cause}; the configuration {stands}") from None
+
+
+def _note(judged: Judged, config: MachineConfig, answer: Literal["accepted", "rejected"], by: str, reason: str) -> None:
+    offer = judged.offer
+    assert offer is not None
+    told = Answer(
+        offer.name, offer.version, offer.stage, judged.document, answer, by, reason, time.time(), config.digest
+    )
+    add_answer(config.store.directory, told)
+
+
+@contextmanager
+def _alone(file: Path) -> Iterator[None]:
+    """Hold the configuration's folder, so that of two who answer at once the second sees what the first did."""
+    descriptor = os.open(file.resolve().parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            text = f"another command is answering an offer of {file}; wait until it has ended, then try again"
+            raise OutputError(text) from None
+        yield
+    finally:
+        os.close(descriptor)

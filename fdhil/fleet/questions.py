@@ -1,0 +1,158 @@
+"""Answers what is asked of all machines, from the views of the database; as JSON has it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from fdhil.fleet.due import due
+from fdhil.fleet.outliers import Course, Sisters, judge, of_machines
+from fdhil.fleet.services import services
+from fdhil.fleet.sets import MONTH_S, Db, Row, ages_months, date_of, known, newest_sets, std_of
+from fdhil.records import INTERVAL_95, PARAMETERS, frozen, unit_of
+
+__all__ = ["compare", "outliers", "services", "status", "trend"]
+
+NEWEST_SETS = 50  # of an axis, where it is compared with others
+LEAST_TREND = 5  # sets
+TOLD_OF_SISTERS = ("median", "spread", "slope_per_k", "slope_per_month", "temperature_c", "age_months", "bound")
+Rows = Sequence[Row]
+_OPEN = """
+SELECT n.machine, count(*) AS open FROM fleet.notices n LEFT JOIN
+  (SELECT machine, store, jsonb_array_elements(notices)::bigint AS number FROM fleet.acknowledgements) a
+  USING (machine, store, number)
+WHERE n.severity <> 'info' AND a.number IS NULL GROUP BY n.machine
+"""
+
+
+def status(db: Db) -> dict[str, Any]:
+    """Return every machine: when it was heard, what is missing, its newest parameters, open notices; what is due."""
+    waiting = {row["machine"]: row["open"] for row in db.execute(_OPEN)}
+    newest: dict[str, dict[str, Any]] = {}
+    for row in db.execute("SELECT * FROM fleet.newest_parameter_sets"):
+        newest.setdefault(row["machine"], {})[row["axis"]] = _set(row)
+    machines = [
+        {
+            "machine": row["machine"],
+            "name": (row["about"] or {}).get("name", row["machine"]),
+            "labels": (row["about"] or {}).get("labels", {}),
+            "last_heard": date_of(row["last_stored_at"]),
+            "records": row["records"],
+            "missing": row["missing"],
+            "open_notices": waiting.get(row["machine"], 0),
+            "axes": newest.get(row["machine"], {}),
+        }
+        for row in db.execute("SELECT * FROM fleet.machines ORDER BY machine")
+    ]
+    refused = db.execute("SELECT count(*) AS refused FROM fleet.refused").fetchone()
+    return {"machines": machines, "due": due(db), "refused_messages": refused["refused"] if refused else 0}
+
+
+def trend(db: Db, machine: str, axis: str, parameter: str) -> dict[str, Any]:
+    """Return how a parameter of an axis moved: each set, and the slope per 30 days (the median of all pairs)."""
+    query = "SELECT * FROM fleet.parameter_sets WHERE machine = %s AND axis = %s ORDER BY stored_at, sequence"
+    rows = db.execute(query, (machine, axis)).fetchall()
+    points = [
+        {"time": date_of(row["at"]), "revision": row["revision"], "temperature_c": row["temperature_c"]}
+        | _figures(row, parameter)
+        for row in rows
+    ]
+    pairs = [(row["at"].timestamp(), row[parameter]) for row in rows if row[parameter] is not None]
+    return {"machine": machine, "axis": axis, "parameter": parameter, "unit": unit_of(parameter), "sets": points} | {
+        "slope_per_30_days": _slope(pairs)
+    }
+
+
+def _slope(pairs: list[tuple[float, float]]) -> float | None:
+    """Return the median slope of all pairs of the newest 500 (Theil and Sen); None for a few, or for one moment."""
+    if len(pairs) < LEAST_TREND:
+        return None
+    at_s, values = np.array(pairs[-500:]).T
+    first, second = np.triu_indices(at_s.size, 1)
+    apart_s = at_s[second] - at_s[first]
+    slopes = (values[second] - values[first])[apart_s != 0] / apart_s[apart_s != 0]
+    return float(np.median(slopes) * MONTH_S) if slopes.size else None
+
+
+def compare(db: Db, parameter: str, by: str, axis: str | None) -> dict[str, Any]:
+    """Return a parameter of the same axis of all machines, in groups of machines whose label ``by`` is the same."""
+    groups = _groups(db, by, axis)
+    return {"parameter": parameter, "unit": unit_of(parameter), "by": by, "groups": _compared(groups, parameter)}
+
+
+def _compared(groups: Mapping[tuple[str, str], Sequence[Rows]], parameter: str) -> list[dict[str, Any]]:
+    courses = {key: [_course(rows, parameter) for rows in axes if rows[-1][parameter] is not None]
+               for key, axes in groups.items()}  # fmt: skip
+    judged = {key: judge(own) for key, own in courses.items()}
+    found = []
+    for key, own in courses.items():
+        same = [sisters for (label, _), sisters in judged.items() if label == key[0] and sisters is not None]
+        found += [_group(key, own, judged[key], of_machines(same))] if own else []
+    return found
+
+
+def _group(
+    key: tuple[str, str], courses: Sequence[Course], sisters: Sisters | None, expected: Mapping[tuple[str, str], float]
+) -> dict[str, Any]:
+    listed = [
+        {"machine": c.machine, "axis": c.axis, "value": c.values[-1], "std": known(c.std)}
+        for c in sorted(courses, key=lambda course: float(course.values[-1]))
+    ]
+    told = {name: None if sisters is None else known(getattr(sisters, name)) for name in TOLD_OF_SISTERS}
+    outliers = [
+        {"machine": level.machine, "value": level.value, "off": level.off, "score": known(level.score),
+         "off_by_its_other_axes": expected[level.machine, level.axis]}
+        for level in (sisters.levels if sisters is not None else ()) if level.is_outlier
+    ]  # fmt: skip
+    return {"label": key[0], "axis": key[1], "sisters": listed, **told, "outliers": outliers}
+
+
+def outliers(db: Db, by: str, axis: str | None) -> dict[str, Any]:
+    """Return the axes that are unlike their sisters in a parameter, the farthest first."""
+    groups, found = _groups(db, by, axis), []
+    for parameter in PARAMETERS:
+        for group in _compared(groups, parameter):
+            of_group = {name: group[name] for name in ("label", "axis", "median", "bound")}
+            found += [
+                {"parameter": parameter, "unit": unit_of(parameter), "sisters": len(group["sisters"])} | of_group | each
+                for each in group["outliers"]
+            ]
+    found.sort(key=lambda each: -math.inf if each["score"] is None else -abs(each["score"]))
+    return {"by": by, "outliers": found}
+
+
+def _groups(db: Db, by: str, axis: str | None) -> dict[tuple[str, str], list[Rows]]:
+    """Return the newest sets of each axis, by the label of its machine (or its own) and its letter."""
+    labels = {row["machine"]: row["about"] or {} for row in db.execute("SELECT machine, about FROM fleet.machines")}
+    groups: dict[tuple[str, str], list[Rows]] = {}
+    for (machine, letter), rows in newest_sets(db, NEWEST_SETS, axis=axis).items():
+        groups.setdefault((_label(labels.get(machine, {}), letter, by), letter), []).append(rows)
+    return groups
+
+
+def _course(rows: Rows, parameter: str) -> Course:
+    told = [row for row in rows if row[parameter] is not None]
+    values = frozen([row[parameter] for row in told])
+    at_c = frozen([math.nan if row["temperature_c"] is None else row["temperature_c"] for row in told])
+    last = told[-1]
+    return Course(last["machine"], last["axis"], values, at_c, frozen(ages_months(told)), std_of(last, parameter))
+
+
+def _label(about: Mapping[str, Any], axis: str, by: str) -> str:
+    own = about.get("axis_labels", {}).get(axis, {})
+    return str(own.get(by) or about.get("labels", {}).get(by) or "")
+
+
+def _set(row: Mapping[str, Any]) -> dict[str, Any]:
+    figures = {name: _figures(row, name) | {"unit": unit_of(name)} for name in PARAMETERS}
+    head = {"revision": row["revision"], "time": date_of(row["at"]), "temperature_c": row["temperature_c"]}
+    return head | {"parameters": figures}
+
+
+def _figures(row: Mapping[str, Any], parameter: str) -> dict[str, Any]:
+    value, half = row[parameter], INTERVAL_95 * std_of(row, parameter)
+    known = value is not None and math.isfinite(half)
+    return {"value": value, "low": value - half if known else None, "high": value + half if known else None}

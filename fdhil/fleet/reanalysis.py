@@ -1,0 +1,113 @@
+"""Analyses the stored windows of many machines again, by another method or another fdhil, as a revision of its own.
+
+What was found before stays as it is. A revision belongs to one method (its settings, the configurations that were
+given, the code): what is done of it is not done twice, so that whoever was killed begins where he was.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
+from datetime import datetime
+from functools import partial
+from typing import Any, LiteralString
+
+import psycopg
+from psycopg.types.json import Jsonb
+
+from fdhil.config.fleet import Fleet
+from fdhil.errors import StoreError
+from fdhil.fleet import migrations
+from fdhil.fleet.sets import Db, entered
+from fdhil.fleet.window_work import Again, Method, Stored, analyse_again
+from fdhil.fleet.workers import WindowCrew
+
+Progress = Callable[[int, int], None]
+_LOCK = 7_170_019  # with a revision: of the advisory lock of whoever makes it
+_OPEN: LiteralString = """
+  FROM fleet.windows w WHERE window_name IS NOT NULL
+    AND (%(machine)s::text IS NULL OR machine = %(machine)s) AND (%(axis)s::text IS NULL OR axis = %(axis)s)
+    AND (%(since)s::timestamptz IS NULL OR least(recorded_at, stored_at) >= %(since)s)
+    AND (%(until)s::timestamptz IS NULL OR least(recorded_at, stored_at) < %(until)s)
+    AND NOT EXISTS (SELECT 1 FROM fleet.reanalysed_windows a WHERE a.revision = %(revision)s
+      AND a.machine = w.machine AND a.window_name = w.window_name AND NOT a.result ? 'error')
+"""
+_KEEP = """
+INSERT INTO fleet.reanalysed_windows AS a (revision, machine, window_name, digest, result)
+VALUES (%s, %s, %s, %s, %s) ON CONFLICT (revision, machine, window_name)
+DO UPDATE SET digest = excluded.digest, result = excluded.result, done_at = now() WHERE a.result ? 'error'
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Scope:
+    """Which windows: those recorded in a time, of one machine or all, of one axis or all."""
+
+    since: datetime | None = None
+    until: datetime | None = None
+    machine: str | None = None
+    axis: str | None = None
+
+
+def unseen(done: int, total: int) -> None:
+    """Tell nobody how far it is."""
+
+
+def reanalyse(fleet: Fleet, method: Method, scope: Scope, crew: WindowCrew, progress: Progress = unseen) -> int:
+    """Analyse what of a scope is not yet done of a method's revision, and return the revision's number.
+
+    ``progress`` hears how many windows are done, of how many. ConnectError where the database cannot be entered,
+    StoreError where nothing was collected or another is at the same revision, FdhilError of a worker.
+    """
+    with entered(fleet) as db, entered(fleet) as reader:
+        db.execute("SELECT FROM fleet.records LIMIT 1")
+        asyncio.run(_bring_up(fleet))
+        revision = _revision(db, method)
+        if not _one(db, "SELECT pg_try_advisory_lock(%s, %s)", (_LOCK, revision)):
+            raise StoreError(f"revision {revision} is being made by another fdhil fleet reanalyse; let it end", "Busy")
+        wanted = asdict(scope) | {"revision": revision}
+        total = _one(reader, f"SELECT count(*) FROM (SELECT DISTINCT machine, window_name {_OPEN}) AS open", wanted)
+        done = 0
+        progress(done, total)
+        crew = replace(
+            crew, per_task=max(1, min(crew.per_task, total // (2 * crew.at_once)))
+        )  # work for all, to the end
+        with closing(_windows(reader, wanted)) as windows:
+            for task, results in crew.spread(partial(analyse_again, method=method), windows):
+                _keep(db, revision, results)
+                done += len(task)
+                progress(done, total)
+    return revision
+
+
+async def _bring_up(fleet: Fleet) -> None:
+    async with await psycopg.AsyncConnection.connect(fleet.database.connection, autocommit=True) as db:
+        await migrations.bring_up(db)
+
+
+def _revision(db: Db, method: Method) -> int:
+    """Return the number of a method's revision, a new one where there is none."""
+    told = (method.digest, Jsonb(method.document()))
+    db.execute("INSERT INTO fleet.reanalyses (digest, method) VALUES (%s, %s) ON CONFLICT DO NOTHING", told)
+    return _one(db, "SELECT revision FROM fleet.reanalyses WHERE digest = %s", (method.digest,))
+
+
+def _one(db: Db, query: LiteralString, values: Mapping[str, Any] | Sequence[Any]) -> int:
+    row = db.execute(query, values).fetchone()
+    assert row is not None
+    return int(next(iter(row.values())))
+
+
+def _windows(db: Db, wanted: Mapping[str, Any]) -> Generator[Stored]:
+    """Yield what is open, as it was when this began."""
+    with db.transaction(), db.cursor("open") as rows:
+        for row in rows.execute(f"SELECT DISTINCT machine, window_name {_OPEN} ORDER BY 1, 2", wanted):
+            yield Stored(row["machine"], row["window_name"])
+
+
+def _keep(db: Db, revision: int, results: Sequence[Again]) -> None:
+    with db.transaction(), db.cursor() as cursor:
+        rows = [(revision, again.window.machine, again.window.name, again.digest, again.text) for again in results]
+        cursor.executemany(_KEEP, rows)

@@ -1,0 +1,85 @@
+"""Spreads work over an executor: this process, further processes, or a cluster; what is done comes as it is done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any, Generic, TypeVar
+
+TEND_S = 10.0
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+class Here(Executor):
+    """Does what it is given in this process, before it returns."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Return the future of work that is done; what the work raises is raised here."""
+        done: Future[Any] = Future()
+        done.set_result(fn(*args, **kwargs))
+        return done
+
+
+@dataclass(frozen=True)
+class Crew(Generic[Item, Result]):
+    """Who works: an executor, how many items are one task, how many tasks are on their way at once.
+
+    Where a task ends with one of the errors ``deadly`` (its worker died, again and again), it is tried in halves; a
+    single item that ends so is tried once more alone, at the end, and then has the result ``lost``. ``tend`` sees to
+    workers that are missing; it is called while nothing ends.
+    """
+
+    executor: Executor
+    per_task: int
+    at_once: int
+    deadly: tuple[type[BaseException], ...] = ()
+    lost: Callable[[Item], Result] | None = None
+    tend: Callable[[], object] | None = None
+
+    def spread(
+        self, work: Callable[[Sequence[Item]], Sequence[Result]], items: Iterable[Item]
+    ) -> Iterator[tuple[Sequence[Item], Sequence[Result]]]:
+        """Yield the items of each task and their results, in the order in which tasks end."""
+        left, halves, suspects = iter(items), list[list[Item]](), list[list[Item]]()
+        running: dict[Future[Sequence[Result]], list[Item]] = {}
+        while True:
+            while len(running) < self.at_once and (
+                task := halves.pop() if halves else list(islice(left, self.per_task))
+            ):
+                running[self.executor.submit(work, task)] = task
+            if not running:
+                break
+            for future in self._ended(running):
+                task = running.pop(future)
+                try:
+                    results = future.result()
+                except self.deadly:
+                    middle = len(task) // 2
+                    if middle:
+                        halves += [task[:middle], task[middle:]]
+                    else:
+                        suspects.append(task)
+                    continue
+                yield task, results
+        for task in suspects:  # alone: who else was at its worker may have been the one
+            yield task, self._alone(work, task)
+
+    def _alone(self, work: Callable[[Sequence[Item]], Sequence[Result]], task: list[Item]) -> Sequence[Result]:
+        future = self.executor.submit(work, task)
+        self._ended([future])
+        try:
+            return future.result()
+        except self.deadly:
+            if self.lost is None:
+                raise
+            return [self.lost(task[0])]
+
+    def _ended(self, running: Iterable[Future[Sequence[Result]]]) -> set[Future[Sequence[Result]]]:
+        """Return the futures that have ended, one at least."""
+        while not (ended := wait(running, TEND_S, FIRST_COMPLETED).done):
+            if self.tend is not None:
+                self.tend()
+        return ended

@@ -1,0 +1,159 @@
+"""What a worker does in a re-analysis: reads stored windows and analyses each again; the same bits wherever it runs."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import platform
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import fdhil
+from fdhil.config import Identification, MachineConfig
+from fdhil.errors import FdhilError, RecordingError
+from fdhil.fleet.objects import path_of
+from fdhil.pipeline import analyse_windows
+from fdhil.records import WindowOutcome
+from fdhil.store.history import described
+from fdhil.store.windows import MAX_FILE_BYTES, decode_window
+
+ROOMS = ("records", "model", "identification", "validation", "pipeline")  # whose code the figures follow from
+LIBRARIES = ("numpy", "scipy", "numba", "pyarrow")
+
+
+class Stored(NamedTuple):
+    """A window of the folder of windows, and whose it is."""
+
+    machine: str
+    name: str
+
+
+class Again(NamedTuple):
+    """What a window says now: plain JSON in one order, and its SHA-256."""
+
+    window: Stored
+    text: str
+    digest: str
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """How windows are analysed: the settings, the configurations that are known (by the machine's name in the works),
+    the folder of windows, and the code of whoever asks.
+    """
+
+    settings: Identification
+    machines: Mapping[str, MachineConfig]
+    folder: Path
+    code: str
+
+    def document(self) -> dict[str, Any]:
+        """Return all that the results follow from, as JSON has it."""
+        machines = {
+            name: {
+                "sync_period_s": config.machine.sync_period_s,
+                "settings": config.identification.model_dump(mode="json"),
+            }
+            | {"axes": {axis: section.model_dump(mode="json") for axis, section in config.axis.items()}}
+            for name, config in self.machines.items()
+        }
+        return {"settings": self.settings.model_dump(mode="json"), "machines": machines, "code": self.code}
+
+    @property
+    def digest(self) -> str:
+        """The SHA-256 of it."""
+        return hashlib.sha256(json.dumps(self.document(), sort_keys=True).encode()).hexdigest()
+
+
+@cache
+def code_digest() -> str:
+    """Return the SHA-256 of the code that makes the figures, and of the versions of the libraries under it."""
+    digest = hashlib.sha256(repr([platform.python_version(), *map(version, LIBRARIES)]).encode())
+    for path in _sources(Path(fdhil.__file__).parent):
+        digest.update(path.name.encode() + hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def _sources(folder: Path) -> Iterator[Path]:
+    for room in ROOMS:
+        yield from sorted((folder / room).rglob("*.py"))
+    yield folder / "store" / "windows.py"
+
+
+def analyse_again(windows: Sequence[Stored], method: Method) -> list[Again]:
+    """Return what each window says now; one that cannot be read has its error as the result.
+
+    FdhilError where this worker cannot do the same work as the others: it has other code, or no folder of windows.
+    """
+    if method.code != code_digest():
+        text = "has another fdhil, or other versions of its libraries, than the command: install the same on all"
+        raise FdhilError(f"the worker on {platform.node()} {text}")
+    if not method.folder.is_dir():
+        text = f"does not see {method.folder}: the folder of windows must be there, under the same name, on all"
+        raise FdhilError(f"the worker on {platform.node()} {text}")
+    return [told(window, _result(window, method)) for window in windows]
+
+
+def told(window: Stored, result: Mapping[str, Any]) -> Again:
+    """Return a result as it is kept."""
+    text = json.dumps(result, sort_keys=True, allow_nan=False)
+    return Again(window, text, hashlib.sha256(text.encode()).hexdigest())
+
+
+def lost(window: Stored) -> Again:
+    """Return the result of a window over which its worker died, each time."""
+    return told(window, {"error": {"class": "WorkerDied", "text": f"each process that analysed {window.name} died"}})
+
+
+def _result(window: Stored, method: Method) -> dict[str, Any]:
+    config = method.machines.get(window.machine)
+    settings = method.settings if config is None else _of_machine(config, method.settings)
+    try:
+        recorded = decode_window(_content(window.name, method.folder), window.name)
+        axis = None if config is None else config.axis.get(recorded.axis)
+        period_s = None if config is None else config.machine.sync_period_s
+        ((outcome,), _) = analyse_windows([recorded], settings, axis, period_s)
+    except (FdhilError, MemoryError) as error:
+        return {"error": {"class": type(error).__name__, "text": str(error) or "the memory is used up"}}
+    return _document(outcome) | {"configured": axis is not None}
+
+
+def _of_machine(config: MachineConfig, asked: Identification) -> Identification:
+    """Return a machine's own settings, with the method that was asked for."""
+    return config.identification.model_copy(update={"method": asked.method} if asked.method else {})
+
+
+def _content(name: str, folder: Path) -> bytes:
+    path = path_of(folder, name)
+    try:
+        with path.open("rb") as file:
+            content = file.read(MAX_FILE_BYTES + 1)
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror}; check [objects] directory") from None
+    if hashlib.sha256(content).hexdigest() != name:
+        raise RecordingError(f"{path} is damaged: it is not what its name says; take it from a backup")
+    return content
+
+
+def _document(outcome: WindowOutcome) -> dict[str, Any]:
+    """Return an outcome as the history of a machine has its row."""
+    estimate, verdict = outcome.estimate, outcome.verdict
+    return {
+        "accepted": verdict.accepted,
+        "fit_percent": _finite(verdict.fit_percent),
+        "unexplained_um": _finite(verdict.unexplained_um),
+        "reasons": [str(reason) for reason in verdict.reasons],
+        "warnings": [str(reason) for reason in verdict.warnings],
+        "method": estimate and estimate.method,
+        "result": estimate and estimate.result.value,
+        "parameters": described(outcome) if estimate else None,
+    }
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None

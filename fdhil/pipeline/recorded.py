@@ -1,0 +1,39 @@
+"""Analyses the windows of one recording of one axis, by the best that they show of its drive."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
+
+from fdhil.config import Axis, Identification
+from fdhil.pipeline.analysis import analyse
+from fdhil.pipeline.own_loops import explained
+from fdhil.records import LoopEstimate, Window, WindowOutcome
+
+Work = Callable[[Window], WindowOutcome]
+Spread = Callable[[Work, Sequence[Window]], Iterable[WindowOutcome]]
+
+
+def analyse_windows(
+    windows: Sequence[Window],
+    settings: Identification,
+    axis: Axis | None = None,
+    sync_period_s: float | None = None,
+    spread: Spread = map,
+    done: Callable[[], None] = lambda: None,
+) -> tuple[Sequence[WindowOutcome], LoopEstimate | None]:
+    """Return what each window says, and the drive's own loops where they had to be sought.
+
+    ``spread`` may use further processes, in order; ``done`` is told of each window.
+    """
+    work = partial(analyse, settings=settings, axis=axis, sync_period_s=sync_period_s)
+
+    def told() -> Iterator[WindowOutcome]:
+        for outcome in spread(work, windows):
+            done()
+            yield outcome
+
+    def again(own: Axis) -> Sequence[WindowOutcome]:
+        return list(spread(partial(work, axis=own), windows))
+
+    return explained(list(told()), axis, settings, sync_period_s, again)

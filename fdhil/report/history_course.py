@@ -1,0 +1,147 @@
+"""The course of one parameter as a chart: its estimates over time or temperature, its line, nominal value and limit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+
+from fdhil.records import INTERVAL_95, Float
+from fdhil.report.chart import DAY_S, Chart, Panel, Trace
+from fdhil.report.drawing import COLOURS, INK
+from fdhil.report.parameter_view import DISPLAY, cell, half_of, spoken
+
+MANY = 200  # estimates: more are shown by their daily medians
+BAND = (5.0, 95.0)  # percentiles of a day's estimates
+IN_VIEW = 4.0  # of the estimates' own range: a limit farther away would flatten them
+LEVELS_APART = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class AxisHistory:
+    """What is known of one axis: its revisions, its health (see ``fdhil history --json``), its nominal values."""
+
+    axis: str
+    rows: Sequence[Mapping[str, Any]] = ()
+    told: Mapping[str, Any] | None = None
+    nominal: Mapping[str, float] = field(default_factory=dict)
+
+    def names(self) -> list[str]:
+        """Return the parameters that have a course, in the order in which they are told."""
+        of_windows = [window["parameters"] for window in (self.told or {}).get("windows", ())]
+        known = dict.fromkeys(name for parameters in of_windows for name in parameters)
+        known |= dict.fromkeys(name for row in self.rows for name in row["parameters"])
+        return [name for name in DISPLAY if name in known]
+
+    def estimates(self, name: str) -> list[Mapping[str, Any]]:
+        """Return the windows that have an estimate of a parameter."""
+        windows = () if self.told is None else self.told["windows"]
+        return [w for w in windows if None not in (w["parameters"].get(name, {}).get(key) for key in ("value", "std"))]
+
+
+def over_time(history: AxisHistory, name: str) -> Chart:
+    """Return a parameter's course in time: estimates or their daily medians, what was published, its line."""
+    unit, factor = DISPLAY[name]
+    traces = [*_published(history, name), *_estimated(history, name)]
+    told = history.told or {}
+    if line := told.get("trends", {}).get(name):
+        at, newest = _second(line["at"]), _second(told["windows"][-1]["time"])
+        ends = np.array([_second(line["since"]), at, newest])
+        traces.append(_line("trend", ends, (ends - at) / DAY_S, line, "per_day", factor))
+    marks = [
+        (change["cause"], _second(change["time"])) for change in told.get("changes", ()) if name in change["parameters"]
+    ]
+    panel = Panel(f"{name.partition('_')[0]} ({unit})", traces, levels=_levels(history, name, traces))
+    return Chart("time (UTC)", [panel], _words(history, name), in_time=True, marks=marks)
+
+
+def over_temperature(history: AxisHistory, name: str) -> Chart | None:
+    """Return a parameter's course over the slide-way's temperature; None where it does not surely follow it."""
+    line = (history.told or {}).get("slopes", {}).get(name)
+    known = [window for window in history.estimates(name) if window["temperature_c"] is not None]
+    if not known or line is None or line["low"] <= 0.0 <= line["high"]:
+        return None
+    unit, factor = DISPLAY[name]
+    drawn = known[:: -(-len(known) // MANY)]
+    celsius = np.array([window["temperature_c"] for window in drawn])
+    ends = np.array([celsius.min(), line["at_celsius"], celsius.max()])
+    ends.sort()
+    traces = [
+        _points(drawn, name, celsius),
+        _line("slope", ends, ends - line["at_celsius"], line, "per_kelvin", factor),
+    ]
+    told = cell(name, line["per_kelvin"], half_of(line), " ")
+    alt = f"Axis {history.axis}: {spoken(name)} over the temperature of the slide-way, {told} {unit} per kelvin."
+    return Chart("temperature of the slide-way (degC)", [Panel(f"{name.partition('_')[0]} ({unit})", traces)], alt)
+
+
+def _published(history: AxisHistory, name: str) -> list[Trace]:
+    """Return what was published; of many sets the last of each day."""
+    rows = [row for row in history.rows if name in row["parameters"]]
+    if len(rows) > MANY or len(history.estimates(name)) > MANY:
+        rows = list({row["time"][:10]: row for row in rows}.values())
+    if not rows:
+        return []
+    values = np.array([row["parameters"][name]["value"] for row in rows]) * DISPLAY[name][1]
+    return [Trace("published", _seconds(row["time"] for row in rows), values, COLOURS[1])]
+
+
+def _estimated(history: AxisHistory, name: str) -> list[Trace]:
+    """Return each estimate with its interval; of many, the median of each day and where nine in ten of them lie."""
+    known = history.estimates(name)
+    if not known:
+        return []
+    time_s = _seconds(window["time"] for window in known)
+    if len(known) <= MANY:
+        return [_points(known, name, time_s)]
+    values = np.array([window["parameters"][name]["value"] for window in known]) * DISPLAY[name][1]
+    starts = np.flatnonzero(np.diff(time_s // DAY_S, prepend=-1.0))
+    days = np.split(values, starts[1:])
+    low, middle, high = (np.array([np.percentile(day, p) for day in days]) for p in (BAND[0], 50.0, BAND[1]))
+    at = np.array([float(np.median(part)) for part in np.split(time_s, starts[1:])])
+    return [Trace("median of the day, with 90 % of its rapids", at, middle, COLOURS[0], low=low, high=high)]
+
+
+def _points(windows: Sequence[Mapping[str, Any]], name: str, at: Float) -> Trace:
+    factor = DISPLAY[name][1]
+    values = np.array([window["parameters"][name]["value"] for window in windows]) * factor
+    half = INTERVAL_95 * np.array([window["parameters"][name]["std"] for window in windows]) * factor
+    return Trace("each rapid, 95 % interval", at, values, COLOURS[0], "points", values - half, values + half)
+
+
+def _line(label: str, ends: Float, away: Float, line: Mapping[str, Any], key: str, factor: float) -> Trace:
+    """Return a line through its centre with the fan of its slope's interval."""
+    value, one, other = (factor * (line["level"] + line[which] * away) for which in (key, "low", "high"))
+    return Trace(label, ends, value, INK, "dashed", np.minimum(one, other), np.maximum(one, other))
+
+
+def _levels(history: AxisHistory, name: str, traces: Sequence[Trace]) -> list[tuple[str, float]]:
+    """Return nominal value and limit where they are near enough to be drawn; the table tells them all the same."""
+    shown = [values for trace in traces for values in (trace.low, trace.y, trace.high) if values is not None]
+    if not shown:
+        return []
+    low, high = min(float(np.nanmin(v)) for v in shown), max(float(np.nanmax(v)) for v in shown)
+    limits = (history.told or {}).get("limits", {})
+    named = {"nominal": history.nominal.get(name), "limit": limits.get(name, {}).get("limit")}
+    levels = [(label, value * DISPLAY[name][1]) for label, value in named.items() if value is not None]
+    room = IN_VIEW * max(high - low, 0.02 * abs(high))
+    return [(label, level) for label, level in levels if low - room <= level <= high + room]
+
+
+def _words(history: AxisHistory, name: str) -> str:
+    unit, factor = DISPLAY[name]
+    known = [row["parameters"][name]["value"] for row in history.rows if name in row["parameters"]]
+    known = known or [window["parameters"][name]["value"] for window in history.estimates(name)]
+    ends = f", first {known[0] * factor:.4g} {unit}, latest {known[-1] * factor:.4g} {unit}" if known else ""
+    return f"Axis {history.axis}: course of {spoken(name)} in time{ends}."
+
+
+def _second(date: str) -> float:
+    return datetime.fromisoformat(date).timestamp()
+
+
+def _seconds(dates: Any) -> Float:
+    return np.array([_second(date) for date in dates])

@@ -1,0 +1,103 @@
+"""Reads what the store knows of a machine's drives, as ``fdhil history --json`` and the pages have it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+from fdhil.config import MachineConfig
+from fdhil.report.history_course import AxisHistory
+from fdhil.report.history_trends import NEWEST_WINDOWS, health
+from fdhil.report.history_verdict import Refusals, refusals_of
+
+if TYPE_CHECKING:
+    from fdhil.store.rows import Revision, StoredWindow
+
+NEWEST_NOTICES = 500
+
+
+def read_history(
+    machine: MachineConfig, axis: str | None = None, tell: Callable[[str], object] | None = None
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Return the published revisions and, by axis, what the windows tell of the drive's health. StoreError.
+
+    ``tell`` hears of damaged rows that were left out.
+    """
+    from fdhil.store.history import History
+
+    with History.read(machine.store.directory, tell) as stored:
+        windows = stored.windows(axis, limit=NEWEST_WINDOWS)
+        return [_row(revision) for revision in stored.revisions(axis)], health(windows, stored, machine)
+
+
+def read_axes(
+    machine: MachineConfig, axis: str | None = None, newest: int = 1
+) -> tuple[list[AxisHistory], dict[str, Refusals]]:
+    """Return the history of each axis, or of one, and which of its newest windows were not believed. StoreError.
+
+    Of the published sets of one axis there are the first and the ``newest``.
+    """
+    from fdhil.store.history import History
+
+    with History.read(machine.store.directory) as stored:
+        windows = stored.windows(axis, limit=NEWEST_WINDOWS)
+        revisions = stored.revisions(axis, newest)
+        if axis is not None and len(revisions) == newest > 1:
+            first = stored.first_revision(axis)
+            revisions = [first, *revisions[1:]] if first is not None else revisions
+        told = health(windows, stored, machine)
+    refused = _refused(windows)
+    return by_axis(machine, [_row(revision) for revision in revisions], told, [*machine.axis, *refused]), refused
+
+
+def read_refusals(machine: MachineConfig) -> dict[str, Refusals]:
+    """Return by axis which of the newest windows were not believed. StoreError."""
+    from fdhil.store.history import History
+
+    with History.read(machine.store.directory) as stored:
+        return _refused(stored.windows(limit=NEWEST_WINDOWS))
+
+
+def _refused(windows: Sequence[StoredWindow]) -> dict[str, Refusals]:
+    axes = dict.fromkeys(window.axis for window in windows)
+    return {axis: refusals_of([window for window in windows if window.axis == axis]) for axis in axes}
+
+
+def read_notices(machine: MachineConfig, axis: str | None = None) -> list[dict[str, Any]]:
+    """Return the newest notices that ask to be acknowledged, and who did, oldest first. StoreError."""
+    from fdhil.store.history import RECENT_NOTICES, History
+    from fdhil.store.notice_document import notice_document
+
+    with History.read(machine.store.directory) as stored:
+        known = stored.notices(limit=RECENT_NOTICES)
+    asking = [n for n in known if n.notice.severity != "info" and axis in (None, n.notice.axis)]
+    return [notice_document(notice) for notice in asking[-NEWEST_NOTICES:]]
+
+
+def _row(revision: Revision) -> dict[str, Any]:
+    from fdhil.store.set_document import set_document
+
+    return {
+        **set_document(revision.set),
+        "time": datetime.fromtimestamp(revision.stamp.wall_s, UTC).isoformat(timespec="seconds"),
+        "window_ids": list(revision.window_ids),
+        "config_digest": revision.set.config_digest,
+    }
+
+
+def by_axis(
+    machine: MachineConfig, rows: Sequence[Mapping[str, Any]], told: Mapping[str, Any], seen: Iterable[str] = ()
+) -> list[AxisHistory]:
+    """Return the history of each axis that is known of, in the order of the config."""
+    known = {*(row["axis"] for row in rows), *told, *seen}
+    axes = [axis for axis in machine.axis if axis in known] + sorted(known - set(machine.axis))
+    return [
+        AxisHistory(
+            axis,
+            [row for row in rows if row["axis"] == axis],
+            told.get(axis),
+            machine.axis[axis].nominal.model_dump() if axis in machine.axis else {},
+        )
+        for axis in axes
+    ]

@@ -1,0 +1,224 @@
+"""Finds the drives' health in the stored windows: slopes, steps, and the dates of the maintenance limits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+from fdhil.records import PARAMETERS, RATIOS, unit_of
+from fdhil.report.parameter_view import DISPLAY, cell, half_of
+
+if TYPE_CHECKING:
+    from fdhil.config import MachineConfig
+    from fdhil.identification.trends import Crossing, Step
+    from fdhil.records import Float
+    from fdhil.store.history import History
+    from fdhil.store.rows import StoredWindow
+
+NEWEST_WINDOWS = 2000
+DAY_S = 86_400.0
+LEAST_SPAN_S = 3_600.0  # below it a course in time is warming, not wear
+WEAR_SPAN_S = 2 * DAY_S  # from it on what follows the temperature is told apart from wear
+FARTHEST_DAYS = 3_650.0
+TOGETHER = 2  # windows within which steps have one cause
+CAUSES = {
+    frozenset({"Jt"}): "a changed load",
+    frozenset({"ft"}): "changed lubrication",
+    frozenset({"ft", "Cd"}): "changed lubrication or guides",
+    frozenset({"Cd"}): "changed guides, seals or preload",
+    frozenset({"R"}): "a changed winding or connection",
+    frozenset({"K"}): "changed magnets or a current sensor's gain",
+}
+
+
+def health(windows: Sequence[StoredWindow], history: History, machine: MachineConfig) -> dict[str, dict[str, Any]]:
+    """Return by axis ``slopes``, ``trends``, ``limits``, ``changes`` and their ``windows``, as JSON has them.
+
+    ``windows`` are the newest of ``history``, oldest first.
+
+    An axis without voltage has no accepted windows; its ratios to K follow friction and load all the same.
+    """
+    stored = [window for window in windows if window.parameters]
+    told = {}
+    for name in dict.fromkeys(window.axis for window in stored):
+        own = [window for window in stored if window.axis == name]
+        accepted = [window for window in own if window.accepted]
+        if not accepted:
+            if ratios := [window for window in own if _tells_ratios(window)]:
+                told[name] = of_axis(ratios, {}, RATIOS)
+            continue
+        first = history.first_revision(name)
+        limits = {}
+        if first is not None:
+            shares = machine.maintenance.model_dump()
+            limits = {symbol: (value, shares[symbol]) for symbol, value in first.set.parameters.as_dict().items()}
+        told[name] = of_axis(accepted, limits)
+    return told
+
+
+def _tells_ratios(window: StoredWindow) -> bool:
+    """Return whether nothing but its missing voltage speaks against a window."""
+    told = (window.parameters or {}).get(RATIOS[0], {}).get("value") is not None
+    return told and len(window.reasons) == 1
+
+
+def of_axis(
+    windows: Sequence[StoredWindow], limits: Mapping[str, tuple[float, float]], symbols: Sequence[str] = PARAMETERS
+) -> dict[str, Any]:
+    """Return an axis' health; ``limits`` maps a symbol to its first published value and the change that it may have."""
+    import numpy as np
+
+    from fdhil.identification.trends import BY_DIRECTION, FRICTION, slope, steps, without_direction
+
+    symbols = (*symbols, FRICTION) if symbols == PARAMETERS else symbols
+    values, stds = (_columns(windows, key, symbols) for key in ("value", "std"))
+    values[stds == 0.0] = np.nan  # given, not estimated: a data sheet's value has no course
+    direction = np.array([window.direction for window in windows], dtype=np.float64)
+    for k in (k for k, symbol in enumerate(symbols) if symbol in BY_DIRECTION):
+        values[:, k] = without_direction(values[:, k], direction)
+    time_s = np.array([window.stamp.wall_s for window in windows])
+    celsius = np.array([np.nan if w.temperature_c is None else w.temperature_c for w in windows], dtype=np.float64)
+    known = bool(np.isfinite(celsius).all())
+    found = steps(values, stds, celsius if known else None, symbols)
+    told: dict[str, Any] = {"slopes": {}, "trends": {}, "limits": {}, "changes": _changes(found, windows)}
+    for k, symbol in enumerate(symbols):
+        since = max((step.row for step in found if step.name == symbol), default=0)
+        y, std, kelvin = values[since:, k], stds[since:, k], celsius[since:]
+        span_s = float(np.ptp(time_s[since:]))
+        if line := slope(y, kelvin, std, time_s[since:] if span_s >= WEAR_SPAN_S else None):
+            centre = {"level": line.level, "at_celsius": line.at}
+            told["slopes"][symbol] = {"per_kelvin": line.value, "std": line.std, **_interval(line.interval())} | centre
+        if span_s < LEAST_SPAN_S:
+            continue
+        held = known and bool(np.ptp(kelvin) > 0)
+        line = slope(y, time_s[since:] / DAY_S, std, kelvin if held else None)
+        if line is not None:
+            rest: dict[str, Any] = {"level": line.level, "at": _date(line.at * DAY_S), "since": _date(time_s[since])}
+            rest["at_constant_temperature"] = held
+            told["trends"][symbol] = {"per_day": line.value, "std": line.std, **_interval(line.interval())} | rest
+            if symbol in limits:
+                told["limits"] |= _limit(symbol, line, limits[symbol], float(time_s[-1]), span_s / DAY_S)
+    return told | {"windows": _rows(windows, values, stds, symbols)}
+
+
+def _columns(windows: Sequence[StoredWindow], key: str, symbols: Sequence[str]) -> Float:
+    """Return (n, k) of the windows' values or standard deviations, NaN where one was not told."""
+    import numpy as np
+
+    from fdhil.identification.trends import FRICTION
+
+    known: list[dict[str, Any]] = [{**(window.parameters or {}), FRICTION: window.friction or {}} for window in windows]
+    told = [[parameters.get(name, {}).get(key) for name in symbols] for parameters in known]
+    return np.array(told, dtype=np.float64).reshape(-1, len(symbols))
+
+
+def _interval(interval: tuple[float, float]) -> dict[str, float]:
+    return {"low": interval[0], "high": interval[1]}
+
+
+def _date(seconds: float) -> str:
+    return datetime.fromtimestamp(float(seconds), UTC).isoformat(timespec="seconds")
+
+
+def _limit(
+    symbol: str, line: Any, limit: tuple[float, float], newest_s: float, span_days: float
+) -> dict[str, dict[str, Any]]:
+    """Return when the line reaches the limit that lies ahead of it, and nothing when no date can be told."""
+    from fdhil.identification.trends import crossing, reach_days
+
+    first, share = limit
+    value = first + abs(first) * (share if line.value > 0 else -share)
+    reached = crossing(line, value)
+    if reached is None or reached.at - newest_s / DAY_S > min(reach_days(span_days), FARTHEST_DAYS):
+        return {}
+    return {symbol: {"limit": value, "reached": reached.at * DAY_S <= newest_s, **_dates(reached, newest_s)}}
+
+
+def _dates(reached: Crossing, newest_s: float) -> dict[str, str | None]:
+    """Return the date and its interval; one that ends in a farther future has no latest date."""
+    late = reached.high - newest_s / DAY_S > FARTHEST_DAYS
+    return {
+        "date": _date(reached.at * DAY_S),
+        "earliest": _date(reached.low * DAY_S),
+        "latest": None if late else _date(reached.high * DAY_S),
+    }
+
+
+def _changes(found: Sequence[Step], windows: Sequence[StoredWindow]) -> list[dict[str, Any]]:
+    """Return the steps with those of other parameters at about the same window taken together."""
+    from fdhil.identification.trends import FRICTION
+
+    changes: list[list[Step]] = []
+    for step in found:
+        if changes and step.row - changes[-1][0].row <= TOGETHER:
+            changes[-1].append(step)
+        else:
+            changes.append([step])
+    told = []
+    for together in changes:
+        window = windows[together[0].row]
+        parameters = {
+            s.name: {"before": s.before, "after": s.before + s.size, "std": s.std, "unit": unit_of(s.name)}
+            for s in together
+        }
+        # the sum of ft and Cd tells no cause beside either
+        moved_by = frozenset(name.removesuffix("/K") for name in parameters) - {FRICTION} or frozenset({"ft", "Cd"})
+        cause = CAUSES.get(moved_by, "a changed drive or sensor")
+        told.append(
+            {"window": window.number, "time": _date(window.stamp.wall_s), "cause": cause, "parameters": parameters}
+        )
+    return told
+
+
+def _rows(windows: Sequence[StoredWindow], values: Float, stds: Float, symbols: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the windows as the plot and JSON have them: number, time, temperature, NC, value and deviation."""
+    import numpy as np
+
+    def told(number: float) -> float | None:
+        return float(number) if np.isfinite(number) else None
+
+    return [
+        {
+            "window": window.number,
+            "time": _date(window.stamp.wall_s),
+            "temperature_c": window.temperature_c,
+            "nc": window.nc,
+            "parameters": {
+                name: {"value": told(v), "std": told(s)} for name, v, s in zip(symbols, row, spread, strict=True)
+            },
+        }
+        for window, row, spread in zip(windows, values, stds, strict=True)
+    ]
+
+
+def slope_rows(told: Mapping[str, Any]) -> list[list[str]]:
+    """Return a row per parameter that has a slope: per kelvin, per day, and its limit's date."""
+    slopes, trends, limits = (told[key] for key in ("slopes", "trends", "limits"))
+    rows = []
+    for name in DISPLAY:
+        if name in slopes or name in trends:
+            cells = [
+                cell(name, line[key], half_of(line), " ") if (line := lines.get(name)) else "-"
+                for lines, key in ((slopes, "per_kelvin"), (trends, "per_day"))
+            ]
+            rows.append([f"{name.partition('_')[0]} {DISPLAY[name][0]}", *cells, _when(name, limits.get(name))])
+    return rows
+
+
+def moved(change: Mapping[str, Any]) -> str:
+    """Return what moved in a change, in words."""
+    parts = ((name, DISPLAY[name], p) for name, p in change["parameters"].items())
+    return ", ".join(
+        f"{name} {p['before'] * factor:.4g} -> {p['after'] * factor:.4g} {unit}" for name, (unit, factor), p in parts
+    )
+
+
+def _when(name: str, limit: Mapping[str, Any] | None) -> str:
+    if limit is None:
+        return "-"
+    value = f"{limit['limit'] * DISPLAY[name][1]:.4g}"
+    if limit["reached"]:
+        return f"{value} has been reached"
+    latest = limit["latest"][:10] if limit["latest"] else "open"
+    return f"{value} on {limit['date'][:10]}\n({limit['earliest'][:10]} to {latest})"

@@ -1,0 +1,76 @@
+"""Shows parameters to people: one unit each, and one meaning of ±, in every table."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from fdhil.records import UNITS
+
+MEANING = "± is half the width of the 95 % interval"
+# what people read: unit and factor; the ratios to K and all of JSON stay in SI units
+DISPLAY: Mapping[str, tuple[str, float]] = {name: (unit, 1.0) for name, unit in UNITS.items()} | {
+    "R": ("mohm", 1e3),
+    "L": ("mH", 1e3),
+    "Jt": ("g.m2", 1e3),
+    "ft": ("mN.m.s", 1e3),
+}
+
+MEANINGS: Mapping[str, str] = {
+    "R": "resistance of the winding",
+    "L": "inductance of the winding",
+    "K": "torque per ampere",
+    "Jt": "inertia at the motor's shaft",
+    "ft": "friction that grows with speed",
+    "Cd": "dry friction",
+    "friction_at_rapid": "friction at the rapid speed",
+    "Jt/K": "inertia, in amperes",
+    "ft/K": "friction that grows with speed, in amperes",
+    "Cd/K": "dry friction, in amperes",
+}
+
+
+def spoken(name: str) -> str:
+    """Return a parameter's symbol, or what has none in words."""
+    return MEANINGS[name] if "_" in name else name
+
+
+def head(name: str) -> str:
+    """Return the head of a parameter's column: its symbol above its unit."""
+    return f"{name}\n{DISPLAY[name][0]}"
+
+
+def half_of(told: Mapping[str, Any]) -> float | None:
+    """Return half the width of a value's 95 % interval as JSON has it; None where it has none."""
+    if told.get("low") is None or told.get("high") is None:
+        return None
+    return float(told["high"] - told["low"]) / 2
+
+
+def cell(name: str, value: float | None, half: float | None, between: str = "\n") -> str:
+    """Return a value and half of its interval in the parameter's unit, both to the place where the half begins."""
+    if value is None or not math.isfinite(value):
+        return "-"
+    factor = DISPLAY[name][1] if name in DISPLAY else 1.0  # terms are shown in SI units
+    shown = value * factor
+    if half is None or not math.isfinite(half):
+        return f"{shown:.4g}{between}(no ±)"
+    width = half * factor
+    if width <= 0.0:
+        return f"{shown:.6g}{between}±0"
+    digits = -math.floor(math.log10(width))
+    if -1 <= digits <= 6:
+        places = max(0, digits)
+        return f"{shown:.{places}f}{between}±{width:.{places}f}"
+    if digits < 0 and abs(shown) < 1e6:
+        return f"{round(shown, digits):.0f}{between}±{round(width, digits):.0f}"
+    return _with_exponent(shown, width, between)
+
+
+def _with_exponent(value: float, width: float, between: str) -> str:
+    """Return value and half width with one exponent for both, to the same place."""
+    exponent = math.floor(math.log10(max(abs(value), width)))
+    places = max(0, exponent - math.floor(math.log10(width)))
+    scale = 10.0**exponent
+    return f"({value / scale:.{places}f}{between}±{width / scale:.{places}f})e{exponent}"

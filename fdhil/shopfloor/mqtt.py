@@ -1,0 +1,273 @@
+"""Tells an MQTT broker what the daemon knows, as an edge node of Sparkplug B.
+
+The broker is told when the node is born and when it dies, and in between only what changes. Of all commands the one
+that asks for the births is obeyed, and no other. Nothing is stored: what happens while the broker is away is not told
+later.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import logging
+import time
+from collections.abc import Iterable, Mapping
+from typing import NoReturn
+
+import aiomqtt
+from aiomqtt.exceptions import MqttConnectError
+
+from fdhil.config import MachineConfig
+from fdhil.config.publish import MqttBroker
+from fdhil.daemon import journal
+from fdhil.shopfloor.broker_security import password_of, tls_of
+from fdhil.shopfloor.news import News, listen
+from fdhil.shopfloor.process import say_ready
+from fdhil.shopfloor.published import Event, Value
+from fdhil.shopfloor.sparkplug import (
+    BOOLEAN,
+    DOUBLE,
+    INT64,
+    STRING,
+    EdgeNode,
+    HostState,
+    Message,
+    Metric,
+    host_state,
+    host_topic,
+    wants_rebirth,
+)
+
+FIRST_RETRY_S, LAST_RETRY_S = 1.0, 60.0
+DEATH_S = 2.0  # a broker that does not take our death certificate sends the one it has
+REBIRTH_S = 1.0  # births are sent no more often
+WAITING = 32  # messages of the broker that wait to be looked at
+NOTICE = "the newest notice"
+DATATYPES: Mapping[str, int] = {"measure": DOUBLE, "count": INT64, "flag": BOOLEAN, "state": STRING, "text": STRING}
+
+
+class HostGone(Exception):
+    """The primary host application says that it is not there."""
+
+
+async def publish(config: MachineConfig) -> None:
+    """Publish until it is cancelled; a broker that is not there is tried again, later and later.
+
+    ConnectError when the files of its credentials cannot be used.
+    """
+    settings = config.publish.mqtt
+    session = Session(settings, settings.node_name(config.machine.name))
+    tls_of(settings)  # what is wrong with the files ends the command
+    password_of(settings)
+    where = f"{settings.host}:{settings.port}"
+    say_ready(f"Sparkplug B of {config.machine.name}: {session.node.topic('NBIRTH')}, for the broker at {where}")
+    tasks = [asyncio.create_task(_hear(config, session)), asyncio.create_task(_stay_connected(session, settings))]
+    try:  # neither goes on without the other: what is told would be old
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        done.pop().result()
+    finally:
+        await _end(tasks)
+
+
+async def _end(tasks: Iterable[asyncio.Task[None]]) -> None:
+    """Cancel until they have ended: Python 3.11 loses a cancellation that comes as a connection breaks."""
+    left = set(tasks)
+    while left:
+        for task in left:
+            task.cancel()
+        _, left = await asyncio.wait(left, timeout=DEATH_S + 1.0)
+
+
+async def _hear(config: MachineConfig, session: Session) -> None:
+    async for news in listen(config, config.publish.mqtt.period_s):
+        session.hear(news)
+
+
+async def _stay_connected(session: Session, settings: MqttBroker) -> NoReturn:
+    delay_s, told = FIRST_RETRY_S, ""
+    where = f"{settings.host}:{settings.port}"
+    while True:
+        began_s = time.monotonic()
+        try:
+            async with _client(settings, session) as broker:
+                journal.write_line(f"the broker {where} is there")
+                await session.run(broker)
+        except* aiomqtt.MqttError as errors:
+            cause = _cause(_first(errors))
+            if cause != told:
+                journal.write_line(f"the broker {where} is not told anything: {cause}; it is tried again", "minor")
+            told = cause
+        except* HostGone:
+            journal.write_line(f"the primary host {settings.primary_host} is gone; it is waited for", "minor")
+        if time.monotonic() - began_s > LAST_RETRY_S:  # it was there, and not for a moment only
+            delay_s, told = FIRST_RETRY_S, ""
+        await asyncio.sleep(delay_s)
+        delay_s = min(LAST_RETRY_S, 2 * delay_s)
+
+
+def _first(error: BaseException) -> BaseException:
+    return _first(error.exceptions[0]) if isinstance(error, BaseExceptionGroup) else error
+
+
+def _cause(error: BaseException) -> str:
+    """Return why a broker cannot be told, and what to look at."""
+    if isinstance(error, MqttConnectError):
+        return f"it refuses ({error}); check user and password_file, and whom it lets in"
+    if "SSL" in str(error):
+        return f"{error}; check tls_ca_file and the name in its certificate"
+    return f"{error}; check host and port, and whether it runs"
+
+
+def _client(settings: MqttBroker, session: Session) -> aiomqtt.Client:
+    """Return a client for one connection, with its own death certificate as the will."""
+    will = session.node.will(_now_ms())
+    identity = hashlib.sha256(will.topic.encode()).hexdigest()[:16]
+    return aiomqtt.Client(
+        settings.host,
+        settings.port,
+        identifier=f"fdhil-{identity}",  # the broker ends what is left of our own connection before
+        username=settings.user,
+        password=password_of(settings),
+        tls_context=tls_of(settings),
+        will=aiomqtt.Will(will.topic, will.payload, will.qos, retain=False),
+        clean_session=True,
+        keepalive=round(settings.keepalive_s),
+        max_queued_incoming_messages=WAITING,
+        logger=_silent_log(),
+    )
+
+
+def _silent_log() -> logging.Logger:
+    """Return a log that says nothing: what matters of the library's words comes as an exception."""
+    log = logging.getLogger("fdhil.mqtt")
+    log.propagate = False
+    log.handlers = [logging.NullHandler()]
+    return log
+
+
+class Session:
+    """What is said over one connection after another."""
+
+    def __init__(self, settings: MqttBroker, node: str) -> None:
+        self.node = EdgeNode(settings.group, node)
+        self._host = settings.primary_host
+        self._news: News | None = None
+        self._notices: dict[str, Metric] = {}
+        self._waiting = asyncio.Queue[News]()
+        self._stir = asyncio.Event()
+        self._rebirth = self._born = False
+        self._host_state: HostState | None = None
+
+    def hear(self, news: News) -> None:
+        """Take what the daemon says now; it is told where a broker is there."""
+        self._news = news
+        if self._born:
+            self._waiting.put_nowait(news)
+        else:  # the births tell the newest notice, too
+            for event in news.events:
+                self._note(event)
+        self._stir.set()
+
+    async def run(self, broker: aiomqtt.Client) -> None:
+        """Serve one connection until it breaks (an ExceptionGroup with MqttError or HostGone), or all is cancelled."""
+        self._rebirth, self._born, self._host_state = False, False, None
+        self._waiting = asyncio.Queue()
+        await broker.subscribe(self.node.topic("NCMD"), qos=1)
+        if self._host:
+            await broker.subscribe(host_topic(self._host), qos=1)
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(self._obey(broker))
+                tasks.create_task(self._tell(broker))
+        finally:
+            await self._die(broker)
+
+    async def _die(self, broker: aiomqtt.Client) -> None:
+        """Say so before leaving; the broker only tells of a connection that broke."""
+        if not self._born:
+            return
+        self._born = False
+        with contextlib.suppress(aiomqtt.MqttError):  # it broke: the broker has the will
+            await _send(broker, [self.node.death(_now_ms())], DEATH_S)
+
+    async def _obey(self, broker: aiomqtt.Client) -> None:
+        async for message in broker.messages:
+            if self._host and message.topic.matches(host_topic(self._host)):
+                self._note_host(host_state(message.payload))
+            elif wants_rebirth(message.payload):
+                self._rebirth = True
+                self._stir.set()
+
+    def _note_host(self, state: HostState | None) -> None:
+        """Take the host's word, the newest one: an older death is that of a connection before."""
+        known = self._host_state
+        if state is None or (known is not None and state.stamp_ms < known.stamp_ms):
+            return
+        self._host_state = state
+        self._stir.set()
+        if self._born and not state.online:
+            raise HostGone
+
+    async def _tell(self, broker: aiomqtt.Client) -> NoReturn:
+        while self._news is None or (self._host and not (self._host_state and self._host_state.online)):
+            await self._stirred()
+        while True:
+            if self._rebirth or not self._born:
+                self._rebirth, self._born = False, True
+                self._waiting = asyncio.Queue()
+                assert self._news is not None
+                await _send(broker, self.node.births(*self._metrics(self._news), self._news.stamp_ms))
+                await asyncio.sleep(REBIRTH_S)
+            while not self._rebirth and not self._waiting.empty():
+                await _send(broker, self._changes(self._waiting.get_nowait()))
+            if not self._rebirth:
+                await self._stirred()
+
+    async def _stirred(self) -> None:
+        await self._stir.wait()
+        self._stir.clear()
+
+    def _changes(self, news: News) -> list[Message]:
+        """Return what is new, every notice of several by itself."""
+        messages: list[Message] = []
+        for event in news.events:
+            self._note(event)
+            messages += self.node.news(*self._metrics(news), news.stamp_ms)
+        return messages or self.node.news(*self._metrics(news), news.stamp_ms)
+
+    def _note(self, event: Event) -> None:
+        text = f"{event.code}: {event.text}"
+        self._notices[event.axis] = Metric("notice", STRING, text, event.stamp_ms, description=NOTICE, event=True)
+
+    def _metrics(self, news: News) -> tuple[list[Metric], dict[str, list[Metric]]]:
+        """Return the metrics of the node, and of each axis; while the daemon is silent, no axis is there."""
+        up = Metric("up", BOOLEAN, not news.silent, news.stamp_ms, description="whether the daemon answers")
+        node = [up, *self._of("", news)]
+        axes = dict.fromkeys(value.axis for value in news.values if value.axis)
+        return node, {} if news.silent else {axis: self._of(axis, news) for axis in axes}
+
+    def _of(self, axis: str, news: News) -> list[Metric]:
+        known = [metric_of(value) for value in news.values if value.axis == axis]
+        told = [f"{alarm.code}: {alarm.text}" for alarm in news.alarms if alarm.axis == axis]
+        text = None if news.silent else "; ".join(told)
+        alarms = Metric("alarms", STRING, text, news.stamp_ms, description="what is wrong now, with the next action")
+        none_yet = Metric("notice", STRING, None, news.stamp_ms, description=NOTICE)
+        return [*known, alarms, self._notices.get(axis, none_yet)]
+
+
+def metric_of(value: Value) -> Metric:
+    """Return a published value as a metric; those of a bus are in its folder."""
+    item = value.item
+    name = f"{value.bus}/{item.name}" if value.bus else item.name
+    unit = "" if item.unit == "1" else item.unit
+    return Metric(name, DATATYPES[item.kind], value.value, value.stamp_ms, unit, item.description)
+
+
+async def _send(broker: aiomqtt.Client, messages: list[Message], timeout_s: float | None = None) -> None:
+    for message in messages:
+        await broker.publish(message.topic, message.payload, message.qos, retain=False, timeout=timeout_s)
+
+
+def _now_ms() -> int:
+    return time.time_ns() // 1_000_000

@@ -1,0 +1,140 @@
+"""An MTConnect adapter: agents connect to it over TCP and are told in SHDR, line by line, what changes.
+
+It answers an agent's pings and reads nothing else. An agent that does not read what it is sent loses its connection,
+and one that goes silent too; it comes again, and is told everything.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+
+from fdhil.config import MachineConfig
+from fdhil.config.publish import MtConnectAdapter
+from fdhil.daemon import journal
+from fdhil.errors import ConnectError
+from fdhil.shopfloor.news import News, buses, listen
+from fdhil.shopfloor.process import say_ready
+from fdhil.shopfloor.published import published
+from fdhil.shopfloor.shdr import PING, Picture, devices_xml, lines, notice, picture
+
+HEARTBEAT_S = 10.0  # an agent pings as often; twice as long without a ping it is gone
+MAX_AGENTS = 8
+MAX_LINE = 1024
+MAX_UNREAD = 256 * 1024  # bytes that wait for an agent
+
+
+async def publish(config: MachineConfig) -> None:
+    """Serve agents, until it is cancelled. ConnectError when it cannot listen."""
+    settings = config.publish.mtconnect
+    adapter = Adapter()
+    server = await _listening(adapter, settings)
+    async with server:
+        host, port = server.sockets[0].getsockname()[:2]
+        say_ready(f"MTConnect adapter of {config.machine.name}: agents may connect to {host}:{port}")
+        try:
+            async for news in listen(config, settings.period_s):
+                adapter.tell(news)
+        finally:
+            adapter.close()
+
+
+def devices(config: MachineConfig) -> str:
+    """Return the Devices.xml for the agent of a machine."""
+    now_ms = time.time_ns() // 1_000_000
+    known = published(tuple(config.axis), buses(config), None, now_ms)
+    return devices_xml(config.machine.name, config.publish.mtconnect.device_uuid, known, now_ms)
+
+
+async def _listening(adapter: Adapter, settings: MtConnectAdapter) -> asyncio.Server:
+    try:
+        return await asyncio.start_server(adapter.attend, settings.host, settings.port, limit=MAX_LINE)
+    except OSError as error:
+        where = f"{settings.host}:{settings.port}"
+        text = f"cannot listen at {where}: {error.strerror or error}; set another [publish.mtconnect] host or port"
+        raise ConnectError("MTConnect adapter", text) from None
+
+
+class Adapter:
+    """Says the same to every agent: all that is known when it comes, then what changes."""
+
+    def __init__(self) -> None:
+        self._agents: dict[asyncio.StreamWriter, asyncio.Task[None] | None] = {}
+        self._pinging: set[asyncio.StreamWriter] = set()
+        self._picture: Picture | None = None
+        self._notices: dict[str, str] = {}  # the newest of each axis
+
+    def tell(self, news: News) -> None:
+        """Tell every agent what is new."""
+        now = picture(news)
+        new = [notice(event) for event in news.events]
+        self._notices |= {event.axis: line for event, line in zip(news.events, new, strict=True)}
+        told, self._picture = self._picture, now
+        for agent in list(self._agents):
+            self._write(agent, [*lines(told, now), *new])
+
+    @property
+    def agents(self) -> int:
+        """How many are connected."""
+        return len(self._agents)
+
+    def close(self) -> None:
+        """End all connections; an agent then holds everything for unavailable."""
+        for agent, task in list(self._agents.items()):
+            agent.close()
+            if task is not None:
+                task.cancel()
+
+    async def attend(self, reader: asyncio.StreamReader, agent: asyncio.StreamWriter) -> None:
+        """Attend to one agent until it leaves."""
+        if not self._has_room():
+            journal.write_line(f"{MAX_AGENTS} agents are connected, another one is sent away", "minor")
+            agent.close()
+            return
+        self._agents[agent] = asyncio.current_task()
+        self._greet(agent)
+        try:
+            await self._answer_pings(reader, agent)
+        except (OSError, ValueError, TimeoutError):
+            pass  # it left, sent a line without an end, or is no longer there: it may come again
+        except asyncio.CancelledError:
+            pass  # the process stops; the stream's own callback must not see it
+        finally:
+            self._agents.pop(agent, None)
+            self._pinging.discard(agent)
+            agent.close()
+
+    def _has_room(self) -> bool:
+        """Whether one more may come; of those that never pinged, which no agent is, the first makes room for it."""
+        if len(self._agents) < MAX_AGENTS:
+            return True
+        silent = next((agent for agent in self._agents if agent not in self._pinging), None)
+        if silent is None:
+            return False
+        self._agents.pop(silent)
+        silent.transport.abort()
+        return True
+
+    def _greet(self, agent: asyncio.StreamWriter) -> None:
+        everything = lines(None, self._picture) if self._picture else []
+        self._write(agent, ["* adapterVersion: fdhil", *everything, *self._notices.values()])
+
+    async def _answer_pings(self, reader: asyncio.StreamReader, agent: asyncio.StreamWriter) -> None:
+        patience_s: float | None = None  # who never pings, as a person with a terminal, may listen
+        while True:
+            async with asyncio.timeout(patience_s):
+                line = await reader.readline()
+            if not line:
+                return
+            if line.decode("utf-8", "replace").strip() == PING:
+                patience_s = 2 * HEARTBEAT_S
+                self._pinging.add(agent)
+                self._write(agent, [f"* PONG {round(1000 * HEARTBEAT_S)}"])
+
+    def _write(self, agent: asyncio.StreamWriter, said: list[str]) -> None:
+        if agent.transport.get_write_buffer_size() > MAX_UNREAD:
+            agent.transport.abort()
+            return
+        with contextlib.suppress(OSError):
+            agent.write("".join(f"{line}\n" for line in said).encode())

@@ -1,0 +1,87 @@
+"""Fills what the companion specification has a place for: who the machine is, and the program that runs.
+
+What fdhil does not know has a bad quality there, and no default that would be taken for a fact: 0 is a mode, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Mapping
+from typing import Any
+
+from asyncua import Node, Server, ua
+
+from fdhil.config.publish import OpcUaServer
+from fdhil.shopfloor.opcua_shown import node_id, shown, unknown
+from fdhil.shopfloor.published import Value
+
+DI = "http://opcfoundation.org/UA/DI/"
+PRODUCTION_STATES = 24  # ProductionStateMachineType of MachineTool, whose components are the states
+DOES: Mapping[str, str] = {"rapid": "Running", "feed": "Running", "arc": "Running", "hold": "Interrupted"}
+
+
+class Companion:
+    """The standard parts of one MachineTool."""
+
+    def __init__(self, server: Server, machine: Node, machine_tool: int) -> None:
+        self._server, self._machine, self._space = server, machine, machine_tool
+        self._program: Node
+        self._state: tuple[Node, Node, Node]  # CurrentState, its Id and its Number
+        self._states: dict[str, tuple[ua.NodeId, int]] = {}
+
+    async def build(self, settings: OpcUaServer) -> None:
+        """Say who the machine is, and that nothing is known yet of what it does."""
+        await self._identify(settings)
+        at = self._space
+        for part in ("Monitoring", "Production"):
+            async for node in _variables(await self._machine.get_child(f"{at}:{part}")):
+                await self._server.write_attribute_value(node.nodeid, unknown(ua.StatusCodes.BadNoDataAvailable, 0))
+        program = await self._machine.get_child([f"{at}:Production", f"{at}:ActiveProgram"])
+        self._program = await program.get_child(f"{at}:Name")
+        state = await program.get_child([f"{at}:State", "0:CurrentState"])
+        self._state = state, await state.get_child("0:Id"), await state.get_child("0:Number")
+        kinds = self._server.get_node(node_id(PRODUCTION_STATES, at))
+        for name in set(DOES.values()):
+            kind = await kinds.get_child(f"{at}:{name}")
+            self._states[name] = kind.nodeid, await (await kind.get_child("0:StateNumber")).read_value()
+
+    async def _identify(self, settings: OpcUaServer) -> None:
+        di = await self._server.get_namespace_index(DI)
+        place = await self._machine.get_child(f"{di}:Identification")
+        told = {
+            "Manufacturer": ua.Variant(ua.LocalizedText(settings.manufacturer)),
+            "SerialNumber": ua.Variant(settings.serial_number, ua.VariantType.String),
+            "ProductInstanceUri": ua.Variant(settings.product_instance_uri, ua.VariantType.String),
+        }
+        for name, variant in told.items():
+            await (await place.get_child(f"{di}:{name}")).write_value(variant)
+
+    async def show(self, value: Value, why: int) -> None:
+        """Show a value where the companion specification has a place for it, too; ``why`` it may not be known."""
+        if value.item.name == "nc_program":
+            await self._server.write_attribute_value(self._program.nodeid, shown(value, why))
+        elif value.item.name == "nc_motion":
+            await self._show_state(value, why)
+
+    async def _show_state(self, value: Value, why: int) -> None:
+        name = DOES.get(str(value.value))
+        told = [unknown(why, value.stamp_ms)] * 3
+        if name is not None:
+            kind, number = self._states[name]
+            variants: list[Any] = [
+                ua.Variant(ua.LocalizedText(name, "en")),
+                ua.Variant(kind, ua.VariantType.NodeId),
+                ua.Variant(number, ua.VariantType.UInt32),
+            ]
+            stamp = told[0].SourceTimestamp
+            told = [ua.DataValue(variant, SourceTimestamp=stamp) for variant in variants]
+        for node, data in zip(self._state, told, strict=True):
+            await self._server.write_attribute_value(node.nodeid, data)
+
+
+async def _variables(top: Node) -> AsyncIterator[Node]:
+    """Yield every variable below a node."""
+    for child in await top.get_children():
+        if await child.read_node_class() is ua.NodeClass.Variable:
+            yield child
+        async for below in _variables(child):
+            yield below

@@ -1,0 +1,96 @@
+"""Tells alarms as conditions and notices as events, under the machine's Notification.Messages (OPC 40501-1)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import Any
+
+from asyncua import Server, ua
+from asyncua.server.event_generator import EventGenerator
+
+from fdhil.shopfloor.news import News
+from fdhil.shopfloor.opcua_nodes import Nodes
+from fdhil.shopfloor.opcua_shown import node_id
+from fdhil.shopfloor.published import Alarm, Event
+
+ALERT_TYPE, NOTIFICATION_EVENT_TYPE = 39, 35  # of MachineTool
+SEVERITY: Mapping[str, int] = {"info": 100, "minor": 400, "MAJOR": 800}  # of 1..1000
+SILENT = "DaemonSilent"
+
+
+class Messages:
+    """The conditions that are on, and the events as they come."""
+
+    def __init__(self, server: Server, nodes: Nodes) -> None:
+        self._server, self._nodes = server, nodes
+        self._on: dict[tuple[str, str], Alarm] = {}
+        self._conditions: dict[tuple[str, str], EventGenerator] = {}
+        self._notices: EventGenerator
+
+    async def build(self) -> None:
+        """Make the type of fdhil's notices, and the way by which they reach the server's own node."""
+        everything = self._server.nodes.server
+        await everything.set_event_notifier([ua.EventNotifier.SubscribeToEvents])
+        await everything.add_reference(self._nodes.messages, ua.ObjectIds.HasNotifier)
+        base = node_id(NOTIFICATION_EVENT_TYPE, self._nodes.machine_tool)
+        kind = await self._server.create_custom_event_type(self._nodes.own, "NoticeType", base, [])
+        self._notices = await self._generator(kind.nodeid, "Identifier")
+
+    async def tell(self, news: News) -> None:
+        """Tell what began, what ended, and what is new. A silent daemon ends no alarm: it is not known."""
+        now = {(alarm.code, alarm.axis): alarm for alarm in news.alarms}
+        if news.silent:
+            silent = Alarm(SILENT, "MAJOR", f"{news.silent}; no value is known")
+            now = self._on | {(SILENT, ""): silent}
+        for key in self._on.keys() - now.keys():
+            await self._condition(self._on[key], False)
+        for key, alarm in now.items():
+            if key not in self._on:
+                await self._condition(alarm, True)
+        self._on = now
+        for event in news.events:
+            await self._notice(event)
+
+    async def _generator(self, kind: ua.NodeId, code: str) -> EventGenerator:
+        """Return what triggers events of a type; ``code`` is a field that the type declares without a value."""
+        generator = await self._server.get_event_generator(kind, self._nodes.messages.nodeid)
+        generator.event.add_property(code, "", ua.VariantType.String)
+        return generator
+
+    async def _condition(self, alarm: Alarm, active: bool) -> None:
+        key = alarm.code, alarm.axis
+        if key not in self._conditions:
+            self._conditions[key] = await self._generator(node_id(ALERT_TYPE, self._nodes.machine_tool), "ErrorCode")
+        generator = self._conditions[key]
+        told: Any = generator.event
+        told.NodeId = node_id(".".join(filter(None, ["alarm", alarm.code, alarm.axis])), self._nodes.own)
+        told.ConditionName = told.ErrorCode = alarm.code
+        told.SourceName = alarm.axis or "machine"
+        told.Severity = SEVERITY[alarm.severity]
+        told.Retain = active
+        _set_state(told, "EnabledState", "Enabled", True)
+        _set_state(told, "ActiveState", "Active" if active else "Inactive", active)
+        _set_state(told, "AckedState", "Acknowledged", True)  # fdhil acknowledges at the daemon, by name
+        await self._trigger(generator, alarm.text if active else f"{alarm.code}: this is no longer so", None)
+
+    async def _notice(self, event: Event) -> None:
+        told: Any = self._notices.event
+        told.Identifier = event.code
+        told.SourceName = event.axis or "machine"
+        told.Severity = SEVERITY[event.severity]
+        stamp = datetime.fromtimestamp(event.stamp_ms * 1e-3, UTC)
+        await self._trigger(self._notices, f"{event.code}: {event.text}", stamp)
+
+    async def _trigger(self, generator: EventGenerator, message: str, stamp: datetime | None) -> None:
+        """Tell who listens to the machine's messages, and who listens to all of the server."""
+        told = generator.event
+        told.emitting_node = self._nodes.messages.nodeid
+        await generator.trigger(time_attr=stamp, message=message)
+        told.emitting_node = self._server.nodes.server.nodeid  # and there a ConditionRefresh finds it
+        await self._server.iserver.subscription_service.trigger_event(told)
+
+
+def _set_state(told: Any, name: str, words: str, value: bool) -> None:
+    setattr(told, name, ua.LocalizedText(words, "en"))
+    setattr(told, f"{name}/Id", value)

@@ -1,0 +1,157 @@
+"""Says who may connect to the OPC UA server, and what they may ask: to read, to browse, to subscribe.
+
+Without a certificate the server is for this computer alone and asks for no name. With one, everything is signed and
+encrypted. No client can write, call more than ConditionRefresh, or add a node.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from asyncua import Server, ua
+from asyncua.common.utils import ServiceError
+from asyncua.crypto.permission_rules import USER_TYPES, SimpleRoleRuleset, User, UserRole
+from asyncua.crypto.truststore import TrustStore
+from asyncua.crypto.uacrypto import x509
+from asyncua.crypto.validator import CertificateValidator, CertificateValidatorOptions
+from asyncua.server.internal_server import InternalServer
+from asyncua.server.user_managers import UserManager
+
+from fdhil.config.publish import OpcUaServer
+from fdhil.config.users import User as KnownUser
+from fdhil.config.users import matches, read_users
+from fdhil.errors import ConnectError
+
+NAME = "OPC UA server"
+MOST_CONNECTIONS = 16
+MOST_SUBSCRIPTIONS = 64
+MOST_FAILURES, FAILURES_S = 10, 60.0
+REFUSED = {
+    ua.ObjectIds.WriteRequest_Encoding_DefaultBinary,
+    ua.ObjectIds.HistoryReadRequest_Encoding_DefaultBinary,
+}
+POLICIES = [
+    ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt,
+    ua.SecurityPolicyType.Aes128Sha256RsaOaep_SignAndEncrypt,
+    ua.SecurityPolicyType.Aes256Sha256RsaPss_SignAndEncrypt,
+]
+CHECKED = (
+    CertificateValidatorOptions.TIME_RANGE
+    | CertificateValidatorOptions.URI
+    | CertificateValidatorOptions.TRUSTED
+    | CertificateValidatorOptions.PEER_CLIENT
+)
+
+
+class ForReading(SimpleRoleRuleset):
+    """Every user may read, browse and subscribe; nobody may do more."""
+
+    def __init__(self) -> None:
+        self._permitted = {ua.NodeId(ua.Int32(kind)) for kind in USER_TYPES if kind not in REFUSED}
+
+    def check_validity(self, user: User, action_type_id: ua.NodeId, body: Any) -> bool:
+        """Whether a request of that type is served."""
+        return action_type_id in self._permitted
+
+
+class Doorkeeper(UserManager):
+    """Lets in who knows a user's password; without a users file anyone, for then only this computer is served.
+
+    After ten wrong passwords in a minute none is taken for the rest of it: guessing is slow, and cheap to refuse.
+    """
+
+    def __init__(self, users: Mapping[str, KnownUser] | None) -> None:
+        self._users = users
+        self._failures_s: list[float] = []
+
+    def get_user(
+        self, iserver: Any, username: str | None = None, password: str | None = None, certificate: Any = None
+    ) -> User | None:
+        """Return the user of a session; None: it is not let in."""
+        if self._users is None:
+            return User(role=UserRole.User)
+        now_s = time.monotonic()
+        self._failures_s = [at_s for at_s in self._failures_s if now_s - at_s < FAILURES_S]
+        if len(self._failures_s) >= MOST_FAILURES or username is None or password is None:
+            return None
+        if matches(self._users.get(username), password):
+            return User(role=UserRole.User, name=username)
+        self._failures_s.append(now_s)
+        return None
+
+
+class ReadServer(InternalServer):
+    """An address space that remembers no other servers: who is not let in could fill its memory with them."""
+
+    def __init__(self, settings: OpcUaServer) -> None:
+        users = None if settings.users_file is None else read_users(settings.users_file)
+        super().__init__(user_manager=Doorkeeper(users))
+        self.bind_condition_methods = True
+        self.allow_remote_admin = False
+        self.max_connections = MOST_CONNECTIONS
+        self.max_subscriptions = MOST_SUBSCRIPTIONS
+        taken: Any = (ua.UserNameIdentityToken,) if users is not None else (ua.AnonymousIdentityToken,)
+        self.supported_tokens = taken
+
+    def register_server(self, server: Any, conf: Any = None) -> None:
+        """Refuse to be a discovery server."""
+        raise ServiceError(ua.StatusCodes.BadServiceUnsupported)
+
+
+async def secure(server: Server, settings: OpcUaServer, uri: str) -> None:
+    """Give the server its certificate and its URI; ConnectError with the file that cannot be used."""
+    if settings.certificate_file is None or settings.private_key_file is None:
+        server.set_security_policy([ua.SecurityPolicyType.NoSecurity], ForReading())
+        await server.set_application_uri(uri)
+        return
+    server.set_security_policy(POLICIES, ForReading())
+    for key, load in (("certificate_file", server.load_certificate), ("private_key_file", server.load_private_key)):
+        content = _read(key, getattr(settings, key))
+        try:
+            await load(content, format="pem" if b"-----BEGIN" in content else "der")
+        except (ValueError, TypeError):
+            raise _fault(key, f"{getattr(settings, key)} cannot be used: it is none, or has a password") from None
+    _check_pair(server, settings)
+    await server.set_application_uri(_application_uri(server.iserver.certificate) or uri)
+    if settings.trusted_clients is not None:
+        server.iserver.certificate_validator = await _validator(settings.trusted_clients)
+
+
+def _check_pair(server: Server, settings: OpcUaServer) -> None:
+    if server.iserver.certificate.public_key() != server.iserver.private_key.public_key():
+        raise _fault("private_key_file", f"{settings.private_key_file} is not the key of the certificate_file")
+
+
+async def _validator(folder: Path) -> CertificateValidator:
+    if not any(path.suffix.lower() in (".der", ".pem") for path in folder.glob("*")):
+        raise _fault("trusted_clients", f"{folder} has no certificate whose name ends in .der or .pem")
+    trusted = TrustStore([folder], [])
+    try:
+        await trusted.load()
+    except (OSError, ValueError) as error:
+        raise _fault("trusted_clients", f"{folder} cannot be used ({str(error)[:100]})") from None
+    return CertificateValidator(CHECKED, trusted)
+
+
+def _application_uri(certificate: Any) -> str | None:
+    """Return the URI that the certificate is for: a client compares it with what the server calls itself."""
+    try:
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return None
+    uris = names.get_values_for_type(x509.UniformResourceIdentifier)
+    return str(uris[0]) if uris else None
+
+
+def _read(key: str, path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise _fault(key, f"{path} cannot be read: {error.strerror}") from None
+
+
+def _fault(key: str, what: str) -> ConnectError:
+    return ConnectError(NAME, f"[publish.opcua] {key}: {what}; nothing is served; correct the file or its rights")

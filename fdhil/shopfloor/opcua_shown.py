@@ -1,0 +1,77 @@
+"""Makes OPC UA's data of what is published: a value with its kind, quality and time, a unit, the ID of a node. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import UTC
+from typing import Any
+
+from asyncua import ua
+
+from fdhil.shopfloor.published import Kind, Value
+
+TYPES: Mapping[Kind, ua.VariantType] = {
+    "measure": ua.VariantType.Double,
+    "count": ua.VariantType.Int64,
+    "flag": ua.VariantType.Boolean,
+    "state": ua.VariantType.String,
+    "text": ua.VariantType.String,
+}
+ZEROS: Mapping[ua.VariantType, Any] = {
+    ua.VariantType.Double: 0.0,
+    ua.VariantType.Int64: 0,
+    ua.VariantType.Boolean: False,
+    ua.VariantType.String: "",
+}
+# unit: common code of UNECE Recommendation 20, symbol, name
+UNITS: Mapping[str, tuple[str, str, str]] = {
+    "1": ("C62", "", "one"),
+    "%": ("P1", "%", "percent"),
+    "s": ("SEC", "s", "second"),
+    "Hz": ("HTZ", "Hz", "hertz"),
+    "um": ("4H", "µm", "micrometre"),
+    "mm/min": ("H81", "mm/min", "millimetre per minute"),
+    "degC": ("CEL", "°C", "degree Celsius"),
+    "ohm": ("OHM", "Ω", "ohm"),
+    "H": ("81", "H", "henry"),
+    "N.m/A": ("F90", "N·m/A", "newton metre per ampere"),
+    "kg.m2": ("B32", "kg·m²", "kilogram metre squared"),
+    "N.m.s": ("C53", "N·m·s", "newton metre second"),
+    "N.m": ("NU", "N·m", "newton metre"),
+}
+
+
+def shown(value: Value, why: int) -> ua.DataValue:
+    """Return a value with its quality and time; one that is not known says by its status ``why``."""
+    if value.value is None:
+        return unknown(why, value.stamp_ms)
+    kind = TYPES[value.item.kind]
+    plain: Any = float(value.value) if kind is ua.VariantType.Double else value.value
+    return ua.DataValue(ua.Variant(plain, kind), SourceTimestamp=_time(value.stamp_ms))
+
+
+def unknown(why: int, stamp_ms: int) -> ua.DataValue:
+    """Return no value, with the status that says ``why``."""
+    status = ua.StatusCode(ua.UInt32(why))
+    return ua.DataValue(ua.Variant(), StatusCode=status, SourceTimestamp=_time(stamp_ms))
+
+
+def _time(stamp_ms: int) -> ua.DateTime:
+    return ua.DateTime.fromtimestamp(stamp_ms * 1e-3, UTC)
+
+
+def node_id(identifier: int | str, namespace: int = 0) -> ua.NodeId:
+    """Return the ID of a node by its number or its name."""
+    known = ua.Int32(identifier) if isinstance(identifier, int) else ua.String(identifier)
+    return ua.NodeId(known, ua.Int16(namespace))
+
+
+def unit_of(unit: str) -> ua.EUInformation:
+    """Return a unit as OPC UA has it: the letters of its common code, one byte each, are its number."""
+    code, symbol, name = UNITS[unit]
+    return ua.EUInformation(
+        NamespaceUri="http://www.opcfoundation.org/UA/units/un/cefact",
+        UnitId=int.from_bytes(code.encode(), "big"),
+        DisplayName=ua.LocalizedText(symbol, "en"),
+        Description=ua.LocalizedText(name, "en"),
+    )

@@ -1,0 +1,121 @@
+"""Serves the metrics to Prometheus over HTTP: GET /metrics and nothing else, for the hosts that the config allows."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import ssl
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from typing import Any
+
+import uvicorn
+from prometheus_client import CollectorRegistry
+from prometheus_client.exposition import choose_encoder
+
+from fdhil.config import MachineConfig
+from fdhil.config.publish import PrometheusMetrics
+from fdhil.errors import ConnectError
+from fdhil.shopfloor.metrics import Metrics
+from fdhil.shopfloor.news import listen
+from fdhil.shopfloor.process import say_ready
+
+LOOPBACK = ("localhost", "127.0.0.1", "::1")
+MOST_CONNECTIONS = 32
+Send = Callable[[Mapping[str, Any]], Awaitable[None]]
+
+
+class Page:
+    """The one page, as an ASGI application."""
+
+    def __init__(self, metrics: Metrics, hosts: tuple[str, ...]) -> None:
+        self._registry = CollectorRegistry(auto_describe=False)
+        self._registry.register(metrics)
+        self._hosts = {host.lower() for host in hosts}
+
+    async def __call__(self, scope: Mapping[str, Any], receive: Callable[[], Awaitable[Any]], send: Send) -> None:
+        """Answer one request."""
+        status, kind, body = self._answer(scope)
+        headers = [(b"content-type", kind.encode()), (b"cache-control", b"no-store")]
+        await send({"type": "http.response.start", "status": status, "headers": headers})
+        await send({"type": "http.response.body", "body": b"" if scope["method"] == "HEAD" else body})
+
+    def _answer(self, scope: Mapping[str, Any]) -> tuple[int, str, bytes]:
+        headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
+        if _name_of(headers.get("host", "")) not in self._hosts:
+            return 421, "text/plain", b"this host is not among [publish.prometheus] allowed_hosts\n"
+        if scope["path"] != "/metrics":
+            return 404, "text/plain", b"the metrics are at /metrics\n"
+        if scope["method"] not in ("GET", "HEAD"):
+            return 405, "text/plain", b"the metrics are for reading\n"
+        encode, kind = choose_encoder(headers.get("accept", ""))
+        return 200, kind, encode(self._registry)
+
+
+def _name_of(host: str) -> str:
+    """Return the name in a Host header, without its port."""
+    if host.startswith("["):
+        return host[1:].partition("]")[0].lower()
+    return host.partition(":")[0].lower()
+
+
+class _Server(uvicorn.Server):
+    """Leaves the signals to the process that it is a part of."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+
+async def publish(config: MachineConfig) -> None:
+    """Serve until it is cancelled; ConnectError where it cannot listen."""
+    settings, metrics = config.publish.prometheus, Metrics()
+    server = _Server(_configured(settings, Page(metrics, (*LOOPBACK, settings.host, *settings.allowed_hosts))))
+    with _listening(settings) as listener:
+        serving = asyncio.create_task(server.serve(sockets=[listener]))
+        try:
+            scheme = "https" if settings.tls_certificate_file else "http"
+            host = f"[{settings.host}]" if ":" in settings.host else settings.host
+            say_ready(f"metrics for Prometheus at {scheme}://{host}:{listener.getsockname()[1]}/metrics")
+            async for news in listen(config, settings.period_s):
+                metrics.take(news)
+                if serving.done():
+                    raise ConnectError("metrics", "the server ended by itself; start it again")
+        finally:
+            server.should_exit = True
+            await serving
+
+
+def _configured(settings: PrometheusMetrics, page: Page) -> uvicorn.Config:
+    """Return the server's settings; ConnectError with the TLS file that cannot be used."""
+    asked = settings.tls_client_ca_file
+    configured = uvicorn.Config(
+        page,
+        lifespan="off",
+        ws="none",
+        log_config=None,
+        log_level="error",
+        access_log=False,
+        server_header=False,
+        limit_concurrency=MOST_CONNECTIONS,
+        timeout_graceful_shutdown=2,
+        ssl_certfile=settings.tls_certificate_file,
+        ssl_keyfile=settings.tls_key_file,
+        ssl_ca_certs=str(asked) if asked else None,
+        ssl_cert_reqs=ssl.CERT_REQUIRED if asked else ssl.CERT_NONE,
+    )
+    try:
+        configured.load()
+    except OSError as error:  # an SSLError is one, too
+        text = f"the TLS files cannot be used ({error.strerror or error}); compare [publish.prometheus] tls_..._file"
+        raise ConnectError("metrics", f"{text}, which this user must be able to read") from None
+    return configured
+
+
+def _listening(settings: PrometheusMetrics) -> socket.socket:
+    try:
+        family = socket.getaddrinfo(settings.host, settings.port, type=socket.SOCK_STREAM)[0][0]
+        return socket.create_server((settings.host, settings.port), family=family)
+    except OSError as error:
+        text = f"{settings.host}:{settings.port} cannot be opened: {error.strerror or error}"
+        raise ConnectError("metrics", f"{text}; set another [publish.prometheus] host or port") from None

@@ -1,0 +1,208 @@
+"""Says published values as lines of MTConnect's adapter protocol (SHDR), and what an agent must know of them. Pure.
+
+Lines and levels: MTConnect part 5 and the adapter's guide of the reference agent. Names, units and the form of
+Devices.xml: MTConnect 2.0, part 2; a type or unit that the standard does not know has the prefix ``x:``.
+"""
+
+from __future__ import annotations
+
+import re
+import uuid
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
+
+from fdhil.daemon.journal import printable
+from fdhil.shopfloor.news import News
+from fdhil.shopfloor.published import Alarm, Event, Item, Plain, Value
+
+VERSION = "2.0"
+SCHEMA = f"urn:mtconnect.org:MTConnectDevices:{VERSION}"
+OWN_SCHEMA = f"urn:fdhil:MTConnectDevices:{VERSION}"
+UNAVAILABLE = "UNAVAILABLE"
+AVAILABLE, CONDITION, NOTICE = "avail", "condition", "notice"
+PING, PONG = "* PING", "* PONG"
+
+# our unit -> MTConnect's, and what a value is multiplied with
+UNITS: Mapping[str, tuple[str, float]] = {
+    "um": ("MILLIMETER", 1e-3),
+    "mm/min": ("MILLIMETER/SECOND", 1 / 60),
+    "s": ("SECOND", 1.0),
+    "Hz": ("HERTZ", 1.0),
+    "%": ("PERCENT", 1.0),
+    "degC": ("CELSIUS", 1.0),
+    "ohm": ("OHM", 1.0),
+    "N.m": ("NEWTON_METER", 1.0),
+    "H": ("x:HENRY", 1.0),
+    "N.m/A": ("x:NEWTON_METER_PER_AMPERE", 1.0),
+    "kg.m2": ("x:KILOGRAM_METER_SQUARED", 1.0),
+    "N.m.s": ("x:NEWTON_METER_SECOND", 1.0),
+}
+# what the standard has a type for, or the world a word: type and sub-type
+TYPES: Mapping[str, tuple[str, str]] = {
+    "R": ("RESISTANCE", ""),
+    "L": ("x:INDUCTANCE", ""),
+    "K": ("x:TORQUE_CONSTANT", ""),
+    "Jt": ("x:INERTIA", ""),
+    "ft": ("x:VISCOUS_FRICTION", ""),
+    "Cd": ("x:COULOMB_FRICTION", ""),
+    "identified_at": ("TEMPERATURE", ""),
+    "slideway": ("TEMPERATURE", ""),
+    "nc_program": ("PROGRAM", ""),
+    "nc_line": ("LINE_NUMBER", "ABSOLUTE"),
+    "nc_feed": ("PATH_FEEDRATE", "ACTUAL"),
+    "nc_feed_override": ("PATH_FEEDRATE_OVERRIDE", "PROGRAMMED"),
+    "nc_rapid_override": ("PATH_FEEDRATE_OVERRIDE", "RAPID"),
+}
+IN_PERCENT = {"nc_feed_override", "nc_rapid_override"}
+
+
+def key_of(name: str, axis: str = "", bus: str = "") -> str:
+    """Return the id of a data item: of letters, digits and underscores."""
+    return re.sub(r"\W", "_", "_".join(filter(None, (axis or bus or "machine", name))), flags=re.ASCII)
+
+
+def stamp(ms: int) -> str:
+    """Return Unix time in ms as ISO 8601 in UTC."""
+    return datetime.fromtimestamp(ms / 1000, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def _plain(text: str) -> str:
+    """Return text at which no line ends, and no field, and that an agent can write as XML."""
+    return printable(" ".join(text.replace("|", "/").split()))
+
+
+def shown(item: Item, value: Plain) -> str:
+    """Return a value as a data item shows it, in its unit."""
+    if value is None:
+        return UNAVAILABLE
+    if isinstance(value, bool):
+        return str(value).upper()
+    if isinstance(value, str):
+        return _plain(value)
+    return f"{value * _factor(item):.12g}"
+
+
+def _factor(item: Item) -> float:
+    return 100.0 if item.name in IN_PERCENT else UNITS.get(item.unit, ("", 1.0))[1]
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """All that the adapter says at one time: the text of each data item, and when it was so (Unix time in ms).
+
+    ``conditions`` has the active alarms of each condition by their code; None: nothing is known of it.
+    """
+
+    items: Mapping[str, str]
+    stamps: Mapping[str, int]
+    conditions: Mapping[str, Mapping[str, str] | None]
+    now_ms: int
+
+
+def picture(news: News) -> Picture:
+    """Return what is to be said of an answer of the daemon, or of its silence."""
+    items = {AVAILABLE: UNAVAILABLE if news.silent else "AVAILABLE"}
+    items |= {key_of(*value.key): shown(value.item, value.value) for value in news.values}
+    stamps = {key_of(*value.key): value.stamp_ms for value in news.values}
+    conditions: dict[str, Mapping[str, str] | None] = {}
+    for axis in ("", *dict.fromkeys(value.axis for value in news.values if value.axis)):
+        active = {alarm.code: _level(alarm) for alarm in news.alarms if alarm.axis == axis}
+        conditions[key_of(CONDITION, axis)] = None if news.silent else active
+    return Picture(items, stamps, conditions, news.stamp_ms)
+
+
+def _level(alarm: Alarm) -> str:
+    level = "FAULT" if alarm.severity == "MAJOR" else "WARNING"
+    return f"{level}|{alarm.code}|{alarm.severity}||{_plain(alarm.text)}"
+
+
+def lines(before: Picture | None, now: Picture) -> list[str]:
+    """Return the lines that lead an agent from ``before`` (None: it knows nothing) to ``now``."""
+    told = {} if before is None else before.items
+    changed = [(key, text) for key, text in now.items.items() if told.get(key) != text]
+    said = [f"{stamp(now.stamps.get(key, now.now_ms))}|{key}|{text}" for key, text in changed]
+    for key, active in now.conditions.items():
+        texts = _condition(None, active) if before is None else _changed(before.conditions[key], active)
+        said += [f"{stamp(now.now_ms)}|{key}|{text}" for text in texts]
+    return said
+
+
+def notice(event: Event) -> str:
+    """Return the line of a notice: a message with the class as its native code."""
+    return f"{stamp(event.stamp_ms)}|{key_of(NOTICE, event.axis)}|{event.code}|{_plain(event.text)}"
+
+
+def _changed(past: Mapping[str, str] | None, active: Mapping[str, str] | None) -> list[str]:
+    return [] if past == active else _condition(past, active)
+
+
+def _condition(past: Mapping[str, str] | None, active: Mapping[str, str] | None) -> list[str]:
+    """Return what is said of a condition: that which is over by its code, or that all is well."""
+    if active is None:
+        return [f"{UNAVAILABLE}||||"]
+    if not active:
+        return ["NORMAL||||"]
+    before = past or {}
+    over = [f"NORMAL|{code}|||" for code in before if code not in active]
+    return over + [text for code, text in active.items() if before.get(code) != text]
+
+
+def devices_xml(machine: str, uid: str, values: Iterable[Value], created_ms: int) -> str:
+    """Return the Devices.xml of an agent that listens to this adapter: every data item that it will ever name."""
+    listed = list(values)
+    axes = dict.fromkeys(value.axis for value in listed if value.axis)
+    root = Element("MTConnectDevices", {"xmlns": SCHEMA, "xmlns:x": OWN_SCHEMA})
+    head = {"creationTime": stamp(created_ms), "deviceModelChangeTime": stamp(created_ms), "sender": "fdhil"}
+    head |= {
+        "instanceId": "1",
+        "version": VERSION,
+        "bufferSize": "131072",
+        "assetBufferSize": "1024",
+        "assetCount": "0",
+    }
+    SubElement(root, "Header", head)
+    name = re.sub(r"\W", "_", machine, flags=re.ASCII)
+    identity = {"id": "fdhil", "name": name, "uuid": uid or default_uuid(machine)}
+    device = SubElement(SubElement(root, "Devices"), "Device", identity)
+    SubElement(device, "Description").text = f"feed drives of {machine}, as fdhil knows them"
+    own = SubElement(device, "DataItems")
+    SubElement(own, "DataItem", {"category": "EVENT", "id": AVAILABLE, "type": "AVAILABILITY"})
+    _listed(own, [value for value in listed if not value.axis], "")
+    components = SubElement(SubElement(device, "Components"), "Axes", {"id": "axes"})
+    linear = SubElement(components, "Components")
+    for axis in axes:
+        component = SubElement(linear, "Linear", {"id": key_of("axis", axis), "name": axis})
+        _listed(SubElement(component, "DataItems"), [value for value in listed if value.axis == axis], axis)
+    indent(root)
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n"
+
+
+def default_uuid(machine: str) -> str:
+    """Return the UUID of a machine that was given none: the same for the same name, always."""
+    return str(uuid.uuid5(uuid.NAMESPACE_URL, f"urn:fdhil:{machine}"))
+
+
+def _listed(parent: Element, values: Iterable[Value], axis: str) -> None:
+    for value in values:
+        SubElement(parent, "DataItem", _described(value))
+    SubElement(parent, "DataItem", {"category": "CONDITION", "id": key_of(CONDITION, axis), "type": "SYSTEM"})
+    SubElement(parent, "DataItem", {"category": "EVENT", "id": key_of(NOTICE, axis), "type": "MESSAGE"})
+
+
+def _described(value: Value) -> dict[str, str]:
+    """Return the attributes of a data item; what has a unit that is none of a share or a count is a sample."""
+    item = value.item
+    name, _, end = item.name.partition("_")
+    interval = name in TYPES and end in ("low", "high")
+    kind, sub = TYPES[name] if interval else TYPES.get(item.name, (f"x:{item.name.upper()}", ""))
+    sub = f"x:INTERVAL_{end.upper()}" if interval else sub
+    unit = UNITS[item.unit][0] if item.kind == "measure" and item.unit in UNITS else ""
+    told = {
+        "category": "SAMPLE" if unit else "EVENT",
+        "id": key_of(*value.key),
+        "name": key_of(*value.key),
+        "type": kind,
+    }
+    return told | ({"subType": sub} if sub else {}) | ({"units": unit} if unit else {})

@@ -1,0 +1,250 @@
+"""Speaks Sparkplug B as an edge node: topics, payloads, birth and death certificates, sequence numbers. Pure.
+
+The field numbers of the payload, the data types and the order of the messages are those of the Eclipse Sparkplug
+specification 3.0, chapters 4 to 6. An edge node is a machine, its devices are the axes.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf.message import DecodeError
+
+NAMESPACE = "spBv1.0"
+REBIRTH = "Node Control/Rebirth"
+BIRTH_DEATH = "bdSeq"
+WRAP = 256  # seq and bdSeq go from 0 to 255
+INT64, DOUBLE, BOOLEAN, STRING = 4, 10, 11, 12
+UNIT = "engUnit"
+DESCRIPTION = "Documentation"
+
+Value = bool | int | float | str | None
+
+# message -> its fields in use here: number, protobuf's type ("*": repeated), name
+_FIELDS: Mapping[str, tuple[tuple[int, str, str], ...]] = {
+    "Payload": ((1, "uint64", "timestamp"), (2, "Metric*", "metrics"), (3, "uint64", "seq")),
+    "Metric": (
+        (1, "string", "name"), (2, "uint64", "alias"), (3, "uint64", "timestamp"), (4, "uint32", "datatype"),
+        (7, "bool", "is_null"), (9, "PropertySet", "properties"), (10, "uint32", "int_value"),
+        (11, "uint64", "long_value"), (12, "float", "float_value"), (13, "double", "double_value"),
+        (14, "bool", "boolean_value"), (15, "string", "string_value"),
+    ),
+    "PropertySet": ((1, "string*", "keys"), (2, "PropertyValue*", "values")),
+    "PropertyValue": ((1, "uint32", "type"), (2, "bool", "is_null"), (8, "string", "string_value")),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """One value of the node or of a device: ``datatype`` as Sparkplug numbers it, ``stamp_ms`` since 1970 in UTC.
+
+    An ``event`` is told again where its value is the one before and its stamp is not.
+    """
+
+    name: str
+    datatype: int
+    value: Value
+    stamp_ms: int
+    unit: str = ""
+    description: str = ""
+    event: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """What is published on the broker; nothing of an edge node is retained."""
+
+    topic: str
+    payload: bytes
+    qos: int = 0
+
+
+class EdgeNode:
+    """The session of one edge node with a broker, over as many connections as it takes.
+
+    It is asked in the order of the specification: ``will`` before each connection, ``births`` after it (and when a
+    host asks for them again), then ``news`` as often as wanted, ``death`` before the connection is closed on purpose.
+    """
+
+    def __init__(self, group: str, node: str) -> None:
+        self._group, self._node = group, node
+        self._aliases: dict[tuple[str, str], int] = {}
+        self._told: dict[str, dict[str, Metric]] = {}  # of the node ("") and of each device that was born
+        self._seq = 0
+        self._bd_seq = -1
+
+    def topic(self, verb: str, device: str = "") -> str:
+        """Return the topic of a message."""
+        return "/".join((NAMESPACE, self._group, verb, self._node, *([device] if device else [])))
+
+    def will(self, now_ms: int) -> Message:
+        """Begin a new connection: return the death certificate that the broker publishes where we cannot."""
+        self._bd_seq = (self._bd_seq + 1) % WRAP
+        return self.death(now_ms)
+
+    def death(self, now_ms: int) -> Message:
+        """Return the death certificate of this connection."""
+        return Message(self.topic("NDEATH"), _payload(now_ms, None, [_fields(self._birth_death(now_ms))]), qos=1)
+
+    def births(self, node: Iterable[Metric], devices: Mapping[str, Iterable[Metric]], now_ms: int) -> list[Message]:
+        """Return the birth certificates of the node and of its devices, with everything that is known."""
+        self._told, self._seq = {}, -1
+        rebirth = Metric(REBIRTH, BOOLEAN, False, now_ms, description="write true to have all births sent again")
+        own = [_fields(self._birth_death(now_ms)), _fields(rebirth)]
+        born = [self._born("", list(node), now_ms, own)]
+        return born + [self._born(device, list(metrics), now_ms, []) for device, metrics in devices.items()]
+
+    def news(self, node: Iterable[Metric], devices: Mapping[str, Iterable[Metric]], now_ms: int) -> list[Message]:
+        """Return what has changed since the last call: values, devices that went silent, and those that are back.
+
+        A device that is not listed is silent. What gains a value that its birth did not name is born again.
+        """
+        now = {device: list(metrics) for device, metrics in devices.items()}
+        if self._outgrown("", own := list(node)):
+            return self.births(own, now, now_ms)
+        silent = [device for device in self._told if device and device not in now]
+        messages = [message for message in [self._changed("", own, now_ms)] if message is not None]
+        for device in silent:
+            del self._told[device]
+            messages.append(Message(self.topic("DDEATH", device), _payload(now_ms, self._next(), [])))
+        for device, metrics in now.items():
+            if device not in self._told or self._outgrown(device, metrics):
+                messages.append(self._born(device, metrics, now_ms, []))
+            elif (changed := self._changed(device, metrics, now_ms)) is not None:
+                messages.append(changed)
+        return messages
+
+    def _outgrown(self, device: str, metrics: list[Metric]) -> bool:
+        told = self._told.get(device, {})
+        return any(m.name not in told or told[m.name].datatype != m.datatype for m in metrics)
+
+    def _born(self, device: str, metrics: list[Metric], now_ms: int, own: Sequence[Mapping[str, Any]]) -> Message:
+        seq = self._next()
+        self._told[device] = {metric.name: metric for metric in metrics}
+        named = [{**_fields(metric), "alias": self._alias(device, metric.name)} for metric in metrics]
+        return Message(self.topic("DBIRTH" if device else "NBIRTH", device), _payload(now_ms, seq, [*own, *named]))
+
+    def _changed(self, device: str, metrics: list[Metric], now_ms: int) -> Message | None:
+        """Return what is new by alias alone; None where nothing is. A value that is no longer told is null."""
+        told = self._told[device]
+        still = {metric.name for metric in metrics}
+        gone = [replace(old, value=None, stamp_ms=now_ms) for name, old in told.items() if name not in still]
+        new = [metric for metric in (*metrics, *gone) if _is_new(metric, told[metric.name])]
+        if not new:
+            return None
+        told.update({metric.name: metric for metric in new})
+        by_alias = [{**_value_of(m), "alias": self._alias(device, m.name), "timestamp": m.stamp_ms} for m in new]
+        return Message(self.topic("DDATA" if device else "NDATA", device), _payload(now_ms, self._next(), by_alias))
+
+    def _alias(self, device: str, name: str) -> int:
+        return self._aliases.setdefault((device, name), len(self._aliases) + 1)
+
+    def _birth_death(self, now_ms: int) -> Metric:
+        return Metric(BIRTH_DEATH, INT64, max(0, self._bd_seq), now_ms)
+
+    def _next(self) -> int:
+        self._seq = (self._seq + 1) % WRAP
+        return self._seq
+
+
+def wants_rebirth(payload: bytes) -> bool:
+    """Whether a command asks for the births; every other command is none that is honoured here."""
+    command = _classes()["Payload"]()
+    try:
+        command.ParseFromString(payload)
+    except DecodeError:
+        return False
+    return any(metric.name == REBIRTH and metric.boolean_value for metric in command.metrics)
+
+
+@dataclass(frozen=True, slots=True)
+class HostState:
+    """What a primary host application says of itself, and when (ms since 1970)."""
+
+    online: bool
+    stamp_ms: int
+
+
+def host_topic(host: str) -> str:
+    """Return the topic on which a primary host application says that it is there."""
+    return f"{NAMESPACE}/STATE/{host}"
+
+
+def host_state(payload: bytes) -> HostState | None:
+    """Read the state of a host application; None for what is none."""
+    try:
+        told = json.loads(payload)
+        online, stamp_ms = told["online"], told["timestamp"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return None
+    whole = isinstance(online, bool) and isinstance(stamp_ms, int)
+    return HostState(online, stamp_ms) if whole else None
+
+
+def _is_new(metric: Metric, told: Metric) -> bool:
+    return _value_of(metric) != _value_of(told) or (metric.event and metric.stamp_ms != told.stamp_ms)
+
+
+def _fields(metric: Metric) -> dict[str, Any]:
+    """Return the fields of a metric in a certificate: its name, data type, unit and description."""
+    pairs = [(UNIT, metric.unit), (DESCRIPTION, metric.description)]
+    properties = [(key, text) for key, text in pairs if text]
+    told = {
+        "keys": [key for key, _ in properties],
+        "values": [{"type": STRING, "string_value": text} for _, text in properties],
+    }
+    named = {"name": metric.name, "timestamp": metric.stamp_ms, "datatype": metric.datatype, **_value_of(metric)}
+    return {**named, "properties": told} if properties else named
+
+
+def _value_of(metric: Metric) -> dict[str, Any]:
+    value = metric.value
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return {"is_null": True}
+    if metric.datatype == BOOLEAN:
+        return {"boolean_value": bool(value)}
+    if metric.datatype == INT64:  # the bits of a signed number, as a number without a sign
+        return {"long_value": int(value) % 2**64}
+    if metric.datatype == DOUBLE:
+        return {"double_value": float(value)}
+    # half a character, as of a file name that is no UTF-8, cannot be sent
+    return {"string_value": str(value).encode("utf-8", "replace").decode()}
+
+
+def _payload(now_ms: int, seq: int | None, metrics: Iterable[Mapping[str, Any]]) -> bytes:
+    classes = _classes()
+    whole = classes["Payload"](timestamp=now_ms, metrics=[classes["Metric"](**fields) for fields in metrics])
+    if seq is not None:
+        whole.seq = seq
+    return bytes(whole.SerializeToString())
+
+
+@cache
+def _classes() -> Mapping[str, Any]:
+    """Return protobuf's class of each message, made of ``_FIELDS``."""
+    file = descriptor_pb2.FileDescriptorProto(name="sparkplug_b", package="fdhil.sparkplug", syntax="proto2")
+    for name, fields in _FIELDS.items():
+        file.message_type.add(name=name).field.extend(_described(fields))
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    return {
+        name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"{file.package}.{name}")) for name in _FIELDS
+    }
+
+
+def _described(fields: Iterable[tuple[int, str, str]]) -> Iterator[Any]:
+    field = descriptor_pb2.FieldDescriptorProto
+    for number, kind, name in fields:
+        label = field.LABEL_REPEATED if kind.endswith("*") else field.LABEL_OPTIONAL
+        kind = kind.removesuffix("*")
+        if kind in _FIELDS:
+            of = {"type": field.TYPE_MESSAGE, "type_name": f".fdhil.sparkplug.{kind}"}
+        else:
+            of = {"type": field.Type.Value(f"TYPE_{kind.upper()}")}
+        yield field(name=name, number=number, label=label, **of)

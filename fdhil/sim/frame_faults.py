@@ -1,0 +1,263 @@
+"""Spoils the frames of a CAN bus by a plan: which frames, which way, from which SYNC on, and how. Pure.
+
+Every fault draws from a source of its own for each way, so the same frames in the same order are spoilt alike,
+whatever happens on the other way meanwhile.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from random import Random
+from typing import Any, Literal
+
+from fdhil.sim.frame import Frame
+
+SYNC = 0x80
+_NEVER = float("inf")
+Way = Literal["sent", "received"]
+Passed = tuple[Frame, Any]
+"""A frame that goes on, and what its sender gave along with it (None: it was made up)."""
+
+
+@dataclass(frozen=True, slots=True)
+class FaultValue:
+    """The meaning of a fault's value, and its limits."""
+
+    meaning: str
+    low: float = -1e6
+    high: float = 1e6
+    whole: bool = False
+    among: frozenset[int] = frozenset()
+
+    def fault(self, value: float) -> str:
+        """Return what is wrong with a value, "" when nothing is."""
+        if self.whole and value != int(value):
+            return f"{value:g} is no whole number"
+        if not self.low <= value <= self.high or (self.among and value not in self.among):
+            allowed = ", ".join(map(str, sorted(self.among))) or f"{self.low:g} to {self.high:g}"
+            return f"{value:g} is not among {allowed}"
+        return ""
+
+
+VALUES: Mapping[str, FaultValue | None] = {
+    "drop": None,
+    "duplicate": FaultValue("copies beside the frame", 1, 1000, whole=True),
+    "reorder": FaultValue("frames of the same way that overtake it", 1, 1000, whole=True),
+    "delay": FaultValue("SYNC cycles", 1, 10000, whole=True),
+    "late": FaultValue("seconds", 0, 60),
+    "mutate": FaultValue("bits that are turned over", 1, 64, whole=True),
+    "truncate": FaultValue("bytes that are left", 0, 7, whole=True),
+    "extend": FaultValue("bytes that are added, up to 8 in all", 1, 8, whole=True),
+    "inject": FaultValue("frames at every SYNC", 1, 1e6, whole=True),
+    "raise": FaultValue("error number, such as 105 (ENOBUFS) or 100 (ENETDOWN)", 1, 4095, whole=True),
+}
+"""The faults of frames, and what the value of each means."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameFault:
+    """One entry of a plan; ValueError when it makes no sense.
+
+    ``can_ids``: the frames it meets, None for all (29 bit identifiers with ``frame.EXTENDED``). ``way``: those that the
+    holder of the bus ``sent`` or ``received``, None for both; an injected frame goes the way named, None: is received.
+    ``from_sync``, ``until_sync``: SYNC frames on this bus, the first is number 0 (-1: from the start, before any SYNC).
+    ``percent`` of the frames that it meets, at most ``times`` of them. ``data`` (and one identifier) are those of what
+    is injected.
+    """
+
+    kind: str
+    value: float = 1
+    can_ids: Collection[int] | None = None
+    way: Way | None = None
+    from_sync: int = -1
+    until_sync: int | None = None
+    percent: float = 100.0
+    times: int | None = None
+    data: bytes = b""
+
+    def __post_init__(self) -> None:
+        if self.kind not in VALUES:
+            raise ValueError(f"{self.kind!r} is none of {', '.join(VALUES)}")
+        meaning = VALUES[self.kind]
+        if meaning is not None and (wrong := meaning.fault(self.value)):
+            raise ValueError(f"the value of {self.kind} is {meaning.meaning}: {wrong}")
+        if not 0 < self.percent <= 100:
+            raise ValueError(f"{self.percent:g} is no percentage of frames above 0")
+        if len(self.data) > 8:
+            raise ValueError("a CAN frame has at most 8 bytes")
+        if self.kind == "inject" and (self.can_ids is None or len(self.can_ids) != 1):
+            raise ValueError("inject needs the one identifier of its frame")
+
+
+class BusRefuses(Exception):
+    """A planned error of the bus itself, by its error number."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        super().__init__(number)
+
+
+@dataclass(slots=True)
+class _Active:
+    fault: FrameFault
+    draws: Mapping[Way, Random]
+    met: int = 0
+
+    def meets(self, can_id: int, way: Way, sync: int) -> bool:
+        """Whether this frame is to be spoilt now."""
+        fault = self.fault
+        if (fault.way is not None and way != fault.way) or (fault.can_ids is not None and can_id not in fault.can_ids):
+            return False
+        if not self.is_due(sync) or (fault.times is not None and self.met >= fault.times):
+            return False
+        if fault.percent < 100 and self.draws[way].random() * 100 >= fault.percent:
+            return False
+        self.met += 1
+        return True
+
+    def is_due(self, sync: int) -> bool:
+        fault = self.fault
+        return fault.from_sync <= sync and (fault.until_sync is None or sync < fault.until_sync)
+
+
+@dataclass(slots=True)
+class _Held:
+    passed: Passed
+    way: Way
+    sync: float = _NEVER
+    overtaken: float = _NEVER
+    at_s: float = _NEVER
+
+
+class FrameFaults:
+    """Carries out a plan. ``sync`` counts the SYNC frames that came by; ``counted`` what was done, by kind and id.
+
+    While it is ``down`` nothing passes.
+    """
+
+    def __init__(self, plan: Sequence[FrameFault] = (), seed: int = 0) -> None:
+        self.sync = -1
+        self.counted: Counter[tuple[str, int]] = Counter()
+        self.down = False
+        self._seed, self._made = seed, 0
+        self._plan: list[_Active] = []
+        self._held: list[_Held] = []
+        for fault in plan:
+            self.add(fault)
+
+    def add(self, fault: FrameFault) -> None:
+        """Take a fault into the plan; it acts after those that are there."""
+        ways: tuple[Way, ...] = ("sent", "received")
+        draws = {way: Random(f"{self._seed}:{self._made}:{way}") for way in ways}
+        self._made += 1
+        self._plan.append(_Active(fault, draws))
+
+    def remove(self, fault: FrameFault) -> None:
+        """End a fault; what it holds back comes in its time."""
+        self._plan.remove(next(active for active in self._plan if active.fault == fault))
+
+    @property
+    def idle(self) -> bool:
+        """Whether every frame passes as it is."""
+        return not self._plan and not self._held and not self.down
+
+    def total(self, kind: str, *can_ids: int) -> int:
+        """Return how many frames met this kind of fault, of these identifiers or of all."""
+        return sum(n for (what, i), n in self.counted.items() if what == kind and (not can_ids or i in can_ids))
+
+    def take(self, frame: Frame, way: Way, now_s: float, origin: Any = None) -> list[Passed]:
+        """Return what goes on in place of a frame, at once; BusRefuses where an error is planned."""
+        if self.down:
+            self.counted["down", frame[0]] += 1
+            return []
+        if frame[0] == SYNC:
+            self.sync += 1
+        if self.idle:
+            return [(frame, origin)]
+        passed: list[Passed] = [(frame, origin)]
+        for active in self._plan:
+            if active.fault.kind != "inject":
+                passed = [out for each in passed for out in self._spoilt(active, each, way, now_s)]
+        if self._held and passed:
+            passed += self._overtaken(way)
+        if frame[0] == SYNC:
+            self._inject()
+            passed += self.due(way, now_s)
+        return passed
+
+    def due(self, way: Way, now_s: float) -> list[Passed]:
+        """Return what was held back and goes on now."""
+        return self._released(lambda held: held.way == way and (held.sync <= self.sync or held.at_s <= now_s))
+
+    def due_s(self) -> float:
+        """Return when :meth:`due` has something by time alone; infinite: nothing waits for time."""
+        return min((held.at_s for held in self._held), default=_NEVER)
+
+    def _spoilt(self, active: _Active, passed: Passed, way: Way, now_s: float) -> list[Passed]:
+        (can_id, data), origin = passed
+        fault = active.fault
+        swaps = fault.kind == "reorder" and any(held.way == way and held.overtaken < _NEVER for held in self._held)
+        if swaps or not active.meets(can_id, way, self.sync):  # what is overtaken needs frames that pass
+            return [passed]
+        self.counted[fault.kind, can_id] += 1
+        if fault.kind == "raise":
+            raise BusRefuses(int(fault.value))
+        if fault.kind == "duplicate":
+            return [passed] * (1 + int(fault.value))
+        held = _held(fault, passed, way, self.sync, now_s)
+        if held is not None:
+            self._held.append(held)
+            return []
+        changed = _changed(fault, data, active.draws[way])
+        return [] if changed is None else [((can_id, changed), origin)]
+
+    def _overtaken(self, way: Way) -> list[Passed]:
+        for held in self._held:
+            if held.way == way:
+                held.overtaken -= 1
+        return self._released(lambda held: held.overtaken <= 0)
+
+    def _released(self, goes: Callable[[_Held], bool]) -> list[Passed]:
+        if not self._held:
+            return []
+        out = [held.passed for held in self._held if goes(held)]
+        if out:
+            self._held = [held for held in self._held if not goes(held)]
+        return out
+
+    def _inject(self) -> None:
+        for active in self._plan:
+            fault = active.fault
+            if fault.kind != "inject" or not active.is_due(self.sync):
+                continue
+            (can_id,) = fault.can_ids or ()
+            for _ in range(int(fault.value)):
+                if fault.times is not None and active.met >= fault.times:
+                    break
+                active.met += 1
+                self.counted["inject", can_id] += 1
+                self._held.append(_Held(((can_id, fault.data), None), fault.way or "received", sync=self.sync))
+
+
+def _held(fault: FrameFault, passed: Passed, way: Way, sync: int, now_s: float) -> _Held | None:
+    """Return what holds a frame back, None for a fault that does not."""
+    if fault.kind == "reorder":
+        return _Held(passed, way, overtaken=fault.value)
+    if fault.kind == "delay":
+        return _Held(passed, way, sync=sync + fault.value)
+    return _Held(passed, way, at_s=now_s + fault.value) if fault.kind == "late" else None
+
+
+def _changed(fault: FrameFault, data: bytes, draw: Random) -> bytes | None:
+    """Return what a fault makes of a frame's content, None for no frame at all."""
+    value = int(fault.value)
+    if fault.kind == "mutate":
+        spoilt = bytearray(data)
+        for bit in draw.sample(range(8 * len(data)), min(value, 8 * len(data))):
+            spoilt[bit // 8] ^= 1 << bit % 8
+        return bytes(spoilt)
+    if fault.kind == "truncate":
+        return data[:value]
+    return (data + draw.randbytes(value))[:8] if fault.kind == "extend" else None

@@ -1,0 +1,101 @@
+"""A python-can bus that spoils what goes over another one, by a plan: give it to ``canopen.Network`` or any program.
+
+plan = [FrameFault("drop", can_ids={0x181}, way="received", percent=5, from_sync=1000)]
+bus = FaultBus(can.Bus(interface="virtual", channel="test"), plan, seed=1)
+...
+assert bus.faults.total("drop") == what_my_program_says_it_lost
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+
+import can
+
+from fdhil.sim.frame import EXTENDED, Frame
+from fdhil.sim.frame_faults import BusRefuses, FrameFault, FrameFaults, Passed
+
+_ERROR, _REMOTE = 1 << 29, 1 << 30
+_LOOK_S = 0.02  # so often a receiver that waits looks for what is made up or late
+
+
+class FaultBus(can.BusABC):
+    """Wraps ``bus``, which is shut down with it. ``faults`` counts what was done, and faults may be added meanwhile.
+
+    A planned error is a ``can.CanOperationError`` with its number, out of ``send`` or ``recv``. What is sent
+    periodically goes through the plan, too.
+    """
+
+    def __init__(self, bus: can.BusABC, plan: Sequence[FrameFault] = (), seed: int = 0) -> None:
+        self.faults = FrameFaults(plan, seed)
+        self.channel_info = f"faults on {bus.channel_info}"
+        self._bus = bus
+        self._ready: deque[can.Message] = deque()
+        self._lock = threading.Lock()
+        super().__init__(channel=self.channel_info)
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Send what the plan makes of a message."""
+        now_s = time.monotonic()
+        with self._lock:
+            passed = self._planned(msg, sent=True, now_s=now_s) + self.faults.due("sent", now_s)
+        for each in passed:
+            self._bus.send(_message(each), timeout)
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        until_s = float("inf") if timeout is None else time.monotonic() + timeout
+        while True:
+            now_s = time.monotonic()
+            self._settle(now_s)
+            if self._ready:
+                return self._ready.popleft(), False
+            message = self._bus.recv(max(0.0, min(until_s - now_s, _LOOK_S)))
+            if message is not None:
+                with self._lock:
+                    self._ready.extend(map(_message, self._planned(message, sent=False, now_s=time.monotonic())))
+            elif now_s >= until_s:
+                return None, False
+
+    def _settle(self, now_s: float) -> None:
+        """Let go on what was held back until now, on either way."""
+        with self._lock:
+            self._ready.extend(map(_message, self.faults.due("received", now_s)))
+            late = self.faults.due("sent", now_s)
+        for each in late:
+            self._bus.send(_message(each))
+
+    def _planned(self, message: can.Message, *, sent: bool, now_s: float) -> list[Passed]:
+        try:
+            return self.faults.take(_frame(message), "sent" if sent else "received", now_s, message)
+        except BusRefuses as error:
+            raise can.CanOperationError(os.strerror(error.number), error.number) from None
+
+    def shutdown(self) -> None:
+        """Leave the bus."""
+        super().shutdown()
+        self._bus.shutdown()
+
+
+def _frame(message: can.Message) -> Frame:
+    flags = message.is_extended_id * EXTENDED | message.is_error_frame * _ERROR | message.is_remote_frame * _REMOTE
+    return message.arbitration_id | flags, bytes(message.data)
+
+
+def _message(passed: Passed) -> can.Message:
+    """Return the message that was given, or one like it with what was changed."""
+    (can_id, data), origin = passed
+    message: can.Message | None = origin
+    if message is not None and _frame(message) == (can_id, data):
+        return message
+    return can.Message(
+        timestamp=time.time() if message is None else message.timestamp,
+        arbitration_id=can_id & 0x1FFFFFFF,
+        is_extended_id=bool(can_id & EXTENDED),
+        is_remote_frame=bool(can_id & _REMOTE),
+        is_error_frame=bool(can_id & _ERROR),
+        data=data,
+    )

@@ -1,0 +1,104 @@
+"""What a simulated Modbus unit answers, over TCP and on a serial line alike, and how its faults spoil that. Pure.
+
+Source: MODBUS application protocol V1.1b3, 6.3, 6.4, 6.6, 6.12 and 7.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Mapping
+from random import Random
+
+from fdhil.sim.wire.registers import RegisterMap
+from fdhil.sim.wire.sensor_faults import SensorFaults
+
+_READS, _WRITE, _WRITE_SEVERAL = (3, 4), 6, 16
+_MOST_REGISTERS = 125
+_ILLEGAL_FUNCTION, _ILLEGAL_ADDRESS, _ILLEGAL_VALUE = 1, 2, 3
+
+Seal = Callable[[int, bytes], bytes]
+"""Makes the frame of a unit's answer, as it goes over the wire."""
+
+
+def answer(registers: RegisterMap, faults: SensorFaults, body: bytes) -> bytes:
+    """Return function and data of the answer to a request's function and data."""
+    function = body[0]
+    if faults.exception:
+        return _refusal(function, faults.exception)
+    if function not in (*_READS, _WRITE, _WRITE_SEVERAL):
+        return _refusal(function, _ILLEGAL_FUNCTION)
+    if len(body) < 5:
+        return _refusal(function, _ILLEGAL_VALUE)
+    address, value = struct.unpack(">HH", body[1:5])
+    if function in _READS:
+        return _reading(registers, function, address, value)
+    if address != registers.trigger or (function == _WRITE_SEVERAL and value != 1):
+        return _refusal(function, _ILLEGAL_ADDRESS)
+    if body[-2:] != b"\0\1":
+        return _refusal(function, _ILLEGAL_VALUE)
+    registers.latch()
+    return body[:5]
+
+
+def _reading(registers: RegisterMap, function: int, address: int, count: int) -> bytes:
+    if not 1 <= count <= _MOST_REGISTERS:
+        return _refusal(function, _ILLEGAL_VALUE)
+    words = registers.words()
+    if any(at not in words for at in range(address, address + count)):
+        return _refusal(function, _ILLEGAL_ADDRESS)
+    wanted = [words[at] for at in range(address, address + count)]
+    return struct.pack(f">BB{count}H", function, 2 * count, *wanted)
+
+
+def _refusal(function: int, code: int) -> bytes:
+    return bytes([function | 0x80, code])
+
+
+def spoilt(faults: SensorFaults, seal: Seal, unit: int, body: bytes) -> list[bytes]:
+    """Return the pieces in which an answer goes over the wire, with a pause between them; [] for none at all."""
+    before, faults.before = faults.before, (seal, unit, body)
+    if faults.silent:
+        return []
+    kinds = [kind for kind, percent in faults.answers.items() if 100 * faults.draw.random() < percent]
+    for kind in (kind for kind in kinds if kind in _CONTENT):
+        unit, body = _CONTENT[kind](unit, body, before[2] if before else body)
+    pieces = [seal(unit, body)]
+    for kind in (kind for kind in kinds if kind in _FRAME):
+        pieces = [*pieces[:-1], *_FRAME[kind](pieces[-1], faults.draw)]
+    if before is not None and "stale" in kinds:
+        seal_before, unit_before, body_before = before
+        pieces = [seal_before(unit_before, body_before), *pieces]
+    return pieces
+
+
+def _torn(unit: int, body: bytes, before: bytes) -> tuple[int, bytes]:
+    """Every second register is still that of the answer before: the words of one number are of two moments."""
+    if body[0] not in _READS or len(before) != len(body):
+        return unit, body
+    words = [before[at : at + 2] if at // 2 % 2 else body[at : at + 2] for at in range(2, len(body), 2)]
+    return unit, body[:2] + b"".join(words)
+
+
+def _too_many(unit: int, body: bytes, _before: bytes) -> tuple[int, bytes]:
+    """One register more than was asked for."""
+    return (unit, bytes([body[0], body[1] + 2]) + body[2:] + b"\0\1") if body[0] in _READS else (unit, body)
+
+
+def _flipped(frame: bytes, draw: Random) -> list[bytes]:
+    bit = draw.randrange(8 * len(frame))
+    return [bytes(byte ^ (1 << bit % 8 if at == bit // 8 else 0) for at, byte in enumerate(frame))]
+
+
+_CONTENT: Mapping[str, Callable[[int, bytes, bytes], tuple[int, bytes]]] = {
+    "wrong_unit": lambda unit, body, _before: (unit % 247 + 1, body),
+    "torn": _torn,
+    "too_many": _too_many,
+}
+_FRAME: Mapping[str, Callable[[bytes, Random], list[bytes]]] = {
+    "flipped": _flipped,
+    "short": lambda frame, _draw: [frame[:-3]],
+    "noisy": lambda frame, draw: [draw.randbytes(draw.randint(1, 6)) + frame],
+    "split": lambda frame, _draw: [frame[: len(frame) // 2], frame[len(frame) // 2 :]],
+}
+ANSWER_FAULTS = (*_CONTENT, *_FRAME, "stale")
+"""The faults of answers by name."""

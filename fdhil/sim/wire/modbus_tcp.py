@@ -1,0 +1,142 @@
+"""Serves simulated sensors by Modbus TCP, in a thread of their own.
+
+Source: MODBUS messaging on TCP/IP implementation guide V1.0b, 3.1.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+import threading
+from collections.abc import Mapping
+from functools import partial
+
+from fdhil.errors import ConnectError
+from fdhil.sim.wire.modbus_answers import Seal, answer, spoilt
+from fdhil.sim.wire.modbus_sensor import VoltageSensor
+from fdhil.sim.wire.registers import RegisterMap
+from fdhil.sim.wire.sensor_faults import SensorFaults
+
+_HEADER = struct.Struct(">HHHB")  # transaction, protocol (0), bytes that follow, unit
+_MOST_BYTES = 254
+_GATEWAY_TARGET = 11  # exception of a gateway whose unit does not answer
+_PIECES_S = 0.005
+ANY_UNIT = 0
+_Units = Mapping[int, tuple[RegisterMap, SensorFaults]]
+
+
+class SensorServers:
+    """The Modbus TCP servers of a machine, in one thread; ``ports`` by axis once :meth:`start` has returned.
+
+    Any unit identifier is answered, as TCP sensors do, but behind a gateway.
+    """
+
+    def __init__(
+        self,
+        sensors: Mapping[str, VoltageSensor],
+        addresses: Mapping[str, tuple[str, int]],
+        maps: Mapping[str, RegisterMap] | None = None,
+        units: Mapping[str, int] | None = None,
+    ) -> None:
+        """Serve the sensors that have an address, each with the registers of ``maps`` in place of its own.
+
+        Those with one address are behind a gateway: each answers to its own number of ``units`` only.
+        """
+        self._sensors, self._addresses, self._units = sensors, addresses, units or {}
+        self._maps: Mapping[str, RegisterMap] = sensors if maps is None else maps
+        self._servers: list[asyncio.Server] = []
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._run, name="sim-modbus", daemon=True)
+        self.ports: dict[str, int] = {}
+
+    def start(self) -> None:
+        """Open every port; ConnectError when one cannot be had."""
+        self._thread.start()
+        try:
+            asyncio.run_coroutine_threadsafe(self._open(), self._loop).result()
+        except ConnectError:
+            self.stop()
+            raise
+
+    def stop(self) -> None:
+        """Close every port and end the thread."""
+        asyncio.run_coroutine_threadsafe(self._close(), self._loop).result()
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    def _run(self) -> None:
+        asyncio.set_event_loop(self._loop)
+        self._loop.run_forever()
+
+    async def _open(self) -> None:
+        for axes in self._gateways():
+            port = await self._serve(axes)
+            self.ports |= dict.fromkeys(axes, port)
+
+    def _gateways(self) -> list[list[str]]:
+        """Return the axes by the server that they share; a port that is yet to be chosen is nobody else's."""
+        shared: dict[tuple[str, int | str], list[str]] = {}
+        for axis, (host, port) in self._addresses.items():
+            shared.setdefault((host, port or axis), []).append(axis)
+        return list(shared.values())
+
+    async def _serve(self, axes: list[str]) -> int:
+        """Serve the units of one address and return its port; ConnectError."""
+        host, port = self._addresses[axes[0]]
+        units = {
+            self._units[axis] if len(axes) > 1 else ANY_UNIT: (self._maps[axis], self._sensors[axis].faults)
+            for axis in axes
+        }
+        try:
+            server = await asyncio.start_server(partial(self._client, units), host, port)
+        except OSError:
+            raise ConnectError(
+                f"voltage sensor {axes[0]}",
+                f"TCP port {port} of {host} cannot be had: end the program that holds it, or set "
+                f"axis.{axes[0]}.voltage.port to another one (0 lets the simulator choose one)",
+            ) from None
+        self._servers.append(server)
+        return int(server.sockets[0].getsockname()[1])
+
+    @staticmethod
+    async def _client(units: _Units, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            await _converse(reader, writer, units)
+        except (asyncio.IncompleteReadError, OSError, asyncio.CancelledError):
+            return  # it has gone, or this machine ends
+        finally:
+            writer.close()
+
+    async def _close(self) -> None:
+        for server in self._servers:
+            server.close()
+        others = asyncio.all_tasks(self._loop) - {asyncio.current_task(self._loop)}
+        for task in others:
+            task.cancel()
+        await asyncio.gather(*others, return_exceptions=True)
+
+
+async def _converse(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, units: _Units) -> None:
+    """Answer the requests of one client, one after the other, until it leaves or speaks no Modbus."""
+    while True:
+        transaction, protocol, size, unit = _HEADER.unpack(await reader.readexactly(_HEADER.size))
+        if protocol != 0 or not 2 <= size <= _MOST_BYTES:
+            return
+        request = await reader.readexactly(size - 1)
+        seal = _framing(transaction)
+        served = units.get(ANY_UNIT) or units.get(unit)
+        if served is None:
+            pieces = [seal(unit, bytes([request[0] | 0x80, _GATEWAY_TARGET]))]
+        else:
+            registers, faults = served
+            await asyncio.sleep(faults.slow_s)
+            pieces = spoilt(faults, seal, unit, answer(registers, faults, request))
+        for place, piece in enumerate(pieces):
+            await asyncio.sleep(_PIECES_S if place else 0.0)
+            writer.write(piece)
+            await writer.drain()
+
+
+def _framing(transaction: int) -> Seal:
+    return lambda unit, body: _HEADER.pack(transaction, 0, len(body) + 1, unit) + body

@@ -1,0 +1,129 @@
+"""Keeps the audit: who asked the machine for what, and what he was answered; one line each, chained, never changed.
+
+``audit.jsonl`` in the store: each line carries the SHA-256 of itself and of the line before it, so that a line that was
+changed, left out or put elsewhere is seen. That the newest lines were cut off, or all of them written anew, is not: the
+daemon's journal has each answer too, and may be sent on; ``chattr +a`` guards the file itself.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import json
+import os
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from fdhil.errors import StoreError
+from fdhil.store.atomic import store_error, sync_folder, write_all
+from fdhil.store.rows import Stamp
+
+FILE_NAME = "audit.jsonl"
+TAIL_BYTES = 16 * 1024
+LOCKED_S, LOOK_S = 10.0, 0.01  # how long another writer is waited for; whoever may read the file may lock it, too
+BEGIN = "0" * 64  # what stands before the first line
+BROKEN = "is no line of the audit, or not the one that stood here: it was changed, left out or moved"
+
+
+def append(folder: Path, entry: Mapping[str, Any]) -> None:
+    """Write one entry at the end and wait until it is on the disk. StoreError.
+
+    A line that a power cut left half is closed first: it stays and is told by ``entries``.
+    """
+    path = folder / FILE_NAME
+    try:
+        with _opened(path) as descriptor:
+            before, whole = _last_seal(descriptor)
+            stamp = Stamp.now()
+            told = datetime.fromtimestamp(stamp.wall_s, UTC).isoformat(timespec="milliseconds")
+            body = {"time": told, "boot": stamp.boot, "monotonic_ns": stamp.monotonic_ns, **entry}
+            line = json.dumps({**body, "seal": _seal(before, body)}).encode() + b"\n"
+            write_all(descriptor, line if whole else b"\n" + line)
+            os.fsync(descriptor)
+            if before == BEGIN:
+                sync_folder(folder)
+    except OSError as error:
+        raise store_error(path, error) from None
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[int]:
+    """Open the file for one writer at a time; one that root begins belongs to the owner of the folder."""
+    flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
+    descriptor = os.open(path, flags, 0o640)
+    try:
+        _lock(descriptor)
+        if os.getuid() == 0 and not os.fstat(descriptor).st_size:
+            owner = path.parent.stat()
+            os.fchown(descriptor, owner.st_uid, owner.st_gid)
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def _lock(descriptor: int) -> None:
+    """Wait for the file's lock, but not for ever. OSError."""
+    until_s = time.monotonic() + LOCKED_S
+    while True:
+        try:
+            return fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() > until_s:
+                raise OSError(errno.EBUSY, "another process has kept it locked") from None
+            time.sleep(LOOK_S)
+
+
+def _last_seal(descriptor: int) -> tuple[str, bool]:
+    """Return what the next line is chained to, and whether the file ends with a whole line."""
+    size = start = os.fstat(descriptor).st_size
+    tail = last = b""
+    while start and len(last) == len(tail.removesuffix(b"\n")):  # its beginning is not read yet
+        start = max(0, start - max(TAIL_BYTES, size - start))
+        tail = os.pread(descriptor, size - start, start)
+        last = tail.removesuffix(b"\n").rpartition(b"\n")[2]
+    return (_seal_of(last) if tail else BEGIN), not tail or tail.endswith(b"\n")
+
+
+def _seal_of(line: bytes) -> str:
+    """Return a line's own seal; of one that has none, its SHA-256, so that the chain goes on and shows the damage."""
+    try:
+        seal = json.loads(line)["seal"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        seal = None
+    return seal if isinstance(seal, str) else hashlib.sha256(line).hexdigest()
+
+
+def _seal(before: str, body: Mapping[str, Any]) -> str:
+    return hashlib.sha256((before + json.dumps(body)).encode()).hexdigest()
+
+
+def entries(folder: Path) -> Iterator[tuple[dict[str, Any], str | None]]:
+    """Yield each entry, oldest first, and what is wrong with it, None where it is as it was written. StoreError."""
+    path = folder / FILE_NAME
+    try:
+        with path.open("rb") as file:
+            before = BEGIN
+            for line in file:
+                yield _read(line.rstrip(b"\n"), before)
+                before = _seal_of(line.rstrip(b"\n"))
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        text = f"{path} could not be read: {error.strerror}; check its rights"
+        raise StoreError(text) from None
+
+
+def _read(line: bytes, before: str) -> tuple[dict[str, Any], str | None]:
+    try:
+        body = json.loads(line)
+    except (ValueError, RecursionError):
+        body = None
+    if not isinstance(body, dict):
+        return {"line": line[:200].decode("utf-8", "replace")}, BROKEN
+    seal = body.pop("seal", None)
+    return body, None if seal == _seal(before, body) else BROKEN

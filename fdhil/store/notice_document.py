@@ -1,0 +1,31 @@
+"""A stored notice and its acknowledgement as JSON has them."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any
+
+from fdhil.store.rows import Acknowledgement, Stamp, StoredNotice
+
+
+def notice_document(stored: StoredNotice) -> dict[str, Any]:
+    """Return a stored notice as JSON has it."""
+    notice = stored.notice
+    return {
+        "number": stored.number,
+        "time": _date(stored.stamp),
+        "axis": notice.axis,
+        "code": notice.code,
+        "severity": notice.severity,
+        "text": notice.text,
+        "acknowledged": acknowledgement_document(stored.acknowledged),
+    }
+
+
+def acknowledgement_document(given: Acknowledgement | None) -> dict[str, Any] | None:
+    """Return who acknowledged a notice, when, and what was remarked, as JSON has it; None where nobody did."""
+    return None if given is None else {"who": given.who, "time": _date(given.stamp), "note": given.note}
+
+
+def _date(stamp: Stamp) -> str:
+    return datetime.fromtimestamp(stamp.wall_s, UTC).isoformat(timespec="seconds")

@@ -1,0 +1,209 @@
+"""The outbox: which rows of the history a works is to be told, in the order in which they were written.
+
+An entry is written in the transaction of its row, so that neither is there without the other, and only where the
+configuration has [uplink]; what was recorded before is entered when the daemon first starts with it. Who sends
+(``fdhil uplink``) reads the history and writes its own position beside it; the daemon waits for nobody. An entry goes
+when the position has passed it, or when more than ``keep_unsent`` wait: then the oldest go, and how many is counted.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from fdhil.config.uplink import Uplink
+from fdhil.errors import StoreError
+from fdhil.store import HISTORY_FILE, schema
+from fdhil.store.atomic import write_file
+
+POSITION_FILE = "position.json"
+LARGEST_POSITION = 4096  # bytes of that file
+PRUNE_EVERY = 1_000  # entries
+PRUNE_AT_MOST = 5_000  # entries at once: a few milliseconds
+# table -> what one of its rows is called where many machines are looked at
+KINDS: Mapping[str, str] = {
+    "windows": "window",
+    "revisions": "parameters",
+    "skills": "skill",
+    "loops": "loops",
+    "notices": "notice",
+    "acknowledgements": "acknowledgement",
+}
+
+
+# [uplink] windows, as a condition on a window's row
+_WHOLE = {
+    "all": "file <> ''",
+    "refused": "file <> '' AND NOT accepted",
+    "some": "file <> '' AND id % {every} = 1 % {every}",
+    "none": "0",
+}
+_OF_NO_AXIS = {"acknowledgements": "''"}
+
+
+@dataclass(frozen=True, slots=True)
+class Position:
+    """How far the outbox of ``store`` is sent: the last entry and its message; ``about``: what of the machine."""
+
+    store: str = ""
+    entry: int = 0
+    message: str = ""
+    about: str = ""
+
+
+def read_position(folder: Path) -> Position:
+    """Return how far the outbox was sent; the beginning where that is not known: all is sent again then."""
+    try:
+        with (folder / POSITION_FILE).open("rb") as file:
+            told = json.loads(file.read(LARGEST_POSITION))
+        position = Position(**told)
+    except (OSError, ValueError, TypeError, RecursionError):
+        return Position()
+    kinds = all(isinstance(getattr(position, name), str) for name in ("store", "message", "about"))
+    return position if kinds and type(position.entry) is int else Position()
+
+
+def write_position(folder: Path, position: Position) -> None:
+    """Note how far the outbox was sent. StoreError."""
+    write_file(folder / POSITION_FILE, json.dumps(asdict(position)).encode())
+
+
+class Outbox:
+    """What the daemon adds to each row of its history (``History.open(directory, also=outbox.enter)``)."""
+
+    def __init__(self, settings: Uplink, folder: Path) -> None:
+        self._settings = settings
+        self._folder = folder
+        self._windows = Counter[str]()
+
+    def enter(self, db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
+        """Enter a row that is being written, in its transaction; sqlite3.Error."""
+        if table not in KINDS:
+            return
+        axis = row.get("axis") or ""
+        entry = (table, row["id"], axis, row["digest"], int(table == "windows" and self._is_sent_whole(row)))
+        added = db.execute("INSERT INTO outbox (of, row, axis, message, with_file) VALUES (?, ?, ?, ?, ?)", entry)
+        number = int(added.lastrowid or 0)
+        if number % PRUNE_EVERY == 0:
+            self._prune(db, number)
+
+    def begin(self, db: sqlite3.Connection) -> None:
+        """Enter what was recorded before there was an [uplink], the newest of it, once; sqlite3.Error."""
+        if db.execute("SELECT 1 FROM sqlite_sequence WHERE name = 'outbox'").fetchone():
+            return
+        whole = _WHOLE[self._settings.windows].format(every=self._settings.every_window)
+        tables = " UNION ALL ".join(
+            f"SELECT '{table}' AS of, id AS row, {_OF_NO_AXIS.get(table, 'axis')} AS axis, digest AS message, "
+            f"{whole if table == 'windows' else 0} AS with_file, {place} AS place, "
+            f"max(wall_s) OVER (ORDER BY id) AS at FROM {table} WHERE digest <> ''"
+            for place, table in enumerate(KINDS)
+        )  # a clock that was set back turns no table's order round
+        newest = f"SELECT * FROM ({tables}) ORDER BY at DESC, place DESC, row DESC LIMIT ?"
+        db.execute(
+            "INSERT INTO outbox (of, row, axis, message, with_file) "
+            f"SELECT of, row, axis, message, with_file FROM ({newest}) ORDER BY at, place, row",
+            (self._settings.keep_unsent,),
+        )
+
+    def _is_sent_whole(self, window: Mapping[str, Any]) -> bool:
+        self._windows[window["axis"]] += 1
+        if not window["file"]:
+            return False
+        if self._settings.windows == "some":
+            return self._windows[window["axis"]] % self._settings.every_window == 1 % self._settings.every_window
+        return self._settings.windows == "all" or (self._settings.windows == "refused" and not window["accepted"])
+
+    def _prune(self, db: sqlite3.Connection, newest: int) -> None:
+        """Let go what was sent, and the oldest of too many; the last entry that was sent stays, to be known again."""
+        sent = _sent_before(db, read_position(self._folder))
+        (oldest,) = db.execute("SELECT min(id) FROM outbox").fetchone()
+        until = min(max(sent, newest - self._settings.keep_unsent + 1), oldest + PRUNE_AT_MOST)
+        db.execute("DELETE FROM outbox WHERE id < ?", (until,))
+        if (dropped := until - max(sent + 1, oldest)) > 0:
+            db.execute("UPDATE outbox_of SET dropped = dropped + ?", (dropped,))
+
+
+def _sent_before(db: sqlite3.Connection, position: Position) -> int:
+    """Return the entry before which all were sent, 0 where the position is of another file or of an older copy."""
+    query = "SELECT 1 FROM outbox, outbox_of WHERE id = ? AND message = ? AND store = ?"
+    known = db.execute(query, (position.entry, position.message, position.store)).fetchone()
+    return position.entry if known else 0
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """What is to be sent: ``row`` is what the history has of it, ``left_out`` why there is none."""
+
+    number: int
+    kind: str
+    axis: str
+    message: str
+    row: Mapping[str, Any]
+    left_out: str
+    with_file: bool
+
+
+class OutboxReader:
+    """Reads the outbox of a history that the daemon may be writing; every method raises StoreError."""
+
+    def __init__(self, directory: Path, checked: set[tuple[int, int]] | None = None) -> None:
+        """Open the history of a store; ``checked`` as :func:`schema.open_to_read` has it."""
+        self._path = directory / HISTORY_FILE
+        self._db, version = schema.open_to_read(self._path, checked)
+        if version < schema.WITH_OUTBOX:
+            self._db.close()
+            text = f"{self._path} has no outbox yet: start the daemon of this fdhil, which brings it up to date"
+            raise StoreError(text, "SchemaVersion")
+        self.store, self.dropped = self._ask("SELECT store, dropped FROM outbox_of", ())[0]
+        self._columns: dict[str, list[str]] = {}
+
+    def __enter__(self) -> OutboxReader:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._db.close()
+
+    def _ask(self, query: str, values: tuple[object, ...]) -> list[tuple[Any, ...]]:
+        with schema.told(self._path):
+            return self._db.execute(query, values).fetchall()
+
+    def start(self, position: Position) -> Position:
+        """Return where to go on: at ``position``, or at the beginning where that is not of this file."""
+        query = "SELECT count(*) FROM outbox WHERE id = ? AND message = ?"
+        ((known,),) = self._ask(query, (position.entry, position.message))
+        if position.store == self.store and known:
+            return position
+        return Position(self.store, 0, "", position.about)
+
+    def waiting(self, after: int) -> int:
+        """Return how many entries wait behind one."""
+        return int(self._ask("SELECT count(*) FROM outbox WHERE id > ?", (after,))[0][0])
+
+    def entries(self, after: int, limit: int) -> list[Entry]:
+        """Return the next entries behind one, in order."""
+        query = "SELECT id, of, row, axis, message, with_file FROM outbox WHERE id > ? ORDER BY id LIMIT ?"
+        return [self._entry(*row) for row in self._ask(query, (after, limit))]
+
+    def _entry(self, number: int, table: str, of: int, axis: str, message: str, with_file: int) -> Entry:
+        if table not in KINDS:
+            return Entry(number, "unknown", "", message, {}, "damaged", False)
+        values = self._ask(f"SELECT * FROM {table} WHERE id = ?", (of,))
+        row = dict(zip(self._names(table), values[0], strict=True)) if values else {}
+        left_out = "" if row else "no longer kept"
+        if row and not schema.digest_of(table, row) == row["digest"] == message:
+            row, left_out = {}, "damaged"
+        return Entry(number, KINDS[table], axis, message, row, left_out, bool(with_file and row))
+
+    def _names(self, table: str) -> list[str]:
+        if table not in self._columns:
+            rows = self._ask(f"SELECT name FROM pragma_table_info('{table}') ORDER BY cid", ())
+            self._columns[table] = [name for (name,) in rows]
+        return self._columns[table]

@@ -1,0 +1,58 @@
+"""A published parameter set as JSON has it: each value with its interval, to full precision."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from fdhil.records import INTERVAL_95, PARAMETERS, ParameterSet, unit_of
+
+
+def parameters_status(published: ParameterSet) -> Mapping[str, Mapping[str, Any]]:
+    """Return each parameter with its standard deviation and 95 % interval; nothing is told without its interval."""
+    values, deviations = published.parameters.as_dict(), _deviations(published)
+    return {name: _figures(name, value, deviations[k]) for k, (name, value) in enumerate(values.items())}
+
+
+def terms_status(published: ParameterSet) -> Mapping[str, Mapping[str, Any]]:
+    """Return each term that joined the six parameters in the same way."""
+    deviations = _deviations(published)
+    pairs = enumerate(published.parameters.terms, start=len(PARAMETERS))
+    return {name: _figures(name, value, deviations[k]) for k, (name, value) in pairs}
+
+
+def _deviations(published: ParameterSet) -> list[float]:
+    """Return the standard deviations of the six parameters and the terms, NaN where none is known."""
+    variances = np.diag(published.covariance)
+    known = np.sqrt(np.where(variances >= 0, variances, np.nan)).tolist()
+    return [*known, *[math.nan] * (len(PARAMETERS) + len(published.parameters.terms) - len(known))]
+
+
+def _figures(name: str, value: float, std: float) -> Mapping[str, Any]:
+    half = INTERVAL_95 * std
+    known = math.isfinite(half)
+    return {
+        "value": value,
+        "std": std if known else None,
+        "low": value - half if known else None,
+        "high": value + half if known else None,
+        "unit": unit_of(name),
+    }
+
+
+def set_document(published: ParameterSet) -> dict[str, Any]:
+    """Return a published set as JSON has it."""
+    return {
+        "axis": published.axis,
+        "revision": published.revision,
+        "windows_used": published.windows,
+        "tick": published.tick,
+        "temperature_c": published.temperature_c,
+        "parameters": parameters_status(published),
+        "terms": terms_status(published),
+        "unexplained_um": published.unexplained_um,
+        "warnings": [str(warning) for warning in published.warnings],
+    }

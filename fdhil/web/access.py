@@ -1,0 +1,195 @@
+"""Who may ask: logins, tokens that expire, and the rate of guesses. It knows no HTTP.
+
+A token is 256 random bits that live in this process alone, kept as their SHA-256; a restart ends every login.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import ipaddress
+import logging
+import secrets
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from fdhil.config.users import LONGEST_PASSWORD, Role, User, matches, read_users
+from fdhil.errors import ConfigError
+from fdhil.web.answers import Refused
+
+LIFE_S = 12 * 3600.0
+IDLE_S = 3600.0
+MOST_TOKENS = 256
+FREE_GUESSES = 5
+LONGEST_WAIT_S = 300.0
+FORGET_S = 3600.0
+MOST_GUESSERS = 4096
+MOST_PLACES = 1024
+WAITING_LOGINS = 4
+"""Logins that may wait for their check; each takes a tenth of a second and 32 MiB, one at a time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Asker:
+    """Who asks: a name, empty for someone on this computer who need not log in, and a role."""
+
+    name: str
+    role: Role
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """A login: whose, and until when, on the monotonic clock. ``user`` is what the file said of him then."""
+
+    asker: Asker
+    user: User
+    ends_s: float
+    idle_ends_s: float
+
+
+class Guesses:
+    """Counts wrong passwords by who is guessed and from where; each one beyond five doubles the wait."""
+
+    def __init__(self, now_s: Callable[[], float]) -> None:
+        self._now_s = now_s
+        self._wrong: OrderedDict[str, tuple[int, float]] = OrderedDict()
+
+    def wait_s(self, *keys: str) -> float:
+        """Return for how long none of these may try again; 0 when they may."""
+        return max((self._wait_of(key) for key in keys), default=0.0)
+
+    def _wait_of(self, key: str) -> float:
+        count, at_s = self._wrong.get(key, (0, 0.0))
+        if count < FREE_GUESSES:
+            return 0.0
+        wait_s = min(LONGEST_WAIT_S, 2.0 ** (count - FREE_GUESSES))
+        return max(0.0, at_s + wait_s - self._now_s())
+
+    def wrong(self, *keys: str) -> None:
+        """Note a wrong password."""
+        now_s = self._now_s()
+        for key in keys:
+            count, at_s = self._wrong.pop(key, (0, now_s))
+            self._wrong[key] = (count + 1 if now_s - at_s < FORGET_S else 1, now_s)
+            while len(self._wrong) > MOST_GUESSERS:
+                self._wrong.popitem(last=False)
+
+    def right(self, *keys: str) -> None:
+        """Forget what was wrong before."""
+        for key in keys:
+            self._wrong.pop(key, None)
+
+
+class Access:
+    """The users of one machine, and who of them is logged in."""
+
+    def __init__(self, users_file: Path | None, now_s: Callable[[], float] = time.monotonic) -> None:
+        """Read the users, so that a faulty file is told at the start; ConfigError."""
+        self._users_file = users_file
+        self._now_s = now_s
+        self._sessions: OrderedDict[str, Session] = OrderedDict()
+        self._guesses = Guesses(now_s)
+        # where who has logged in: guesses elsewhere do not lock him out there
+        self._places: OrderedDict[tuple[str, str], None] = OrderedDict()
+        self._checking = asyncio.Semaphore(1)
+        self._waiting = 0
+        self._read: tuple[tuple[int, ...], Mapping[str, User]] = ((), {})
+        if users_file:
+            self._users(users_file)
+
+    @property
+    def by_login(self) -> bool:
+        """Whether there are users at all; without, who reaches the address may read, and nobody may act."""
+        return self._users_file is not None
+
+    def _users(self, path: Path) -> Mapping[str, User]:
+        """Return who may log in now; the file is read again when it is another one. ConfigError."""
+        try:
+            found = path.stat()
+            stamp: tuple[int, ...] = (found.st_ino, found.st_mtime_ns, found.st_size, found.st_mode)
+        except OSError:
+            stamp = ()
+        if not stamp or stamp != self._read[0]:
+            self._read = stamp, read_users(path)
+        return self._read[1]
+
+    def _user(self, name: str) -> User | None:
+        """Return a user; None for one that there is not, or when the file cannot be read any more."""
+        try:
+            return self._users(self._users_file).get(name) if self._users_file else None
+        except ConfigError as error:
+            logging.getLogger("fdhil.web").error("nobody may log in: %s", error)
+            return None
+
+    async def log_in(self, name: str, password: str, address: str) -> tuple[str, Session]:
+        """Return a new token and its session; Refused when name or password is wrong, or too many were."""
+        place = place_of(address)
+        keys = (f"user {name[:64]} {place if (name, place) in self._places else ''}", f"address {place}")
+        wait_s = self._guesses.wait_s(*keys)
+        if wait_s > 0 or self._waiting >= WAITING_LOGINS:
+            text = "too many logins failed or are being checked; nothing was looked at"
+            raise Refused(429, "TooMany", text, f"try again in {max(1.0, wait_s):.0f} s")
+        self._waiting += 1
+        try:
+            async with self._checking:
+                user = await asyncio.to_thread(self._user, name)
+                fits = await asyncio.to_thread(matches, user, password[: LONGEST_PASSWORD + 1])
+        finally:
+            self._waiting -= 1
+        if user is None or not fits:
+            self._guesses.wrong(*keys)
+            raise Refused(401, "AuthRequired", "name or password is wrong", "check both; fdhil web-user sets a new one")
+        self._guesses.right(*keys)
+        self._places[name, place] = None
+        while len(self._places) > MOST_PLACES:
+            self._places.popitem(last=False)
+        return self.begin(name, user)
+
+    def begin(self, name: str, user: User) -> tuple[str, Session]:
+        """Return a new token of a user whose password was right; the oldest login makes room for it."""
+        token, now_s = secrets.token_urlsafe(32), self._now_s()
+        session = Session(Asker(name, user.role), user, now_s + LIFE_S, now_s + IDLE_S)
+        self._sessions[_key(token)] = session
+        while len(self._sessions) > MOST_TOKENS:
+            self._sessions.popitem(last=False)
+        return token, session
+
+    def asker(self, token: str | None) -> Asker | None:
+        """Return whose token this is; None for none, one that has expired, or of a user who was changed since.
+
+        What is looked up is its digest, so that the time it takes tells nothing of the token.
+        """
+        if not self.by_login:
+            return Asker("", "watch")
+        session = self._sessions.get(_key(token)) if token else None
+        now_s = self._now_s()
+        if token is None or session is None:
+            return None
+        changed = self._user(session.asker.name) != session.user
+        if changed or now_s >= min(session.ends_s, session.idle_ends_s):
+            del self._sessions[_key(token)]
+            return None
+        self._sessions[_key(token)] = replace(session, idle_ends_s=now_s + IDLE_S)
+        return session.asker
+
+    def log_out(self, token: str | None) -> None:
+        """End a login; one that is not there is ended already."""
+        self._sessions.pop(_key(token or ""), None)
+
+
+def place_of(address: str) -> str:
+    """Return whose address it is: of IPv6 its network, for a computer has as many addresses there as it likes."""
+    try:
+        ip = ipaddress.ip_address(address.partition("%")[0])
+    except ValueError:
+        return address
+    if isinstance(ip, ipaddress.IPv6Address):
+        return str(ip.ipv4_mapped or ipaddress.IPv6Network((ip, 64), strict=False))
+    return address
+
+
+def _key(token: str) -> str:
+    return hashlib.sha256(token.encode("utf-8", "surrogateescape")).hexdigest()

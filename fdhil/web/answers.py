@@ -1,0 +1,65 @@
+"""What is answered when it is no: one document for every fault, and the status that fits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from pydantic import BaseModel
+
+from fdhil.arming.answers import refusal
+from fdhil.errors import ConfigError, ConnectError, DeviceTimeout, FdhilError, ProgramError, RecordingError, StoreError
+
+STATUS: Mapping[type[FdhilError], int] = {
+    ConnectError: 503,
+    DeviceTimeout: 504,
+    StoreError: 503,
+    ConfigError: 422,
+    ProgramError: 422,
+    RecordingError: 422,
+}
+BY_CODE = {"AuthRequired": 403, "BadRequest": 422, "BadName": 400, "NoHistory": 404, "NotKept": 404, "Busy": 503}
+REFUSED = 409
+"""What the daemon or the guard refuses is a conflict with the state of the machine."""
+
+
+class Fault(BaseModel):
+    """A no: its class, what happened and what it means for the machine, what to do next."""
+
+    ok: Literal[False] = False
+    code: str
+    text: str
+    advice: str
+
+
+class Refused(Exception):
+    """Ends a request with a status and a :class:`Fault`; ``more`` is told beside it."""
+
+    def __init__(self, status: int, code: str, text: str, advice: str = "", more: Mapping[str, Any] | None = None):
+        self.status = status
+        self.document = {**(more or {}), **refusal(code, text, advice)}
+        super().__init__(text)
+
+
+def status_of(error: FdhilError) -> int:
+    """Return the HTTP status that fits an error of fdhil."""
+    code = getattr(error, "code", "")
+    if code in BY_CODE:
+        return BY_CODE[code]
+    return next((status for kind, status in STATUS.items() if isinstance(error, kind)), 500)
+
+
+def document_of(error: FdhilError) -> dict[str, Any]:
+    """Return an error of fdhil as a fault; what to do next is behind the last semicolon of its sentence."""
+    text, _, advice = str(error).rpartition("; ")
+    code = getattr(error, "code", None)
+    return refusal(code if isinstance(code, str) else type(error).__name__, text or advice, advice if text else "")
+
+
+def granted(answer: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the daemon's answer when it is yes; Refused with its reasons when it is no."""
+    if answer.get("ok") is True:
+        return answer
+    code = str(answer.get("code", "NoAnswer"))
+    told = (str(answer.get("text", "the daemon gave no reason")), str(answer.get("advice", "see the daemon's log")))
+    raise Refused(BY_CODE.get(code, REFUSED), code, *told, more=answer)

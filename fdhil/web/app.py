@@ -1,0 +1,122 @@
+"""Puts the pages together behind the gate: one application for one machine, or for many."""
+
+from __future__ import annotations
+
+import logging
+import pkgutil
+from collections.abc import Iterable, Iterator
+from importlib import import_module
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Any
+
+from fastapi import APIRouter, FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import FileResponse, JSONResponse, Response
+from fastapi.staticfiles import StaticFiles
+from starlette.exceptions import HTTPException
+from starlette.middleware.gzip import GZipMiddleware
+
+from fdhil.arming.answers import refusal
+from fdhil.config import MachineConfig
+from fdhil.config.web import Web
+from fdhil.daemon.control import SOCKET_NAME
+from fdhil.errors import FdhilError
+from fdhil.web import pages
+from fdhil.web.access import Access
+from fdhil.web.answers import Fault, Refused, document_of, status_of
+from fdhil.web.context import Context, Entry
+from fdhil.web.daemon import Daemon
+from fdhil.web.gate import Gate
+
+SHELL = ("machine", "live", "rapids", "history", "program", "events", "panel")
+"""The first parts of the paths that the browser's router knows."""
+PACKED_FROM, PACKING = 4096, 4  # bytes, and how hard: a slow network gains, no token is in what is that long
+STATIC = Path(__file__).parent / "static"
+FAULTS: dict[int | str, dict[str, Any]] = {
+    status: {"model": Fault, "description": what}
+    for status, what in {
+        400: "not understood", 401: "no login", 403: "not allowed", 404: "not there", 405: "no such method",
+        408: "too slow", 409: "refused by the machine's state", 413: "too large",
+        421: "not the name of this server", 422: "a value is wrong", 429: "too many", 500: "a fault of fdhil",
+        503: "the daemon or the store is not there",
+        504: "the daemon is silent",
+    }.items()
+}  # fmt: skip
+
+
+def make_app(config: MachineConfig) -> FastAPI:
+    """Return the application of one machine. ConfigError where its users file is faulty."""
+    app = application(config.web, page_routers(), "index.html", SHELL)
+    app.state.context = Context(config, Daemon(config.run_directory / SOCKET_NAME), app.state.entry.access)
+    return app
+
+
+def application(web: Web, routers: Iterable[APIRouter], document: str, paths: Iterable[str]) -> FastAPI:
+    """Return an application behind the gate; ``document`` is what its ``paths`` show. ConfigError as above."""
+    access = Access(web.users_file)
+    app = FastAPI(title="fdhil", docs_url=None, redoc_url=None, openapi_url=None, redirect_slashes=False)
+    app.state.entry = Entry(web, access)
+    for router in routers:
+        app.include_router(router, responses=FAULTS)
+    app.add_api_route("/api/openapi.json", lambda: app.openapi(), include_in_schema=False)
+    _serve_shell(app, document, paths)
+    _answer_faults(app)
+    app.add_middleware(GZipMiddleware, minimum_size=PACKED_FROM, compresslevel=PACKING)
+    app.add_middleware(Gate, settings=web, access=access)
+    return app
+
+
+def page_routers() -> Iterator[APIRouter]:
+    """Yield the router of every page: each file of the folder is one."""
+    for found in pkgutil.iter_modules(pages.__path__):
+        router = getattr(import_module(f"{pages.__name__}.{found.name}"), "router", None)
+        if isinstance(router, APIRouter):
+            yield router
+
+
+def _serve_shell(app: FastAPI, document: str, paths: Iterable[str]) -> None:
+    """Serve the one document of all pages, its scripts, and the carried uPlot."""
+
+    def shell() -> Response:
+        return FileResponse(STATIC / document, media_type="text/html")
+
+    app.add_api_route("/", shell, include_in_schema=False, response_class=Response)
+    for name in paths:
+        for path in (f"/{name}", f"/{name}/{{rest:path}}"):
+            app.add_api_route(path, shell, include_in_schema=False, response_class=Response)
+    with as_file(files("fdhil.report") / "uplot") as uplot:
+        app.mount("/static/uplot", StaticFiles(directory=uplot))
+    app.mount("/static", StaticFiles(directory=STATIC))
+
+
+def _answer_faults(app: FastAPI) -> None:
+    """Answer every fault with one kind of document, and never with a traceback."""
+
+    @app.exception_handler(Refused)
+    def refused(_request: Request, error: Refused) -> JSONResponse:
+        return JSONResponse(error.document, error.status)
+
+    @app.exception_handler(FdhilError)
+    def failed(_request: Request, error: FdhilError) -> JSONResponse:
+        return JSONResponse(document_of(error), status_of(error))
+
+    @app.exception_handler(RequestValidationError)
+    def wrong(_request: Request, error: RequestValidationError) -> JSONResponse:
+        told = "; ".join(f"{'.'.join(map(str, fault['loc'][1:]))}: {fault['msg']}" for fault in error.errors()[:5])
+        return JSONResponse(refusal("BadRequest", told, "mend the values that are named"), 422)
+
+    @app.exception_handler(HTTPException)
+    def none_such(_request: Request, error: HTTPException) -> JSONResponse:
+        if isinstance(error.__cause__, Refused):  # a body that grew too large while it was read
+            return refused(_request, error.__cause__)
+        code = {404: "NotFound", 405: "NoSuchMethod"}.get(error.status_code, "BadRequest")
+        text = {404: "there is nothing at this address", 405: "this address does not take that method"}
+        told = refusal(code, text.get(error.status_code, str(error.detail)), "see /api/openapi.json")
+        return JSONResponse(told, error.status_code, headers=error.headers)
+
+    @app.exception_handler(Exception)
+    def broken(request: Request, error: Exception) -> JSONResponse:
+        logging.getLogger("fdhil.web").error("%s %s failed", request.method, request.url.path, exc_info=error)
+        text = "fdhil web met a fault of its own; the machine and the daemon are not touched by it"
+        return JSONResponse(refusal("InternalError", text, "report what its log says"), 500)

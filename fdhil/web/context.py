@@ -1,0 +1,68 @@
+"""What the routes need: the configuration, the daemon, the store, and who asks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from fastapi import Depends
+from starlette.requests import HTTPConnection
+
+from fdhil.config import MachineConfig
+from fdhil.config.web import Web
+from fdhil.store.history import History
+from fdhil.web.access import Access, Asker
+from fdhil.web.daemon import Daemon
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """One machine, as the pages see it."""
+
+    config: MachineConfig
+    daemon: Daemon
+    access: Access
+    checked: set[tuple[int, int]] = field(default_factory=set)
+    """Histories, by device and inode, that were found whole: to look at all of a large one takes a second."""
+
+    @contextmanager
+    def history(self) -> Iterator[History]:
+        """Open the history for reading (blocking: for routes that are plain functions). StoreError."""
+        with History.read(self.config.store.directory, checked=self.checked) as history:
+            yield history
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """Who may come in: the same for the pages of one machine and of many."""
+
+    web: Web
+    access: Access
+
+
+def _entry(connection: HTTPConnection) -> Entry:
+    entry = connection.app.state.entry
+    assert isinstance(entry, Entry)
+    return entry
+
+
+def _context(connection: HTTPConnection) -> Context:
+    context = connection.app.state.context
+    assert isinstance(context, Context)
+    return context
+
+
+def _asker(connection: HTTPConnection) -> Asker:
+    asker = connection.scope["fdhil.asker"]  # the gate has put it there
+    assert isinstance(asker, Asker)
+    return asker
+
+
+AtEntry = Annotated[Entry, Depends(_entry)]
+"""The parameter of a route that needs to know who may come in."""
+Here = Annotated[Context, Depends(_context)]
+"""The parameter of a route that needs the machine: ``def windows(here: Here) -> ...``."""
+Asking = Annotated[Asker, Depends(_asker)]
+"""The parameter of a route that needs to know who asks: a name and a role."""

@@ -1,0 +1,79 @@
+"""Asks the daemon over its socket, without blocking; who is not waited for any more takes the question back."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from fdhil.errors import ConnectError, DeviceTimeout
+
+ANSWER_S = 10.0
+FRESH_S = 0.5
+LONGEST_ANSWER = 16 * 1024 * 1024
+Progress = Callable[[Mapping[str, Any]], None]
+
+
+class Daemon:
+    """The daemon of one machine, as seen from a process of its own."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._status: tuple[float, asyncio.Task[dict[str, Any]]] | None = None
+
+    async def ask(
+        self, request: Mapping[str, Any], timeout_s: float = ANSWER_S, progress: Progress | None = None
+    ) -> dict[str, Any]:
+        """Send one request and return its answer. ConnectError when no daemon listens, DeviceTimeout when it is silent.
+
+        Cancelled it closes the connection, by which the daemon abandons what it was preparing.
+        """
+        asked = {**request, "progress": True} if progress else request
+        try:
+            async with asyncio.timeout(timeout_s):
+                reader, writer = await asyncio.open_unix_connection(self._path, limit=LONGEST_ANSWER)
+                try:
+                    writer.write(json.dumps(asked).encode() + b"\n")
+                    return await _answer(reader, progress)
+                finally:
+                    writer.close()
+        except TimeoutError:
+            text = f"did not answer within {timeout_s:.0f} s, what the machine does is unknown here; see its log"
+            raise DeviceTimeout("daemon", text) from None
+        except OSError as error:
+            reason = error.strerror or error
+            text = f"is not running or cannot be asked ({reason}); start it with fdhil run CONFIG"
+            raise ConnectError("daemon", text) from None
+
+    async def status(self) -> Mapping[str, Any]:
+        """Return the status document, at most half a second old: many browsers ask the daemon no more than one does.
+
+        Who comes while it is asked has the same answer, or the same failure: nobody waits in a line before silence.
+        """
+        now_s = time.monotonic()
+        if self._status is None or _stale(*self._status, now_s):
+            self._status = now_s, asyncio.create_task(self.ask({"request": "status"}), name="status of the daemon")
+        return await asyncio.shield(self._status[1])
+
+
+def _stale(asked_s: float, answer: asyncio.Task[dict[str, Any]], now_s: float) -> bool:
+    if not answer.done():
+        return False
+    return now_s - asked_s > FRESH_S or answer.cancelled() or answer.exception() is not None
+
+
+async def _answer(reader: asyncio.StreamReader, progress: Progress | None) -> dict[str, Any]:
+    try:
+        line = await reader.readline()
+        while progress and line.startswith(b'{"progress"'):
+            progress(json.loads(line)["progress"])
+            line = await reader.readline()
+        answer = json.loads(line) if line else None
+    except (ValueError, RecursionError, LookupError, TypeError):
+        answer = None
+    if not isinstance(answer, dict):
+        raise ConnectError("daemon", "closed the connection without an answer; see its log")
+    return answer

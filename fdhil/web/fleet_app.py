@@ -1,0 +1,101 @@
+"""The page of many machines: who they are, what is due, which axis is unlike its sisters, how each parameter moved.
+
+It reads the works' database by what it is given to ask with, and reaches no machine.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Depends, FastAPI, Query, Request
+
+from fdhil.config.web import Web
+from fdhil.records import PARAMETERS
+from fdhil.web.answers import Refused
+from fdhil.web.app import application
+from fdhil.web.pages import session
+
+router = APIRouter(prefix="/api/fleet")
+KEPT_S = 30.0  # an answer is as good for so long: a hundred browsers ask the database as one
+MOST_KEPT = 64
+MOST_SETS = 2000
+Ask = Callable[..., Mapping[str, Any]]
+Label = Annotated[str, Query(min_length=1, max_length=32)]
+Machine = Annotated[str, Query(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
+Axis = Annotated[str, Query(pattern=r"^[A-Z]$")]
+
+
+class Answers:
+    """Asks one question at a time, and keeps the newest answers for a while."""
+
+    def __init__(self, ask: Ask, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._ask, self._now_s = ask, now_s
+        self._kept: OrderedDict[tuple[object, ...], tuple[float, Mapping[str, Any]]] = OrderedDict()
+        self._one = threading.Lock()
+
+    def __call__(self, question: str, **given: str | None) -> Mapping[str, Any]:
+        """Return the answer of a question, as JSON has it. FdhilError."""
+        key = (question, *given.values())
+        with self._one:
+            at_s, answer = self._kept.pop(key, (-KEPT_S, {}))
+            if self._now_s() - at_s >= KEPT_S:
+                at_s, answer = self._now_s(), self._ask(question, **given)
+            self._kept[key] = at_s, answer
+            if len(self._kept) > MOST_KEPT:
+                self._kept.popitem(last=False)
+        return answer
+
+
+def _answers(request: Request) -> Answers:
+    answers = request.app.state.answers
+    assert isinstance(answers, Answers)
+    return answers
+
+
+Asked = Annotated[Answers, Depends(_answers)]
+
+
+def make_fleet_app(web: Web, ask: Ask) -> FastAPI:
+    """Return the application; ``ask(question, **given)`` answers. ConfigError where the users file is faulty."""
+    app = application(web, (session.router, router), "fleet.html", ("fleet",))
+    app.state.answers = Answers(ask)
+    return app
+
+
+@router.get("")
+def machines(asked: Asked) -> Mapping[str, Any]:
+    """Return all machines, and what is due."""
+    return asked("status")
+
+
+@router.get("/outliers")
+def outliers(asked: Asked, by: Label = "type") -> Mapping[str, Any]:
+    """Return the axes that are unlike their sisters: those of machines with the same label ``by``."""
+    return asked("outliers", by=by, axis=None)
+
+
+@router.get("/compare")
+def compare(
+    asked: Asked, parameter: Literal["R", "L", "K", "Jt", "ft", "Cd"], by: Label = "type", axis: Axis | None = None
+) -> Mapping[str, Any]:
+    """Return one parameter of all machines side by side."""
+    return asked("compare", parameter=parameter, by=by, axis=axis)
+
+
+@router.get("/services")
+def services(asked: Asked, machine: Machine | None = None) -> Mapping[str, Any]:
+    """Return the services, and what each changed."""
+    return asked("services", machine=machine)
+
+
+@router.get("/axis")
+def axis(asked: Asked, machine: Machine, axis: Axis) -> dict[str, Any]:
+    """Return how each parameter of an axis moved, its newest sets."""
+    courses = [asked("trend", machine=machine, axis=axis, parameter=name) for name in PARAMETERS]
+    if not courses[0]["sets"]:
+        raise Refused(404, "NoSuchAxis", f"no parameters of axis {axis} of {machine} were collected", "see /fleet")
+    return {"machine": machine, "axis": axis, "courses": [{**c, "sets": c["sets"][-MOST_SETS:]} for c in courses]}

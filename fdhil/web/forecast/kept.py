@@ -1,0 +1,94 @@
+"""A forecast as its process leaves it in a folder: what is told of the whole as JSON, and its rows as arrays."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fdhil.records import Correction, Float, Int
+
+DOCUMENT = "forecast.json"
+ADVICE = "advice.json"
+BEFORE, AFTER = 0, 1
+
+
+@dataclass(frozen=True, slots=True)
+class Forecast:
+    """The rows of a program, one a SYNC period: without its correction (``BEFORE``) and with it (``AFTER``).
+
+    ``path_mm`` (n, d) is what the NC will order, ``error_um`` (2, n, d) predicted less ordered of each axis,
+    ``contour_um`` (2, n) the contour error, ``line`` (n,) the program's line, 0 where there is none.
+    """
+
+    document: dict[str, Any]
+    path_mm: Float
+    error_um: Float
+    contour_um: Float
+    line: Int
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """The axes, in the order of the columns."""
+        return tuple(self.document["axes"])
+
+    @property
+    def dt_s(self) -> float:
+        """The time from one row to the next."""
+        return float(self.document["sync_period_s"])
+
+    def actual_mm(self, case: int, rows: slice) -> Float:
+        """Return where the table will be (m, d)."""
+        return np.asarray(self.path_mm[rows] + self.error_um[case, rows] * 1e-3)
+
+    def feed_mm_min(self, rows: slice) -> Float:
+        """Return the ordered speed along the path (m,), from each row to the next."""
+        first, last, _ = rows.indices(len(self.path_mm))
+        return np.asarray(np.linalg.norm(_steps(self.path_mm, first, last), axis=1) / self.dt_s * 60.0)
+
+    @staticmethod
+    def read(folder: Path) -> Forecast:
+        """Map what a process has left; OSError or ValueError where that is not whole."""
+        document = json.loads((folder / DOCUMENT).read_text("utf-8"))
+        arrays = (np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in _NAMES)
+        return Forecast(document, *arrays)
+
+
+_NAMES = ("path_mm", "error_um", "contour_um", "line")
+
+
+def _steps(path_mm: Float, first: int, last: int) -> Float:
+    """Return the way from each row to the next (last - first, d); the last row of all has none to go."""
+    part = path_mm[first : last + 1]
+    steps = np.diff(part, axis=0)
+    return steps if len(steps) == last - first else np.vstack([steps, np.zeros((1, part.shape[1]))])
+
+
+def write(folder: Path, document: dict[str, Any], planned: Correction) -> None:
+    """Leave a forecast in a folder, its document last; OSError."""
+    cases = (planned.before, planned.after)
+    reference = planned.before.reference
+    arrays = {
+        "path_mm": reference.path_mm,
+        "error_um": np.stack([[case.error_um[axis] for axis in reference.axes] for case in cases]).swapaxes(1, 2),
+        "contour_um": np.stack([case.contour_um for case in cases]),
+        "line": reference.line,
+    }
+    kinds = {"error_um": "<f4", "contour_um": "<f4", "line": "<i4", "path_mm": "<f8"}
+    for name, values in arrays.items():
+        np.save(folder / f"{name}.npy", np.ascontiguousarray(values, dtype=kinds[name]), allow_pickle=False)
+    (folder / DOCUMENT).write_text(json.dumps(document, allow_nan=False), "utf-8")
+
+
+def write_advice(folder: Path, tolerance_um: float, lines: list[dict[str, Any]]) -> None:
+    """Leave the feeds that keep a tolerance beside the forecast; OSError."""
+    (folder / ADVICE).write_text(json.dumps({"tolerance_um": tolerance_um, "lines": lines}, allow_nan=False), "utf-8")
+
+
+def read_advice(folder: Path) -> list[dict[str, Any]]:
+    """Return what was left; OSError or ValueError where that is not whole."""
+    lines: list[dict[str, Any]] = json.loads((folder / ADVICE).read_text("utf-8"))["lines"]
+    return lines

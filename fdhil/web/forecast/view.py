@@ -1,0 +1,222 @@
+"""What a browser draws of a forecast: the whole or a part of its path, by as few points as tell the same."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from fdhil.prediction.contour import WINDOW_S, nearest_points_mm
+from fdhil.records import Bool, Float, Int
+from fdhil.web.forecast.kept import AFTER, BEFORE, Forecast
+
+MOST_POINTS = 5000
+WHOLE_ROWS = 3000  # up to which every row is told, with where the table will be
+MOST_ROWS = 400_000  # that are looked at in one view
+STRETCH = 4096  # rows that are looked at as one
+FINE = 1 / 1500  # of the view: nobody sees less
+SHADE = 0.03  # of the scale of colours
+FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+SEEN = 0.15  # of the view that the largest error may take
+BESIDE = 0.1  # of the view, around it
+MOST_COURSE = 1500
+
+
+class Box(NamedTuple):
+    """A part of a plane, mm."""
+
+    left: float
+    right: float
+    bottom: float
+    top: float
+
+
+def plane_of(forecast: Forecast, asked: Sequence[str]) -> tuple[int, int]:
+    """Return the columns of a plane; ValueError where it is none of this machine's."""
+    across, along = (forecast.axes.index(axis) for axis in asked)
+    return across, along
+
+
+def view(forecast: Forecast, plane: tuple[int, int], box: Box | None, factor: float) -> dict[str, Any]:
+    """Return the path inside ``box`` (None: all of it) as runs of points, each with what follows it until the next.
+
+    A run's ``before_um`` and ``after_um`` are the largest contour errors of each piece. Where few rows are inside they
+    are all told, ``whole``, and with them where the table will be, its distance from the path ``factor`` times as far:
+    0 for as far as the view has room for.
+    """
+    flat = _flat(forecast, plane)
+    inside = _inside(flat, box)
+    count = int(inside.sum())
+    whole = count <= WHOLE_ROWS
+    step = 1 if whole else -(-count // MOST_ROWS)
+    size_mm = float(np.ptp(flat, axis=0).max()) if box is None else max(box.right - box.left, box.top - box.bottom)
+    factor = factor or _fitting(forecast, inside, size_mm)
+    runs = []
+    for first, last in _runs(inside):
+        rows = np.arange(first, last)[::step]
+        most = max(8, MOST_POINTS * rows.size * step // max(1, count))
+        points = rows if whole else rows[knots(_seen(forecast, flat, rows, size_mm), most)]
+        told = _run(forecast, flat, points, last)
+        if whole:
+            told |= {"table": [_table(forecast, plane, slice(first, last), case, factor) for case in (BEFORE, AFTER)]}
+        runs.append(told)
+    return {"rows": count, "whole": whole, "factor": factor, "runs": runs}
+
+
+def _fitting(forecast: Forecast, inside: Bool, size_mm: float) -> float:
+    """Return how many times as far the table may be drawn from the path, so that the largest error is seen."""
+    largest_mm = float(np.max(forecast.contour_um[BEFORE], where=inside, initial=0.0)) * 1e-3
+    return float(max(f for f in FACTORS if f == 1 or f * largest_mm <= SEEN * size_mm))
+
+
+def _flat(forecast: Forecast, plane: tuple[int, int]) -> Float:
+    """Return the path (n, 2) in a plane; where one axis is alone, along it."""
+    flat = np.asarray(forecast.path_mm[:, list(plane)], dtype=np.float64)
+    if plane[0] == plane[1]:
+        flat[:, 1] = 0.0
+    return flat
+
+
+def _inside(flat: Float, box: Box | None) -> Bool:
+    """Return the rows (n,) inside a box and a little around it."""
+    if box is None:
+        return np.ones(len(flat), dtype=np.bool_)
+    across, along = BESIDE * (box.right - box.left), BESIDE * (box.top - box.bottom)
+    low = np.array([box.left - across, box.bottom - along])
+    high = np.array([box.right + across, box.top + along])
+    inside = np.asarray(np.all((flat >= low) & (flat <= high), axis=1))
+    # a step that crosses the edge of the view is drawn to its other end
+    inside[:-1] |= inside[1:].copy()
+    inside[1:] |= inside[:-1].copy()
+    return inside
+
+
+def _runs(inside: Bool) -> list[tuple[int, int]]:
+    """Return first row and end of each run of rows that are inside."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8)))
+    return [(int(first), int(last)) for first, last in edges.reshape(-1, 2)]
+
+
+def _seen(forecast: Forecast, flat: Float, rows: Int, size_mm: float) -> Float:
+    """Return the rows (m, 4) as they are seen, place and both colours, in units of the least that anyone sees."""
+    scale = forecast.document["scale"]
+    least_um, largest_um = scale["least_um"], max(scale["largest_um"], 1e-6)
+    errors = np.asarray(forecast.contour_um[:, rows], dtype=np.float64)
+    if least_um is None:
+        shades = errors / largest_um
+    else:
+        decades = np.log10(max(largest_um / least_um, 10.0))
+        shades = np.log10(np.maximum(errors, least_um) / least_um) / decades
+    place = (flat[rows] - flat[rows[0]]) / max(size_mm * FINE, 1e-9)
+    return np.column_stack([place, shades.T / SHADE])
+
+
+def knots(seen: Float, most: int) -> Int:
+    """Return the rows (k,) at which a path (m, d) is cut into straight pieces that are off by less than 1 nowhere.
+
+    The path is taken over its way. The piece that is farthest off is cut first, so that ``most`` points are the best
+    that so few can tell [Douglas, Peucker 1973, with the way as the parameter].
+    """
+    end = len(seen) - 1
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(seen[:, :2], axis=0).T))])
+    kept = {0, end, *range(STRETCH, end, STRETCH)}
+    starts = sorted(kept)
+    waiting = [_worst(seen, way, first, last) for first, last in pairwise(starts)]
+    heapq.heapify(waiting)
+    while waiting and len(kept) < most:
+        off, first, at, last = heapq.heappop(waiting)
+        if -off < 1.0:
+            break
+        kept.add(at)
+        for begin, stop in ((first, at), (at, last)):
+            if stop - begin > 1:
+                heapq.heappush(waiting, _worst(seen, way, begin, stop))
+    return np.array(sorted(kept))
+
+
+def _worst(seen: Float, way: Float, first: int, last: int) -> tuple[float, int, int, int]:
+    """Return how far a piece is off at most, below 0 for a heap, its first row, where that is, and its last row."""
+    length = way[last] - way[first]
+    share = (way[first : last + 1] - way[first]) / length if length > 0 else np.linspace(0, 1, last - first + 1)
+    chord = seen[first] + share[:, None] * (seen[last] - seen[first])
+    off = np.abs(seen[first : last + 1] - chord).max(axis=1)
+    at = int(np.argmax(off))
+    return -float(off[at]), first, first + at, last
+
+
+def _run(forecast: Forecast, flat: Float, points: Int, last: int) -> dict[str, Any]:
+    """Return points of the path, with the largest errors and the largest feed until the next of them."""
+    first = int(points[0])
+    starts = points - first
+    before, after = (
+        np.maximum.reduceat(np.asarray(forecast.contour_um[case, first:last]), starts) for case in (BEFORE, AFTER)
+    )
+    feed = np.maximum.reduceat(forecast.feed_mm_min(slice(first, last)), starts)
+    return {
+        "row": points.tolist(),
+        "line": forecast.line[points].tolist(),
+        "x_mm": rounded(flat[points, 0], 5),
+        "y_mm": rounded(flat[points, 1], 5),
+        "before_um": rounded(before, 3),
+        "after_um": rounded(after, 3),
+        "feed_mm_min": rounded(feed, 0),
+    }
+
+
+def _table(
+    forecast: Forecast, plane: tuple[int, int], rows: slice, case: int, factor: float
+) -> Mapping[str, list[float]]:
+    """Return where the table will be, its distance from the path enlarged."""
+    margin = round(WINDOW_S / forecast.dt_s)
+    around = slice(max(0, rows.start - margin), rows.stop + margin)
+    actual = forecast.actual_mm(case, rows)
+    path = np.asarray(forecast.path_mm[around])
+    nearest = nearest_points_mm(path, actual, forecast.dt_s, rows.start - around.start)
+    drawn = (nearest + factor * (actual - nearest))[:, list(plane)]
+    if plane[0] == plane[1]:
+        drawn[:, 1] = 0.0
+    return {"x_mm": rounded(drawn[:, 0], 6), "y_mm": rounded(drawn[:, 1], 6)}
+
+
+def course(forecast: Forecast, first: int, last: int) -> dict[str, Any]:
+    """Return the contour errors and the feed over time, the largest of each of at most ``MOST_COURSE`` stretches."""
+    starts = np.arange(0, last - first, max(1, -(-(last - first) // MOST_COURSE)))
+    before, after = (
+        np.maximum.reduceat(np.asarray(forecast.contour_um[case, first:last]), starts) for case in (BEFORE, AFTER)
+    )
+    return {
+        "time_s": rounded((first + starts) * forecast.dt_s, 4),
+        "before_um": rounded(before, 3),
+        "after_um": rounded(after, 3),
+        "feed_mm_min": rounded(np.maximum.reduceat(forecast.feed_mm_min(slice(first, last)), starts), 0),
+    }
+
+
+def line_place(forecast: Forecast, line: int) -> dict[str, Any] | None:
+    """Return where a line of the program has its largest error, and how far it goes; None where it orders nothing."""
+    rows = np.flatnonzero(np.asarray(forecast.line) == line)
+    if rows.size == 0:
+        return None
+    row = int(rows[np.argmax(forecast.contour_um[BEFORE][rows])])
+    path = np.asarray(forecast.path_mm[rows])
+    return {
+        "line": line,
+        "row": row,
+        "start_s": round(float(rows[0] * forecast.dt_s), 6),
+        "end_s": round(float((rows[-1] + 1) * forecast.dt_s), 6),
+        "at_mm": rounded(forecast.path_mm[row], 6),
+        "low_mm": rounded(path.min(axis=0), 6),
+        "high_mm": rounded(path.max(axis=0), 6),
+        "before_um": round(float(forecast.contour_um[BEFORE][row]), 3),
+        "after_um": round(float(forecast.contour_um[AFTER][row]), 3),
+        "feed_mm_min": round(float(forecast.feed_mm_min(slice(row, row + 1))[0]), 0),
+    }
+
+
+def rounded(values: npt.ArrayLike, decimals: int) -> list[float]:
+    """Return values as JSON has them, no longer than they are worth."""
+    return [float(value) for value in (np.round(np.asarray(values, dtype=np.float64), decimals) + 0.0).tolist()]

@@ -1,0 +1,199 @@
+"""The gate before every route: host, origin, size, login and role are checked before a byte of a body is read.
+
+One rule for all routes, so that no page can forget it: what is under /api needs the role ``watch`` to be read, and
+``operate`` to be changed. To disarm, a login is enough: standing still is never refused to one who may look. The
+shell, its scripts and the login are open; they tell nothing of the machine.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Mapping
+from typing import Any
+from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from fdhil.config.web import Web
+from fdhil.web.access import Access, Asker
+from fdhil.web.answers import Refused
+
+API = "/api/"
+SESSION = "/api/session"
+DISARM = "/api/machine/disarm"
+COMPUTES_ONLY = "/api/program"
+"""A program is judged for who may read: nothing of the machine is touched."""
+READING = ("GET", "HEAD", "OPTIONS")
+LARGEST_BODY = 64 * 1024
+LARGEST_PROGRAM = 16 * 1024 * 1024
+BODY_S, PROGRAM_S = 20.0, 300.0
+"""For how long a body may take to come: who sends it a byte at a time holds no connection."""
+BEARER = "bearer."
+"""A browser's socket has no header for its token: it comes as a subprotocol, ["fdhil", "bearer.TOKEN"]."""
+HEADERS: Mapping[str, str] = {
+    "content-security-policy": (
+        "default-src 'self'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'; object-src 'none'"
+    ),
+    "x-content-type-options": "nosniff",
+    "x-frame-options": "DENY",
+    "referrer-policy": "no-referrer",
+    "cross-origin-resource-policy": "same-origin",
+    "cross-origin-opener-policy": "same-origin",
+    "permissions-policy": "camera=(), geolocation=(), microphone=()",
+}
+
+
+class Gate:
+    """Lets through what may pass, and answers the rest itself."""
+
+    def __init__(self, app: ASGIApp, settings: Web, access: Access) -> None:
+        self._app, self._access, self._settings = app, access, settings
+        self._hosts = {"localhost", "127.0.0.1", "[::1]", *map(str.lower, settings.allowed_hosts)}
+        if settings.host not in ("0.0.0.0", "::"):
+            self._hosts.add(f"[{settings.host}]" if ":" in settings.host else settings.host.lower())
+        self._origins = {origin.rstrip("/").lower() for origin in settings.allowed_origins}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Check a request or a socket, then hand it on."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        try:
+            self._check_place(scope, headers)
+            asker = self._check_asker(scope, headers)
+            most, within_s = (LARGEST_PROGRAM, PROGRAM_S) if _computes(scope["path"]) else (LARGEST_BODY, BODY_S)
+            _check_length(headers, most)
+        except Refused as refused:
+            await _refuse(scope, send, refused)
+            return
+        scope["fdhil.asker"] = asker
+        if scope["type"] == "websocket":
+            await self._app(scope, receive, send)
+        else:
+            await self._app(scope, _bounded(receive, most, within_s), _with_headers(scope, send))
+
+    def _check_place(self, scope: Scope, headers: Headers) -> None:
+        """Refuse a name that is not ours (DNS rebinding) and a page that is not ours (forged requests)."""
+        host = headers.get("host", "").lower()
+        if _name(host) not in self._hosts or len(headers.getlist("host")) != 1:
+            text = "this is not the name of this server"
+            raise Refused(421, "BadHost", text, "use the address fdhil web told, or add the name to web.allowed_hosts")
+        origin = headers.get("origin")
+        own = f"{'https' if scope['scheme'] in ('https', 'wss') else 'http'}://{host}"
+        foreign = origin is not None and origin.lower() not in (own, *self._origins)
+        site = headers.get("sec-fetch-site", "none")
+        if origin is None and scope["path"].startswith(API):
+            foreign = site not in ("none", "same-origin")
+        if foreign:
+            text = "the request comes from a page of another server, nothing was done"
+            raise Refused(403, "BadOrigin", text, "open fdhil's own page, or add the page to web.allowed_origins")
+
+    def _check_asker(self, scope: Scope, headers: Headers) -> Asker:
+        path, token = scope["path"], token_of(headers)
+        asker = self._access.asker(token)
+        writes = scope["type"] == "http" and scope["method"] not in READING
+        if writes and headers.get("x-fdhil") != "1":
+            raise Refused(403, "BadOrigin", "the header X-Fdhil is missing, nothing was done", "send X-Fdhil: 1")
+        if not path.startswith(API) or path == SESSION:
+            return asker or Asker("", "watch")
+        if asker is None:
+            text = "this needs a login, and there is none or it has ended; nothing was done"
+            raise Refused(401, "AuthRequired", text, "log in again")
+        if writes and not _computes(path):
+            self._check_acting(path, asker)
+        return asker
+
+    def _check_acting(self, path: str, asker: Asker) -> None:
+        if not self._access.by_login:
+            text = "nobody may act in this browser: there are no users; nothing was done"
+            raise Refused(401, "AuthRequired", text, "set web.users_file and make a user with fdhil web-user")
+        if path == DISARM:
+            return
+        if asker.role != "operate":
+            text = f"{asker.name} has the role {asker.role}, nothing was done"
+            raise Refused(403, "RoleRequired", text, "have someone with the role operate do it")
+        if not self._settings.acting:
+            text = "nothing but to disarm may be done in a browser here, nothing was done"
+            raise Refused(403, "ActingOff", text, "use the command line, or set web.acting = true")
+
+
+def _computes(path: str) -> bool:
+    return path == COMPUTES_ONLY or path.startswith(f"{COMPUTES_ONLY}/")
+
+
+def token_of(headers: Headers) -> str | None:
+    """Return the token of a request: a header, or of a browser's socket a subprotocol."""
+    kind, _, token = headers.get("authorization", "").partition(" ")
+    if kind.lower() == "bearer":
+        return token.strip() or None
+    offered = [part.strip() for part in headers.get("sec-websocket-protocol", "").split(",")]
+    return next((part.removeprefix(BEARER) for part in offered if part.startswith(BEARER)), None)
+
+
+def _name(host: str) -> str:
+    """Return a host without its port; empty where it is none."""
+    try:
+        parts = urlsplit(f"//{host}")
+        name, _ = parts.hostname or "", parts.port
+    except ValueError:
+        return ""
+    if parts.username is not None or parts.path or parts.query or parts.fragment:
+        return ""
+    return f"[{name}]" if ":" in name else name
+
+
+def _check_length(headers: Headers, most: int) -> None:
+    length = headers.get("content-length", "0")
+    if not length.isdecimal() or int(length[:20]) > most:
+        raise Refused(413, "TooLarge", f"more than {most >> 10} KiB were sent, they were not read", "send less")
+
+
+def _bounded(receive: Receive, most: int, within_s: float) -> Receive:
+    """Return a ``receive`` that ends a body which is longer than it may be, also one that told no length, or slower."""
+    taken = 0
+    until_s: float | None = asyncio.get_running_loop().time() + within_s
+
+    async def bounded() -> Message:
+        nonlocal taken, until_s
+        try:
+            async with asyncio.timeout_at(until_s):
+                message = await receive()
+        except TimeoutError:
+            raise Refused(408, "TooSlow", "what was sent did not end, nothing was done", "send it again") from None
+        if not message.get("more_body", False):
+            until_s = None  # what comes now is that the browser leaves
+        taken += len(message.get("body", b""))
+        if taken > most:
+            raise Refused(413, "TooLarge", f"more than {most >> 10} KiB were sent, nothing was done", "send less")
+        return message
+
+    return bounded
+
+
+def _with_headers(scope: Scope, send: Send) -> Send:
+    kept = "no-store" if scope["path"].startswith(API) else "no-cache"
+
+    async def sending(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            more = {**HEADERS, "cache-control": kept}
+            message["headers"] = [*message["headers"], *((k.encode(), v.encode()) for k, v in more.items())]
+        await send(message)
+
+    return sending
+
+
+async def _refuse(scope: Scope, send: Send, refused: Refused) -> None:
+    if scope["type"] == "websocket":
+        await send({"type": "websocket.close", "code": 1008, "reason": refused.document["code"]})
+        return
+    body = json.dumps(refused.document).encode()
+    more = {"content-type": "application/json", "content-length": str(len(body)), "connection": "close"}
+    if refused.status == 401:
+        more["www-authenticate"] = "Bearer"
+    start: dict[str, Any] = {"type": "http.response.start", "status": refused.status}
+    sending = _with_headers(scope, send)
+    await sending({**start, "headers": [(k.encode(), v.encode()) for k, v in more.items()]})
+    await sending({"type": "http.response.body", "body": b"" if scope["method"] == "HEAD" else body})

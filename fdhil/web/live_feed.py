@@ -1,0 +1,155 @@
+"""Reads the daemon's stream of samples for all browsers together, while at least one looks on.
+
+The daemon is asked once, however many look. What it tells is kept in a ring for each axis; a daemon that went away is
+asked again, and the hole stays one. The ticks of two buses need not agree, and begin anew with the daemon: each axis'
+are laid on one count of this process by when its first block came, and stay on it as long as they rise.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fdhil.daemon.live import SIGNALS, unpacked
+from fdhil.errors import ConnectError
+from fdhil.web.live_ring import Ring
+
+KEPT_S = 300.0
+SILENT_S = 5.0
+RETRY_S = 1.0
+LINGER_S = 60.0  # a browser that comes back within it finds what it missed
+SAME_COUNT_S = 1.0
+LONGEST_LINE = 16 * 1024 * 1024
+NONSENSE = (ValueError, LookupError, TypeError, ArithmeticError, RecursionError)
+
+
+class LiveFeed:
+    """The newest samples of one machine. ``trouble`` says why none come, empty while they do."""
+
+    def __init__(self, path: Path, axes: Mapping[str, Any], period_s: float) -> None:
+        self._path = path
+        self.period_s = period_s
+        self.rings = {axis: Ring(round(KEPT_S / period_s)) for axis in axes}
+        self.trouble = "the daemon is being asked"
+        self.skipped_lines = 0
+        self._bases: dict[str, int] = {}
+        self._line: tuple[float, float] | None = None
+        self.viewers = 0
+        self._wanted = asyncio.Event()
+
+    @asynccontextmanager
+    async def watched(self) -> AsyncIterator[None]:
+        """Have the daemon asked while the block is open, and a minute longer."""
+        self.viewers += 1
+        self._wanted.set()
+        try:
+            yield
+        finally:
+            self.viewers -= 1
+
+    async def run(self) -> None:
+        """Serve for ever: connect while somebody looks on, and again when the daemon went away."""
+        while True:
+            await self._wanted.wait()
+            try:
+                await self._read()
+                self._wanted.clear()
+                self.trouble = "the daemon is being asked"
+            except (OSError, TimeoutError, ConnectError, *NONSENSE) as error:
+                self.trouble = _cause(error)
+                await asyncio.sleep(RETRY_S)
+                if not self.viewers:
+                    self._wanted.clear()
+
+    async def _read(self) -> None:
+        """Read until nobody has looked on for a minute; OSError and the like when the daemon does not tell."""
+        reader, writer = await asyncio.open_unix_connection(str(self._path), limit=LONGEST_LINE)
+        try:
+            writer.write(b'{"request": "live"}\n')
+            answer = await _line_of(reader)
+            if answer.get("ok") is not True:
+                raise ConnectError("daemon", f"{answer.get('text')}; {answer.get('advice')}")
+            self._bases.clear()
+            self.trouble = ""
+            seen_s = time.monotonic()
+            while time.monotonic() - seen_s < LINGER_S:
+                if self.viewers:
+                    seen_s = time.monotonic()
+                self.take(await _line_of(reader))
+        finally:
+            writer.close()
+
+    def take(self, line: Mapping[str, Any]) -> None:
+        """Take in one line of the daemon; one of ``NONSENSE`` for what is none."""
+        take: Callable[[Mapping[str, Any]], None] | None = {
+            "samples": self._samples,
+            "voltage": self._voltage,
+            "times": self._times,
+            "temperature": lambda told: self.rings[told["axis"]].warm(float(told["celsius"])),
+            "skipped": self._skip,
+        }.get(line.get("live", ""))
+        if take is not None and line.get("axis", next(iter(self.rings))) in self.rings:
+            take(line)
+
+    def _samples(self, line: Mapping[str, Any]) -> None:
+        values = unpacked(line["values"], "<f4").reshape(len(SIGNALS), -1)
+        after = unpacked(line["ticks"], "<i4") if "ticks" in line else np.arange(values.shape[1])
+        axis, first = line["axis"], int(line["tick"])
+        base = self._bases.get(axis)
+        if base is None or first + base < self.rings[axis].end:
+            base = self._bases[axis] = self._base(axis, first)
+        self.rings[axis].put(after.astype(np.int64) + first + base, values)
+
+    def _base(self, axis: str, first: int) -> int:
+        """Return what lays an axis' ticks on this process' count: that of another axis where both count alike."""
+        end = self.rings[axis].end
+        for other, base in self._bases.items():
+            apart = abs(first + base - self.rings[other].end) * self.period_s
+            if other != axis and first + base >= end and apart < SAME_COUNT_S:
+                return base
+        return max(end, int(time.monotonic() / self.period_s)) - first
+
+    def _times(self, line: Mapping[str, Any]) -> None:
+        (first, last), (first_ns, last_ns) = line["tick"], line["t_ns"]
+        slope = (last - first) / (last_ns - first_ns) if last_ns > first_ns else 1e-9 / self.period_s
+        self._line = (first - slope * first_ns, slope)
+
+    def _voltage(self, line: Mapping[str, Any]) -> None:
+        """Lay a sensor's samples on the ticks in which its clock says they were taken: to look at, no closer."""
+        base = self._bases.get(line["axis"])
+        if self._line is None or base is None:
+            return
+        begin, slope = self._line
+        ticks = np.floor(begin + slope * unpacked(line["t_ns"], "<i8")).astype(np.int64) + base
+        self.rings[line["axis"]].put_voltage(ticks, unpacked(line["values"], "<f4"))
+
+    def _skip(self, line: Mapping[str, Any]) -> None:
+        self.skipped_lines += int(line["lines"])
+
+
+async def _line_of(reader: asyncio.StreamReader) -> dict[str, Any]:
+    async with asyncio.timeout(SILENT_S):
+        line = await reader.readline()
+    if not line:
+        raise ConnectError("daemon", "closed the connection; see its log")
+    told = json.loads(line)
+    if not isinstance(told, dict):
+        raise ConnectError("daemon", "told no line of a daemon; see what listens at its socket")
+    return told
+
+
+def _cause(error: Exception) -> str:
+    if isinstance(error, ConnectError):
+        return str(error)
+    if isinstance(error, TimeoutError):
+        return f"the daemon has said nothing for {SILENT_S:.0f} s; see its log"
+    if isinstance(error, OSError):
+        return "the daemon is not running or may not be asked; start it with fdhil run CONFIG"
+    return "the daemon told what is not understood here; use one version of fdhil for both"

@@ -1,0 +1,94 @@
+"""Keeps the newest samples of one axis, and draws them together where there are more than a screen has columns.
+
+Pure: nothing here knows a clock or a socket. Rows are placed by their tick; one that is missing stays NaN.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fdhil.daemon.live import SIGNALS
+
+Rows = NDArray[np.float32]
+UNITS = {
+    "voltage_v": "V",
+    "current_a": "A",
+    "speed_rad_s": "rad/s",
+    "following_error_um": "µm",
+    "offset_um": "µm",
+    "temperature_c": "°C",
+}
+DRAWN = (*SIGNALS, "temperature_c")
+VOLTAGE, TEMPERATURE = DRAWN.index("voltage_v"), DRAWN.index("temperature_c")
+
+
+@dataclass(frozen=True, slots=True)
+class Envelope:
+    """The least and the greatest of every signal in each column, (signals, columns), NaN where no sample came.
+
+    Column j covers ``per_column`` ticks from ``first_tick`` + j ``per_column`` on.
+    """
+
+    first_tick: int
+    per_column: int
+    low: Rows
+    high: Rows
+
+
+class Ring:
+    """The newest ``capacity`` rows of one axis: those of the ticks from ``begin`` to before ``end``."""
+
+    def __init__(self, capacity: int) -> None:
+        self._values: Rows | None = None  # memory is taken when there is something to keep
+        self._celsius = np.nan
+        self._first = 0
+        self.capacity = capacity
+        self.end = 0
+
+    @property
+    def begin(self) -> int:
+        """The oldest tick that is kept; ``end`` while there is none."""
+        return max(self._first, self.end - self.capacity)
+
+    def put(self, ticks: NDArray[np.int64], values: NDArray[Any]) -> None:
+        """Take rows in: ``ticks`` (n,) that rise, behind all before them, and the daemon's signals (5, n)."""
+        if self._values is None:
+            self._values = np.full((len(DRAWN), self.capacity), np.nan, np.float32)
+            self._first = self.end = int(ticks[0])
+        if ticks[0] < self.end:
+            return
+        before, self.end = self.end, int(ticks[-1]) + 1
+        self._values[:, np.arange(max(before, self.begin), self.end) % self.capacity] = np.nan
+        keep = ticks >= self.begin
+        places = ticks[keep] % self.capacity
+        self._values[: len(SIGNALS), places] = values[:, keep]
+        self._values[TEMPERATURE, places] = self._celsius
+
+    def put_voltage(self, ticks: NDArray[np.int64], values: NDArray[Any]) -> None:
+        """Lay the voltage (n,) of a sensor of its own on the rows at ``ticks`` (n,) that are there."""
+        if self._values is not None:
+            held = (ticks >= self.begin) & (ticks < self.end)
+            self._values[VOLTAGE, ticks[held] % self.capacity] = values[held]
+
+    def warm(self, celsius: float) -> None:
+        """Take a temperature in: it holds from here on."""
+        self._celsius = celsius
+
+    def rows(self, first: int, end: int) -> Rows:
+        """Return the rows (signals, n) of the ticks from ``first`` to before ``end``, NaN where none is kept."""
+        values = np.full((len(DRAWN), end - first), np.nan, np.float32)
+        held = np.arange(max(first, self.begin), min(end, self.end))
+        if self._values is not None and held.size:
+            values[:, held[0] - first : held[-1] + 1 - first] = self._values[:, held % self.capacity]
+        return values
+
+    def envelope(self, first: int, end: int, per_column: int) -> Envelope:
+        """Return the columns that lie between two ticks, whole ones: the first begins at a multiple of their width."""
+        start = -(-first // per_column) * per_column
+        columns = max(0, (end - start) // per_column)
+        rows = self.rows(start, start + columns * per_column).reshape(len(DRAWN), columns, per_column)
+        return Envelope(start, per_column, np.fmin.reduce(rows, axis=2), np.fmax.reduce(rows, axis=2))

@@ -1,0 +1,86 @@
+"""What one browser has yet to be told of the rings: whole columns, fewer and wider ones when it cannot keep up.
+
+Pure. A browser says which message it has drawn. While two are on their way nothing is sent; what came meanwhile is told
+at once in columns that are twice, four times ... as wide, and what is older than the view is skipped and counted.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from fdhil.web.live_ring import Envelope, Ring
+
+MOST_UNSEEN = 2
+BURST_S = 0.5  # what one message tells in full
+
+
+class View:
+    """The pictures of one browser: ``axes`` over the newest ``seconds`` in so many ``columns``."""
+
+    def __init__(self, axes: Sequence[str], seconds: float, columns: int, period_s: float) -> None:
+        self._axes = axes
+        self._ticks = round(seconds / period_s)
+        self._burst = max(1, round(BURST_S / period_s))
+        self.per_column = max(1, self._ticks // columns)
+        self._next: dict[str, int] = {}
+        self._number = self._seen = 0
+
+    def may_send(self) -> bool:
+        """Whether the browser has drawn enough of what it was sent."""
+        return self._number - self._seen < MOST_UNSEEN
+
+    def drawn(self, number: int) -> None:
+        """The browser has drawn message ``number``."""
+        self._seen = max(self._seen, min(number, self._number))
+
+    def has_news(self, rings: Mapping[str, Ring]) -> bool:
+        """Whether a column of any axis is complete."""
+        return any(rings[axis].end - self._next.get(axis, rings[axis].begin) >= self.per_column for axis in self._axes)
+
+    def message(self, rings: Mapping[str, Ring], told: Mapping[str, Any]) -> bytes:
+        """Return what is new as one message: a length (uint32), a JSON header, and float32 numbers behind it.
+
+        The header lists the parts; each has (signals, columns) least values, then as many greatest.
+        """
+        self._number += 1
+        parts = [(axis, *self._part(axis, rings[axis])) for axis in self._axes]
+        listed = [
+            {
+                "axis": axis,
+                "first_tick": part.first_tick,
+                "per_column": part.per_column,
+                "columns": part.low.shape[1],
+                "signals": part.low.shape[0],
+                "skipped_ticks": skipped,
+            }
+            for axis, part, skipped in parts
+            if part.low.shape[1]
+        ]
+        header = json.dumps({**told, "number": self._number, "parts": listed}).encode()
+        header += b" " * (-len(header) % 4)
+        numbers = [values.tobytes() for _, part, _ in parts for values in (part.low, part.high)]
+        return b"".join([len(header).to_bytes(4, "little"), header, *numbers])
+
+    def _part(self, axis: str, ring: Ring) -> tuple[Envelope, int]:
+        """Return what is new of an axis, and how many ticks were skipped before it."""
+        oldest = max(ring.begin, ring.end - self._ticks)
+        first = self._next.get(axis, oldest)
+        skipped = max(0, oldest - first)
+        width = self.per_column
+        while axis in self._next and ring.end - max(first, oldest) > self._burst * (width // self.per_column):
+            width *= 2
+        begin = max(first, oldest)
+        part = ring.envelope(begin // width * width if axis in self._next else begin, ring.end, width)
+        if part.low.shape[1]:
+            self._next[axis] = part.first_tick + part.low.shape[1] * width
+        return part, skipped if part.low.shape[1] else 0
+
+
+def finite(values: np.ndarray[Any, Any]) -> list[float | None]:
+    """Return numbers for JSON: None where there is none."""
+    return [round(value, 4) if math.isfinite(value) else None for value in values.tolist()]

@@ -1,0 +1,174 @@
+"""Acting: what arming would move is told first, and only what was told is armed. To disarm asks nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Query, Request
+from pydantic import BaseModel, Field
+
+from fdhil import tables
+from fdhil.arming.token import TOKEN_NAME, given_credential, read_token
+from fdhil.config import MachineConfig
+from fdhil.web.answers import Refused, granted
+from fdhil.web.context import Asking, Context, Here
+from fdhil.web.programs import NAME, Program, listed, look_at
+
+router = APIRouter(prefix="/api/machine")
+DISARM_S = 15.0  # the daemon waits for the guard's answer and for the ramp
+ARM_S = 600.0
+LOOK_S = 0.5  # whether the browser that asked is still there
+PLAN_ID = r"^[0-9a-f]{64}$"
+
+ProgramName = Annotated[str, Field(pattern=NAME)]
+Method = Literal["inverse", "mirror", "flatness"]
+
+
+class Choice(BaseModel):
+    """What may be armed from here: the programs of the folder that the configuration names, and the methods."""
+
+    ok: Literal[True] = True
+    programs: list[Program]
+    methods: list[str]
+    feedforward: bool
+
+
+class AxisReach(BaseModel):
+    """How far the guard lets a correction go on an axis; null where it sends nothing of that kind."""
+
+    max_offset_um: float | None
+    max_speed_mm_s: float | None
+    max_acceleration_mm_s2: float | None
+    max_torque_nm: float | None
+    max_speed_rad_s: float | None
+
+
+class Plan(BaseModel):
+    """What would be armed and what that may move; ``confirm`` goes back with the request, so that nothing else is."""
+
+    ok: Literal[True] = True
+    program: Program | None
+    method: Method
+    axes: Mapping[str, AxisReach]
+    state: str
+    confirm: str
+
+
+class Arming(BaseModel):
+    """The request to arm what a plan told."""
+
+    program: ProgramName | None = None
+    method: Method = "inverse"
+    whole: bool = False
+    confirm: Annotated[str, Field(pattern=PLAN_ID)]
+
+
+class Done(BaseModel):
+    """What was done, in the daemon's words."""
+
+    ok: Literal[True] = True
+    text: str
+    state: str
+
+
+@router.get("/programs")
+def programs(here: Here) -> Choice:
+    """Tell what may be armed from here."""
+    folder = here.config.web.programs_directory
+    feeds = any(axis.feedforward is not None for axis in here.config.axis.values())
+    return Choice(programs=listed(folder) if folder else [], methods=list(tables.CORRECTIONS), feedforward=feeds)
+
+
+@router.get("/plan")
+async def plan(
+    here: Here, program: Annotated[ProgramName | None, Query()] = None, method: Annotated[Method, Query()] = "inverse"
+) -> Plan:
+    """Tell what arming would move. Nothing is done yet."""
+    found = await asyncio.to_thread(_plan, here.config, program, method)
+    status = await here.daemon.status()
+    return found.model_copy(update={"state": str(status["state"])})
+
+
+def _plan(config: MachineConfig, name: str | None, method: Method) -> Plan:
+    if name is None and method != "flatness":
+        raise Refused(422, "BadRequest", f"the method {method} corrects a program, and none is named", "choose one")
+    program = look_at(config.web.programs_directory, name) if name is not None else None
+    axes = _reaches(config, feeds=program is None)
+    if not axes:
+        text = "the configuration lets nothing be sent to any axis"
+        raise Refused(409, "WritingOff", text, "see how a correction is commissioned in docs/how-to/commission.md")
+    told = [program and program.sha256, method, {axis: reach.model_dump() for axis, reach in axes.items()}]
+    confirm = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+    return Plan(program=program, method=method, axes=axes, state="", confirm=confirm)
+
+
+def _reaches(config: MachineConfig, feeds: bool) -> dict[str, AxisReach]:
+    """Return the limits of the axes that are sent to: position offsets, or with ``feeds`` speed and torque."""
+    found = {}
+    for name, axis in config.axis.items():
+        offset, feed = axis.correction, axis.feedforward if feeds else None
+        if offset is not None and (feed is not None or not feeds):
+            found[name] = AxisReach(
+                max_offset_um=None if feeds else offset.max_offset_um,
+                max_speed_mm_s=None if feeds else offset.max_speed_mm_s,
+                max_acceleration_mm_s2=None if feeds else offset.max_acceleration_mm_s2,
+                max_torque_nm=feed and feed.max_torque_nm,
+                max_speed_rad_s=feed and feed.max_speed_rad_s,
+            )
+    return found
+
+
+@router.post("/arm")
+async def arm(arming: Arming, request: Request, here: Here, asking: Asking) -> Done:
+    """Arm what was confirmed; a browser that goes away while a program is checked has nothing armed.
+
+    What the daemon then says it has armed is compared with what was shown, and disarmed where it differs.
+    """
+    shown = await asyncio.to_thread(_plan, here.config, arming.program, arming.method)
+    if shown.confirm != arming.confirm:
+        text = "the program or the limits are not those that were shown; nothing is armed"
+        raise Refused(409, "PlanChanged", text, "look at what is shown now, and confirm again")
+    asked = {
+        "request": "arm",
+        "program": shown.program and shown.program.path,
+        "program_digest": shown.program and shown.program.sha256,
+        "method": arming.method,
+        "whole": arming.whole,
+        "token": await asyncio.to_thread(_operators_token, here.config),
+        "by": asking.name,
+    }
+    answer = granted(await _while_there(request, here, asked))
+    if shown.program is not None and answer.get("program_digest") != shown.program.sha256:
+        await here.daemon.ask({"request": "disarm", "by": asking.name}, DISARM_S)
+        text = "the program was changed while it was armed; it is disarmed again"
+        raise Refused(409, "PlanChanged", text, "look at what is shown now, and confirm again")
+    return Done(text=str(answer["text"]), state=str(answer.get("state", "ARMED")))
+
+
+async def _while_there(request: Request, here: Context, asked: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Ask the daemon as long as the browser waits for it; by its progress the daemon notices that nobody does."""
+    asking = asyncio.ensure_future(here.daemon.ask(asked, ARM_S, progress=lambda _: None))
+    try:
+        while not (await asyncio.wait([asking], timeout=LOOK_S))[0]:
+            if await request.is_disconnected():
+                raise Refused(409, "Abandoned", "nobody waited for the answer, nothing is armed", "arm again")
+        return await asking
+    finally:
+        asking.cancel()
+
+
+def _operators_token(config: MachineConfig) -> str:
+    """Return what arming needs besides the role: given by systemd, or read as the daemon's own user. DeviceError."""
+    given = given_credential(TOKEN_NAME)
+    return read_token(given.parent if given else config.run_directory)
+
+
+@router.post("/disarm")
+async def disarm(here: Here, asking: Asking) -> Done:
+    """Ramp the correction to zero and wait until zero is read back; what is being checked is not armed."""
+    answer = granted(await here.daemon.ask({"request": "disarm", "by": asking.name}, DISARM_S))
+    return Done(text=str(answer["text"]), state=str(answer.get("state", "OFF")))

@@ -1,0 +1,80 @@
+"""Alarms with cause, effect and next action, who acknowledged them, and the black boxes."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Query
+from fastapi.responses import Response
+from pydantic import BaseModel, Field
+
+from fdhil.daemon.notice_book import MOST_NOTE
+from fdhil.drivers.cia402.candump_samples import LARGEST_LOG
+from fdhil.store.history import RECENT_NOTICES
+from fdhil.web.answers import granted
+from fdhil.web.context import Asking, Here
+from fdhil.web.pages.black_boxes import BlackBox, Envelope, envelope, listed, opened
+from fdhil.web.pages.event_list import MOST_PAGE, Events, Severity, page
+
+router = APIRouter(prefix="/api/events")
+LARGEST_NUMBER = 2**53 - 1
+Number = Annotated[int, Field(ge=1, le=LARGEST_NUMBER)]
+
+
+class Acknowledgement(BaseModel):
+    """Which notices somebody has seen: by their numbers, or all that wait up to one."""
+
+    notices: Annotated[list[Number], Field(max_length=1000)] | None = None
+    up_to: Number | None = None
+    note: Annotated[str, Field(max_length=MOST_NOTE)] = ""
+
+
+class Done(BaseModel):
+    """What was acknowledged now, in words and by number."""
+
+    ok: bool
+    text: str
+    acknowledged: list[int]
+
+
+@router.get("")
+def events(
+    here: Here,
+    axis: Annotated[str | None, Query(max_length=32)] = None,
+    code: Annotated[str | None, Query(max_length=64)] = None,
+    severity: Severity | None = None,
+    before: Annotated[int | None, Query(ge=1, le=LARGEST_NUMBER)] = None,
+    limit: Annotated[int, Query(ge=1, le=MOST_PAGE)] = 50,
+) -> Events:
+    """Return the newest notices, those that wait to be acknowledged in front."""
+    with here.history() as history:
+        notices = history.notices(limit=RECENT_NOTICES)
+    return page(notices, limit=limit, before=before, axis=axis, code=code, severity=severity)
+
+
+@router.post("/acknowledge")
+async def acknowledge(wanted: Acknowledgement, here: Here, asking: Asking) -> Done:
+    """Tell the daemon that somebody has seen notices: who is logged in, and the time, are kept with them."""
+    request = {"request": "acknowledge", **wanted.model_dump(exclude_none=True), "by": asking.name}
+    return Done.model_validate(granted(await here.daemon.ask(request)))
+
+
+@router.get("/black-boxes")
+def black_boxes(here: Here) -> list[BlackBox]:
+    """Return which black boxes are kept, newest first."""
+    return listed(here.config.store.directory)
+
+
+@router.get("/black-boxes/{name}")
+def black_box(name: str, here: Here) -> Envelope:
+    """Return the envelope of what the drives did in a black box."""
+    return envelope(here.config.store.directory, name, here.config)
+
+
+@router.get("/black-boxes/{name}/file", response_class=Response)
+def black_box_file(name: str, here: Here) -> Response:
+    """Return a black box as it is: a log that candump's tools read."""
+    with opened(here.config.store.directory, name) as file:
+        content = file.read(LARGEST_LOG)
+    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+    return Response(content, media_type="text/plain; charset=us-ascii", headers=headers)

@@ -1,0 +1,140 @@
+"""What the browser shows of the drives' history: how each is, and the course of each parameter. Reads only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+from fdhil.config import MachineConfig
+from fdhil.records import INTERVAL_95
+from fdhil.report.chart import Chart, told
+from fdhil.report.drawing import COLOURS
+from fdhil.report.history_course import AxisHistory, over_temperature, over_time
+from fdhil.report.history_trends import moved
+from fdhil.report.history_verdict import IN_ORDER, UNKNOWN, Refusals, latest_rows, sentences
+from fdhil.report.parameter_view import DISPLAY, MEANINGS, cell, half_of, spoken
+
+MOST_REVISIONS = 50
+MOST_ESTIMATES = 50
+LINE_COLOUR = 3
+LATEST = ("parameter", "latest", "unit", "nominal", "beside_nominal", "since_first", "may_change_by", "limit")
+"""What each cell of :func:`fdhil.report.history_verdict.latest_rows` is."""
+State = Literal["good", "warn", "bad", "none"]
+
+
+def state_of(history: AxisHistory, refused: Refusals) -> State:
+    """Return how an axis is in one word: in order, to be looked at, at a limit, or not known."""
+    limits = (history.told or {}).get("limits", {})
+    if any(limit["reached"] for limit in limits.values()):
+        return "bad"
+    said = sentences(history, refused)
+    return "good" if said == [IN_ORDER] else "none" if said == [UNKNOWN] else "warn"
+
+
+def axis_line(history: AxisHistory, refused: Refusals) -> dict[str, Any]:
+    """Return an axis in a few words."""
+    windows = (history.told or {}).get("windows", ())
+    return {
+        "axis": history.axis,
+        "state": state_of(history, refused),
+        "says": sentences(history, refused),
+        "newest_time": windows[-1]["time"] if windows else None,
+        "rapids_believed": len(windows),
+        "rapids_refused": refused.refused,
+        "rapids_seen": refused.seen,
+    }
+
+
+def axis_document(machine: MachineConfig, history: AxisHistory, refused: Refusals) -> dict[str, Any]:
+    """Return all that is told of one axis."""
+    health = history.told or {}
+    return {
+        **axis_line(history, refused),
+        "latest": [
+            dict(zip(LATEST, row, strict=True)) for row in latest_rows(history, machine.maintenance.model_dump())
+        ],
+        "limits": [_limit(name, limit) for name, limit in health.get("limits", {}).items()],
+        "slopes": _slopes(health),
+        "changes": [_change(change) for change in health.get("changes", ())[::-1]],
+        "refused": [
+            {"code": code, "count": count, "last_text": text, "last_time": time}
+            for code, count, text, time in refused.reasons
+        ],
+        "courses": [_course(history, name) for name in history.names()],
+        "revisions": [_revision(row) for row in history.rows[-MOST_REVISIONS:][::-1]],
+        "revisions_kept": len(history.rows),
+    }
+
+
+def _limit(name: str, limit: Mapping[str, Any]) -> dict[str, Any]:
+    unit, factor = DISPLAY[name]
+    dates = {key: limit[key] for key in ("reached", "date", "earliest", "latest")}
+    return {"parameter": name, "name": spoken(name), "value": limit["limit"] * factor, "unit": unit, **dates}
+
+
+def _slopes(health: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return how each parameter moves with temperature and time, as text with its interval; null where unknown."""
+    found = []
+    for name in DISPLAY:
+        lines = {key: health.get(of, {}).get(name) for key, of in (("per_kelvin", "slopes"), ("per_day", "trends"))}
+        if any(lines.values()):
+            shown = {key: line and cell(name, line[key], half_of(line), " ") for key, line in lines.items()}
+            found.append({"parameter": name, "name": spoken(name), "unit": DISPLAY[name][0], **shown})
+    return found
+
+
+def _change(change: Mapping[str, Any]) -> dict[str, Any]:
+    return {"time": change["time"], "window": change["window"], "moved": moved(change), "cause": change["cause"]}
+
+
+def _course(history: AxisHistory, name: str) -> dict[str, Any]:
+    """Return a parameter's charts, and the newest estimates as the table that says the same."""
+    unit, factor = DISPLAY[name]
+    warming = over_temperature(history, name)
+    return {
+        "parameter": name,
+        "name": spoken(name),
+        "unit": unit,
+        "meaning": MEANINGS[name],
+        "over_time": _chart(over_time(history, name)),
+        "over_temperature": None if warming is None else _chart(warming),
+        "estimates": [_estimate(name, factor, window) for window in history.estimates(name)[-MOST_ESTIMATES:][::-1]],
+    }
+
+
+def _chart(chart: Chart) -> dict[str, Any]:
+    """Return a chart as the browser draws it: colours are numbers there, so that they fit a dark page too."""
+    document = told(chart)
+    for trace in (trace for panel in document["panels"] for trace in panel["traces"]):
+        trace["colour"] = COLOURS.index(trace["colour"]) + 1 if trace["colour"] in COLOURS else LINE_COLOUR
+    return {**document, "words": chart.alt}
+
+
+def _estimate(name: str, factor: float, window: Mapping[str, Any]) -> dict[str, Any]:
+    figures = window["parameters"][name]
+    half = INTERVAL_95 * figures["std"]
+    return {
+        "window": window["window"],
+        "time": window["time"],
+        "temperature_celsius": window["temperature_c"],
+        "value": figures["value"] * factor,
+        "half_width_95": half * factor,
+        "shown": cell(name, figures["value"], half, " "),
+    }
+
+
+def _revision(row: Mapping[str, Any]) -> dict[str, Any]:
+    parameters: Mapping[str, Mapping[str, Any]] = row["parameters"]
+    return {
+        "revision": row["revision"],
+        "time": row["time"],
+        "temperature_celsius": row["temperature_c"],
+        "windows_used": row["windows_used"],
+        "parameters": {name: cell(name, its["value"], half_of(its), " ") for name, its in parameters.items()},
+        "units": {name: DISPLAY[name][0] for name in parameters},
+    }
+
+
+def newest_first(notices: Sequence[Mapping[str, Any]], most: int) -> list[Mapping[str, Any]]:
+    """Return notices with those that wait in front, else the newest in front."""
+    return sorted(notices, key=lambda notice: (notice["acknowledged"] is not None, -notice["number"]))[:most]

@@ -1,0 +1,204 @@
+"""The page *live*: the signals of every axis as they pass, and single samples of what has just passed."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Depends, FastAPI, Query, WebSocket
+from pydantic import BaseModel, Field
+from starlette.requests import HTTPConnection
+from starlette.websockets import WebSocketDisconnect
+
+from fdhil.daemon.control import SOCKET_NAME
+from fdhil.web.answers import Refused
+from fdhil.web.context import Here
+from fdhil.web.gate import token_of
+from fdhil.web.live_feed import KEPT_S, LiveFeed
+from fdhil.web.live_ring import DRAWN, UNITS
+from fdhil.web.live_view import View, finite
+
+TELL_S = 0.1
+ALIVE_S = 1.0
+LOGIN_S = 10.0
+MAX_BROWSERS = 8
+LEAST_S, MOST_S = 0.5, 60.0
+POLICY, TRY_LATER = 1008, 1013  # RFC 6455, 7.4.1 and the registry of close codes
+
+Axes = Annotated[str, Query(description="names of axes with commas between them; left out: all", max_length=200)]
+Columns = Annotated[int, Query(ge=10, le=4000)]
+
+
+def _feed_of(app: FastAPI) -> LiveFeed:
+    """Return the one feed of this process."""
+    if not hasattr(app.state, "live"):
+        config = app.state.context.config
+        app.state.live = LiveFeed(config.run_directory / SOCKET_NAME, config.axis, config.machine.sync_period_s)
+    feed = app.state.live
+    assert isinstance(feed, LiveFeed)
+    return feed
+
+
+def _feed(connection: HTTPConnection) -> LiveFeed:
+    return _feed_of(connection.app)
+
+
+Feed = Annotated[LiveFeed, Depends(_feed)]
+
+
+@asynccontextmanager
+async def _reading(app: FastAPI) -> AsyncIterator[None]:
+    """Read the daemon's stream, for as long as the application lives, whenever somebody looks on."""
+    task = asyncio.create_task(_feed_of(app).run(), name="live feed")
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.wait([task])
+
+
+router = APIRouter(prefix="/api/live", tags=["live"], lifespan=_reading)
+
+
+class Signal(BaseModel):
+    """One signal of one axis in columns: the least and the greatest, null where no sample came."""
+
+    unit: str
+    low: list[float | None]
+    high: list[float | None]
+
+
+class Samples(BaseModel):
+    """A stretch of what is kept; with ``ticks_per_column`` 1 these are the samples themselves."""
+
+    ok: Literal[True] = True
+    sync_period_s: float
+    first_tick: int = Field(description="of the stream's own count, which the browser learnt from the stream")
+    ticks_per_column: int
+    axes: dict[str, dict[str, Signal]]
+
+
+@router.get("/samples")
+async def samples(  # in the loop, where the rings are written: what is read is whole
+    here: Here,
+    feed: Feed,
+    first_tick: Annotated[int, Query(ge=0, le=2**53)],
+    end_tick: Annotated[int, Query(ge=0, le=2**53)],
+    columns: Columns = 1000,
+    axes: Axes = "",
+) -> Samples:
+    """Tell the samples from one tick to before another, drawn together when there are more than ``columns``.
+
+    Where nothing is kept there is null: the last five minutes are, and while somebody looks on.
+    """
+    named = _axes_of(here, axes)
+    end = max(first_tick + 1, end_tick)
+    first = max(first_tick, end - feed.rings[named[0]].capacity)
+    per_column = max(1, -(-(end - first) // columns))
+    drawn = {axis: feed.rings[axis].envelope(first, end, per_column) for axis in named}
+    return Samples(
+        sync_period_s=feed.period_s,
+        first_tick=next(iter(drawn.values())).first_tick,
+        ticks_per_column=per_column,
+        axes={
+            axis: {
+                name: Signal(unit=UNITS[name], low=finite(part.low[k]), high=finite(part.high[k]))
+                for k, name in enumerate(DRAWN)
+            }
+            for axis, part in drawn.items()
+        },
+    )
+
+
+def _axes_of(here: Here, axes: str) -> list[str]:
+    named = list(dict.fromkeys(axes.split(","))) if axes else list(here.config.axis)
+    if unknown := [axis for axis in named if axis not in here.config.axis]:
+        text = f"there is no axis {unknown[0]!r}"
+        raise Refused(404, "NoSuchAxis", text, f"ask for {', '.join(here.config.axis)}")
+    return named
+
+
+@router.websocket("/stream")
+async def stream(
+    socket: WebSocket,
+    here: Here,
+    feed: Feed,
+    seconds: Annotated[float, Query(ge=LEAST_S, le=MOST_S)] = 20.0,
+    columns: Columns = 800,
+    axes: Axes = "",
+) -> None:
+    """Tell a browser the newest samples as columns, as fast as it draws them, until it leaves or its login ends."""
+    offered = socket.scope.get("subprotocols", [])
+    await socket.accept("fdhil" if "fdhil" in offered else None)
+    try:
+        named = _axes_of(here, axes)
+    except Refused as refused:
+        await socket.close(POLICY, refused.document["text"])
+        return
+    if feed.viewers >= MAX_BROWSERS:
+        await socket.close(TRY_LATER, f"{MAX_BROWSERS} browsers look on already; close one of them")
+        return
+    view = View(named, seconds, columns, feed.period_s)
+    signals = [{"name": name, "unit": UNITS[name]} for name in DRAWN]
+    begin = {"sync_period_s": feed.period_s, "axes": named, "signals": signals, "ticks_per_column": view.per_column}
+    async with feed.watched():
+        with suppress(WebSocketDisconnect):  # it left
+            await socket.send_json({**begin, "kept_s": KEPT_S})
+            await socket.close(POLICY, await _converse(socket, view, feed, here))
+
+
+async def _converse(socket: WebSocket, view: View, feed: LiveFeed, here: Here) -> str:
+    """Tell and hear; return why that is over. WebSocketDisconnect when the browser has left."""
+    drawn = asyncio.Event()
+    tasks = [
+        asyncio.create_task(_hear(socket, view, drawn)),
+        asyncio.create_task(_tell(socket, view, feed, drawn)),
+        asyncio.create_task(_login_ends(socket, here)),
+    ]
+    try:
+        over, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+    return next(iter(over)).result()
+
+
+async def _hear(socket: WebSocket, view: View, drawn: asyncio.Event) -> str:
+    """Take in what the browser has drawn, until it says anything else."""
+    while True:
+        try:
+            told: Any = json.loads(await socket.receive_text())
+        except (ValueError, RecursionError, KeyError):
+            told = None
+        if not isinstance(told, dict) or type(told.get("drawn")) is not int:
+            return 'what came is not understood; send {"drawn": the number of the newest message that was drawn}'
+        view.drawn(told["drawn"])
+        drawn.set()
+
+
+async def _tell(socket: WebSocket, view: View, feed: LiveFeed, drawn: asyncio.Event) -> str:
+    """Tell what is new, some ten times a second, as fast as the browser draws; a word of life when nothing is."""
+    told_s = 0.0
+    loop = asyncio.get_running_loop()
+    while True:
+        await asyncio.sleep(TELL_S)
+        while not view.may_send():
+            drawn.clear()
+            await drawn.wait()
+        if view.has_news(feed.rings) or loop.time() - told_s > ALIVE_S:
+            told_s = loop.time()
+            about = {"trouble": feed.trouble, "skipped_lines": feed.skipped_lines}
+            await socket.send_bytes(view.message(feed.rings, about))
+
+
+async def _login_ends(socket: WebSocket, here: Here) -> str:
+    """Wait until the login by which the socket was opened has ended."""
+    token = token_of(socket.headers)
+    while True:
+        await asyncio.sleep(LOGIN_S)
+        if here.access.asker(token) is None:
+            return "the login has ended; log in again"

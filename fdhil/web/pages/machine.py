@@ -1,0 +1,129 @@
+"""The machine: what its daemon says, how the axes are, and what to do next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from fastapi import APIRouter
+from pydantic import BaseModel
+
+from fdhil.config import MachineConfig
+from fdhil.errors import DeviceError, StoreError
+from fdhil.records import ParameterSet
+from fdhil.store.history import History
+from fdhil.store.rows import Revision
+from fdhil.store.set_document import parameters_status
+from fdhil.web.answers import Fault, document_of
+from fdhil.web.context import Asking, Here
+from fdhil.web.pages.machine_lights import AxisLight, Light, Step, axis_light, change_light, steps
+
+router = APIRouter(prefix="/api/machine")
+START = Step(text="The daemon does not answer.", advice="start it with fdhil run CONFIG, and look at its log")
+
+
+class Machine(BaseModel):
+    """The machine now. Without an answer of the daemon ``status`` is null and ``fault`` says why: that is no error."""
+
+    ok: Literal[True] = True
+    machine: str
+    axes: Mapping[str, AxisLight]
+    next: list[Step]
+    status: dict[str, Any] | None
+    fault: Fault | None = None
+
+
+class Parameter(BaseModel):
+    """A published parameter in SI units: its 95 % interval, its first value, and how far it may change."""
+
+    value: float
+    low: float | None
+    high: float | None
+    unit: str
+    first: float | None
+    change: float | None
+    limit: float
+    light: Light
+
+
+class Published(BaseModel):
+    """The newest published parameters of an axis."""
+
+    revision: int
+    published_wall_s: float
+    windows_used: int
+    temperature_c: float | None
+    unexplained_um: float | None
+    parameters: Mapping[str, Parameter]
+    warnings: list[str]
+
+
+class AllPublished(BaseModel):
+    """What the store knows of every axis; ``fault`` where it cannot be read, or is not there yet."""
+
+    ok: Literal[True] = True
+    axes: Mapping[str, Published]
+    fault: Fault | None = None
+
+
+@router.get("")
+async def machine(here: Here, asking: Asking) -> Machine:
+    """Return the daemon's status document, at most half a second old, and what is to be said of it."""
+    try:
+        status = await here.daemon.status()
+    except DeviceError as error:
+        fault = Fault.model_validate(document_of(error))
+        silent = dict.fromkeys(here.config.axis, AxisLight(light="none", text="not known: the daemon does not answer"))
+        return Machine(machine=here.config.machine.name, axes=silent, next=[START], status=None, fault=fault)
+    acting = here.config.web.acting and asking.role == "operate"
+    return Machine(
+        machine=str(status["machine"]), axes=lights(status), next=list(steps(status, acting)), status=dict(status)
+    )
+
+
+def lights(status: Mapping[str, Any]) -> dict[str, AxisLight]:
+    """Return how each axis of a status document is."""
+    troubles: dict[str, list[str]] = {axis: [] for axis in status["axes"]}
+    for trouble in status["troubles"]:
+        troubles.get(trouble["axis"], []).append(f"{trouble['code']}: {trouble['text']}")
+    return {axis: axis_light(told, troubles[axis]) for axis, told in status["axes"].items()}
+
+
+@router.get("/parameters")
+def parameters(here: Here) -> AllPublished:
+    """Return the newest published parameters, also while no daemon runs."""
+    try:
+        with here.history() as history:
+            found = {axis: _published(history, axis, here.config) for axis in here.config.axis}
+    except StoreError as error:
+        return AllPublished(axes={}, fault=Fault.model_validate(document_of(error)))
+    return AllPublished(axes={axis: told for axis, told in found.items() if told is not None})
+
+
+def _published(history: History, axis: str, config: MachineConfig) -> Published | None:
+    newest = history.revisions(axis, limit=1)
+    if not newest:
+        return None
+    return published_document(newest[0], history.first_revision(axis), config)
+
+
+def published_document(newest: Revision, first: Revision | None, config: MachineConfig) -> Published:
+    """Return a revision beside the first one of its axis."""
+    shown: ParameterSet = newest.set
+    firsts = first.set.parameters.as_dict() if first else {}
+    limits = config.maintenance.model_dump()
+    found = {}
+    for name, told in parameters_status(shown).items():
+        half = None if told["high"] is None else told["high"] - told["value"]
+        change, light = change_light(told["value"], half, firsts.get(name), limits[name])
+        beside = {"first": firsts.get(name), "change": change, "limit": limits[name], "light": light}
+        found[name] = Parameter(**{key: told[key] for key in ("value", "low", "high", "unit")}, **beside)
+    return Published(
+        revision=shown.revision,
+        published_wall_s=newest.stamp.wall_s,
+        windows_used=shown.windows,
+        temperature_c=shown.temperature_c,
+        unexplained_um=shown.unexplained_um,
+        parameters=found,
+        warnings=[str(warning) for warning in shown.warnings],
+    )

@@ -1,0 +1,138 @@
+"""Says of a status document how each axis is and what to do next. Pure: a document in, sentences out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal
+
+from pydantic import BaseModel
+
+from fdhil.arming.guard_link import ORDERED
+from fdhil.arming.standing import ADOPT, START_AND_ADOPT
+
+Light = Literal["good", "warn", "bad", "none"]
+LIVE_S = 2.0
+NEAR = 0.5
+"""The share of a maintenance limit from which a parameter is told to move."""
+ENABLED = "Operation enabled"
+DRIVE_FAULTS = ("Fault", "Fault reaction active")
+
+
+class AxisLight(BaseModel):
+    """How an axis is, in a colour and in words."""
+
+    light: Light
+    text: str
+
+
+class Step(BaseModel):
+    """What to do next: ``urgent`` while something may stand or is lost, ``page`` where it is done in the browser."""
+
+    text: str
+    advice: str
+    urgent: bool = False
+    page: str = ""
+
+
+def axis_light(axis: Mapping[str, Any], troubles: list[str]) -> AxisLight:
+    """Return how an axis is: a trouble first, then what is not known of it, then what is warned of."""
+    heard_s, last = axis.get("samples_s_ago"), axis.get("last_window")
+    if axis.get("drive_state") in DRIVE_FAULTS:
+        return AxisLight(light="bad", text=f"the drive is in {axis['drive_state']}; read its fault code at the drive")
+    if troubles:
+        return AxisLight(light="bad", text=troubles[0])
+    if heard_s is None or heard_s > LIVE_S:
+        ago = "no samples came yet" if heard_s is None else f"no samples for {heard_s:.0f} s"
+        return AxisLight(light="none", text=f"{ago}; switch the drive on, or look at its bus")
+    if axis.get("parameters") is None:
+        return AxisLight(light="none", text=_unpublished(axis))
+    if last and not last["accepted"]:
+        why = f": {last['reasons'][0]}" if last["reasons"] else ""
+        return AxisLight(light="warn", text=f"the last rapid was not believed{why}")
+    if axis.get("warnings"):
+        return AxisLight(light="warn", text=str(axis["warnings"][0]))
+    return AxisLight(light="good", text="in order")
+
+
+def _unpublished(axis: Mapping[str, Any]) -> str:
+    refused = axis.get("refused_by") or {}
+    if not refused:
+        return "no parameters yet; let the NC make a few rapids (G0) of this axis"
+    code, count = max(refused.items(), key=lambda pair: pair[1])
+    return f"no parameters yet: {count} rapids were not believed because of {code}"
+
+
+def change_light(value: float, half: float | None, first: float | None, limit: float) -> tuple[float | None, Light]:
+    """Return a parameter's relative change from its first value, and how near that is to the maintenance limit.
+
+    Bad is what is surely beyond: the change without half its 95 % interval. Without an interval nothing is known.
+    """
+    if not first or half is None or not math.isfinite(half):
+        return None, "none"
+    change, doubt = value / first - 1, half / abs(first)
+    if abs(change) - doubt > limit:
+        return change, "bad"
+    return change, "warn" if abs(change) > NEAR * limit else "good"
+
+
+def steps(status: Mapping[str, Any], acting: bool) -> Iterator[Step]:
+    """Yield what to do next, the most urgent first; at least one."""
+    found = [*_standing(status), *_hearing(status), *_troubles(status), *_waiting(status), *_learning(status)]
+    yield from found or _ready(status, acting)
+
+
+def _standing(status: Mapping[str, Any]) -> Iterator[Step]:
+    guard, stands = status.get("guard") or {}, status.get("may_stand") or {"nothing": True}
+    if status["state"] == "lost":
+        yield Step(text=f"The guard is lost: {stands.get('text', '')}", advice=START_AND_ADOPT, urgent=True)
+    elif not stands["nothing"] and status["state"] in ("OFF", "FROZEN", "OFF(SHADOW)"):
+        yield Step(text=f"{stands['text']}", advice=ADOPT, urgent=True)
+    cause = guard.get("cause")
+    if cause and cause["code"] not in ORDERED:
+        yield Step(text=f"{cause['code']}: {cause['text']}", advice=cause.get("advice", ""))
+
+
+def _hearing(status: Mapping[str, Any]) -> Iterator[Step]:
+    source = status["source"]["state"]
+    if source == "reconnecting":
+        yield Step(text="The bus is lost.", advice="check the adapter and the cable; it is opened again by itself")
+    elif source == "silent":
+        yield Step(text="The bus is silent.", advice="switch the machine on; then check wiring and bit rate")
+    if fault := status["store"]["fault"]:
+        yield Step(text=f"Nothing is stored: {fault}", advice="make room or mend the disk; nothing is armed meanwhile")
+
+
+def _troubles(status: Mapping[str, Any]) -> Iterator[Step]:
+    for trouble in status["troubles"]:
+        text, _, advice = str(trouble["text"]).partition("; ")
+        where = f"{trouble['axis']}: " if trouble["axis"] else ""
+        yield Step(text=f"{where}{trouble['code']}: {text}", advice=advice)
+
+
+def _waiting(status: Mapping[str, Any]) -> Iterator[Step]:
+    waiting = status.get("unacknowledged") or {"count": 0}
+    if waiting["count"]:
+        major = f", {waiting['MAJOR']} of them major" if waiting.get("MAJOR") else ""
+        count = "One notice waits" if waiting["count"] == 1 else f"{waiting['count']} notices wait"
+        yield Step(text=f"{count} to be acknowledged{major}.", advice="see the page Events", page="/events")
+
+
+def _learning(status: Mapping[str, Any]) -> Iterator[Step]:
+    unknown = [axis for axis, told in status["axes"].items() if told["parameters"] is None]
+    if unknown and status["source"]["state"] == "listening":
+        text = f"Nothing is known of {', '.join(unknown)} yet."
+        yield Step(text=text, advice="let the NC make a few rapids (G0) of each, to and fro, over most of the travel")
+
+
+def _ready(status: Mapping[str, Any], acting: bool) -> Iterator[Step]:
+    if status.get("armed"):
+        yield Step(
+            text="A correction is armed.", advice="start the program at the NC; its error is measured as it runs"
+        )
+    elif status["state"] == "OFF(SHADOW)":
+        advice = "start fdhil-guard to correct, after fdhil commission; without it everything is only watched"
+        yield Step(text="All is in order; no guard runs, so nothing can be corrected.", advice=advice)
+    else:
+        by = "below" if acting else "with fdhil arm CONFIG PROGRAM"
+        yield Step(text="All is in order.", advice=f"arm a program {by}, or judge one on the page Program")

@@ -1,0 +1,280 @@
+"""Programs before they are cut: their path error without and with the correction, and what their passes taught.
+
+A program that is dropped is forecast in a process of its own. Nothing here reaches the machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from itertools import islice
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, FastAPI, Path, Query, Request
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel
+from starlette.requests import HTTPConnection
+
+from fdhil.errors import ConnectError, DeviceTimeout
+from fdhil.web.answers import Refused
+from fdhil.web.context import Here
+from fdhil.web.forecast.desk import STATES, Desk, Job, Work
+from fdhil.web.forecast.lessons import lessons, passes
+from fdhil.web.forecast.view import Box, course, line_place, plane_of, view
+from fdhil.web.gate import LARGEST_PROGRAM
+
+LARGEST_MM = 1e7
+MOST_LINES = 400
+LONGEST_LINE = 400
+
+
+class Fault(BaseModel):
+    """Why there is no forecast; ``line`` is that of the program at fault, where one is."""
+
+    code: str
+    text: str
+    advice: str
+    line: int | None
+
+
+class Advice(BaseModel):
+    """The feeds that keep a tolerance, and how far they are: ``lines`` as ``fdhil advise --json`` has them."""
+
+    tolerance_um: float
+    state: STATES
+    trial: int | None
+    fault: Fault | None
+    lines: list[dict[str, Any]]
+
+
+class Told(BaseModel):
+    """A program and how far its forecast is; ``forecast`` as ``fdhil correct --json`` has it, and what a map needs."""
+
+    digest: str
+    name: str
+    state: STATES
+    step: str | None
+    rows: int | None
+    fault: Fault | None
+    forecast: dict[str, Any] | None
+    advice: Advice | None
+
+
+class Kept(BaseModel):
+    """A program that is kept."""
+
+    digest: str
+    name: str
+    state: STATES
+
+
+class Programs(BaseModel):
+    """The programs that are kept here, the newest first, and how large one may be."""
+
+    programs: list[Kept]
+    largest_bytes: int
+
+
+class Learning(BaseModel):
+    """The curves of the programs that have learned, and the passes that the running daemon measured, oldest first."""
+
+    daemon: bool
+    learning: bool
+    lessons: list[dict[str, Any]]
+    passes: list[dict[str, Any]]
+
+
+class Line(BaseModel):
+    """One line of a program's text."""
+
+    line: int
+    text: str
+
+
+class Text(BaseModel):
+    """Lines of a program's text, and whether more follow."""
+
+    lines: list[Line]
+    more: bool
+
+
+@asynccontextmanager
+async def _serving(app: FastAPI) -> AsyncIterator[None]:
+    """Drop what is kept when the pages are no longer served."""
+    yield
+    desk = getattr(app.state, "programs", None)
+    if desk is not None:
+        await desk.close()
+
+
+router = APIRouter(prefix="/api/program", lifespan=_serving)
+
+
+async def _desk(connection: HTTPConnection, here: Here) -> Desk:
+    state = connection.app.state
+    if getattr(state, "programs", None) is None:
+        state.programs = Desk(here.config)
+    desk = state.programs
+    assert isinstance(desk, Desk)
+    return desk
+
+
+Programming = Annotated[Desk, Depends(_desk)]
+Digest = Annotated[str, Path(pattern="^[0-9a-f]{64}$", description="SHA-256 of the program's bytes")]
+Mm = Annotated[float, Query(ge=-LARGEST_MM, le=LARGEST_MM, allow_inf_nan=False)]
+BODY = {"requestBody": {"content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}}}
+
+
+@router.get("")
+async def programs(desk: Programming) -> Programs:
+    """List the programs that are kept."""
+    kept = [Kept(digest=job.digest, name=job.name, state=job.forecasting.state) for job in desk.jobs]
+    return Programs(programs=kept, largest_bytes=LARGEST_PROGRAM)
+
+
+@router.post("", status_code=202, openapi_extra=BODY)
+async def drop(request: Request, desk: Programming, name: Annotated[str, Query(min_length=1, max_length=255)]) -> Told:
+    """Take an NC program, or a demand where ``name`` ends in .csv, as the body's bytes, and have it forecast."""
+    return _told(await desk.take(name, request.stream()))
+
+
+@router.get("/learning")
+async def learning(here: Here, desk: Programming) -> Learning:
+    """Tell what the passes of programs have taught."""
+    try:
+        status = await here.daemon.status()
+    except (ConnectError, DeviceTimeout):
+        status = None
+    measured = passes(status)
+    names = {str(each["program_digest"]): str(each["program"]).rpartition("/")[2] for each in measured}
+    names |= {job.digest: job.name for job in desk.jobs}
+    config = here.config
+    return Learning(
+        daemon=status is not None,
+        learning=config.correction.learning,
+        lessons=lessons(config, names),
+        passes=[dict(each) for each in measured],
+    )
+
+
+@router.get("/{digest}")
+async def program(digest: Digest, desk: Programming) -> Told:
+    """Tell how far a forecast is, and what it says of the whole program."""
+    return _told(desk.job(digest))
+
+
+@router.post("/{digest}/cancel")
+async def cancel(digest: Digest, desk: Programming) -> Told:
+    """End a forecast that is under way."""
+    return _told(await desk.cancel(digest))
+
+
+@router.post("/{digest}/advise", status_code=202)
+async def feeds(
+    digest: Digest, desk: Programming, tolerance_um: Annotated[float, Query(gt=0.0, le=1e6, allow_inf_nan=False)]
+) -> Told:
+    """Have the feeds found that keep the path within a tolerance, as ``fdhil advise`` does."""
+    return _told(desk.advise(digest, tolerance_um))
+
+
+@router.get("/{digest}/view")
+def part(
+    digest: Digest,
+    desk: Programming,
+    across: Annotated[str, Query(max_length=16)],
+    along: Annotated[str, Query(max_length=16)],
+    left: Mm | None = None,
+    right: Mm | None = None,
+    bottom: Mm | None = None,
+    top: Mm | None = None,
+    factor: Annotated[float, Query(ge=0.0, le=10_000.0, allow_inf_nan=False)] = 0.0,
+) -> JSONResponse:
+    """Tell the path in the plane of two axes: all of it, or what lies in a box (mm), there with the table's way.
+
+    ``factor``: how many times as far the table is drawn from the path; 0 for what the view has room for.
+    """
+    forecast = desk.forecast(digest)
+    try:
+        plane = plane_of(forecast, (across, along))
+    except ValueError:
+        told = ", ".join(forecast.axes)
+        raise Refused(422, "BadRequest", "this is no plane of the program", f"its axes are {told}") from None
+    box = None
+    if left is not None and right is not None and bottom is not None and top is not None:
+        box = Box(left, right, bottom, top)
+        if not (left < right and bottom < top):
+            raise Refused(422, "BadRequest", "the box is empty", "give left < right and bottom < top")
+    return JSONResponse(view(forecast, plane, box, factor))
+
+
+@router.get("/{digest}/course")
+def over_time(
+    digest: Digest,
+    desk: Programming,
+    start_s: Annotated[float, Query(ge=0.0, allow_inf_nan=False)] = 0.0,
+    end_s: Annotated[float | None, Query(ge=0.0, allow_inf_nan=False)] = None,
+) -> JSONResponse:
+    """Tell contour errors and feed over time."""
+    forecast = desk.forecast(digest)
+    rows = len(forecast.line)
+    first = min(int(min(start_s / forecast.dt_s, rows)), rows - 1)
+    last = rows if end_s is None else int(min(end_s / forecast.dt_s, rows))
+    return JSONResponse(course(forecast, first, max(last, first + 1)))
+
+
+@router.get("/{digest}/line/{line}")
+def place_of_line(digest: Digest, line: Annotated[int, Path(ge=1, le=10**9)], desk: Programming) -> JSONResponse:
+    """Tell where a line of the program has its largest error."""
+    found = line_place(desk.forecast(digest), line)
+    if found is None:
+        raise Refused(404, "NotFound", f"line {line} of the program orders no motion", "choose a line that moves")
+    return JSONResponse(found)
+
+
+@router.get("/{digest}/text")
+def text(
+    digest: Digest,
+    desk: Programming,
+    first: Annotated[int, Query(ge=1, le=10**9)] = 1,
+    count: Annotated[int, Query(ge=1, le=MOST_LINES)] = 40,
+) -> Text:
+    """Tell lines of the program's text."""
+    job = desk.job(digest)
+    try:
+        with job.program.open(encoding="utf-8", errors="replace", newline="\n") as file:
+            found = list(islice(file, first - 1, first + count))
+    except OSError:
+        raise Refused(404, "NotFound", "the text is not kept (any more)", "drop the file again") from None
+    told = [Line(line=first + k, text=_printable(each)) for k, each in enumerate(found[:count])]
+    return Text(lines=told, more=len(found) > count)
+
+
+def _printable(line: str) -> str:
+    """Return a line without what a screen would not show, cut where it is very long."""
+    kept = "".join(letter if letter.isprintable() else " " for letter in line.rstrip("\r\n")[:LONGEST_LINE])
+    return kept + ("..." if len(line) > LONGEST_LINE + 2 else "")
+
+
+def _told(job: Job) -> Told:
+    work, advising = job.forecasting, job.advising
+    advice = advising and Advice(
+        tolerance_um=advising.tolerance_um or 0.0,
+        state=advising.state,
+        trial=advising.progress.get("trial"),
+        fault=_fault(advising),
+        lines=job.advice if advising.state == "done" else [],
+    )
+    return Told(
+        digest=job.digest,
+        name=job.name,
+        state=work.state,
+        step=work.progress.get("step"),
+        rows=work.progress.get("rows"),
+        fault=_fault(work),
+        forecast=None if job.forecast is None else job.forecast.document,
+        advice=advice,
+    )
+
+
+def _fault(work: Work) -> Fault | None:
+    return None if work.fault is None else Fault.model_validate(work.fault)

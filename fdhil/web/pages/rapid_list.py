@@ -1,0 +1,227 @@
+"""The stored rapids as the browser has them: which there are, newest first, and what was said of each. Reads only."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from datetime import UTC, datetime
+from typing import Any, Literal
+
+from pydantic import BaseModel
+
+from fdhil.records import INTERVAL_95, unit_of
+from fdhil.report.parameter_view import DISPLAY, cell
+from fdhil.report.typography import typeset
+from fdhil.store.history import History
+from fdhil.store.rows import StoredWindow
+from fdhil.web.answers import Refused
+
+SEARCHED = 5_000
+"""Rows of the history that one request looks through: with many more a rare reason would take seconds to find."""
+LARGEST_ID = 2**63 - 1
+Kept = Callable[[str], bool]
+"""Whether the recording of this name is still there."""
+
+
+class Said(BaseModel):
+    """A reason or a warning: its class, the figure that caused it, what to do."""
+
+    code: str
+    text: str
+    advice: str = ""
+
+
+class NcSaid(BaseModel):
+    """What the NC said of itself during the move; what it did not say is null. An override of 1 is 100 %."""
+
+    line: int | None = None
+    program: str | None = None
+    override: tuple[float, float] | None = None
+    held: bool | None = None
+
+
+class Rapid(BaseModel):
+    """A stored rapid and what the daemon said of it; ``kept`` is whether its recording is still there."""
+
+    id: int
+    axis: str
+    time: str
+    direction: int
+    accepted: bool
+    fit_percent: float | None
+    unexplained_um: float | None
+    temperature_celsius: float | None
+    reasons: list[Said]
+    warnings: list[Said]
+    nc: NcSaid | None
+    file: str
+    kept: bool
+
+
+class Rapids(BaseModel):
+    """A page of rapids, newest first; ``older_before`` asks for the next one, null at the oldest."""
+
+    rapids: list[Rapid]
+    older_before: int | None
+
+
+class Count(BaseModel):
+    """How many of the newest rapids were refused for a reason of this class."""
+
+    code: str
+    rapids: int
+
+
+class Counts(BaseModel):
+    """The newest rapids by verdict, and the refused ones by reason; ``searched`` is how many were looked at.
+
+    ``axes`` are the machine's.
+    """
+
+    axes: list[str]
+    searched: int
+    accepted: int
+    refused: int
+    by_reason: list[Count]
+
+
+class Figure(BaseModel):
+    """A parameter in SI units, with its 95 % interval, and as people read it; ``reason`` says why it is not known."""
+
+    name: str
+    unit: str | None
+    value: float | None
+    std: float | None
+    low: float | None
+    high: float | None
+    reason: str | None
+    shown: str
+    shown_unit: str
+
+
+class RapidTold(BaseModel):
+    """All that the history has of one rapid, and its neighbours on the axis.
+
+    ``alike_id`` is the last one before it that was accepted and went the same way.
+    """
+
+    rapid: Rapid
+    parameters: list[Figure]
+    older_id: int | None
+    newer_id: int | None
+    alike_id: int | None
+
+
+Verdict = Literal["accepted", "refused"]
+
+
+def page_of(
+    history: History,
+    kept: Kept,
+    axis: str | None = None,
+    verdict: Verdict | None = None,
+    code: str | None = None,
+    before: int | None = None,
+    limit: int = 50,
+) -> Rapids:
+    """Return the newest rapids below the number ``before`` that fit."""
+    before = newest_id(history) + 1 if before is None else before
+    first = max(1, before - SEARCHED)
+    wanted = {"axis = :axis": axis, "instr(reasons, :code)": None if code is None else f'"{code}:'}
+    conditions = [condition for condition, value in wanted.items() if value is not None]
+    if verdict is not None:
+        conditions.append(f"accepted = {int(verdict == 'accepted')}")
+    where = " AND ".join(["id < :before", "id >= :first", *conditions])
+    values = {"before": before, "first": first, "axis": axis, "code": wanted["instr(reasons, :code)"]}
+    found = history.chosen_windows(f"{where} ORDER BY id DESC", values, limit)
+    oldest = found[-1].number if len(found) == limit else first
+    return Rapids(rapids=[rapid_of(window, kept) for window in found], older_before=oldest if oldest > 1 else None)
+
+
+def newest_id(history: History) -> int:
+    """Return the number of the newest rapid, 0 when there is none."""
+    return int(history.figures("SELECT coalesce(max(id), 0) FROM windows", {})[0][0])
+
+
+def counts_of(history: History, axes: Iterable[str], axis: str | None = None) -> Counts:
+    """Count the newest rapids by verdict and by reason."""
+    values = {"first": newest_id(history) - SEARCHED, "axis": axis}
+    where = "windows.id > :first" + (" AND axis = :axis" if axis else "")
+    verdicts = dict(history.figures(f"SELECT accepted, count(*) FROM windows WHERE {where} GROUP BY accepted", values))
+    by_reason = history.figures(
+        "SELECT substr(value, 1, instr(value || ':', ':') - 1) AS code, count(DISTINCT windows.id) AS rapids"
+        " FROM windows, json_each(CASE WHEN json_valid(reasons) THEN reasons ELSE '[]' END)"
+        f" WHERE {where} AND accepted = 0 GROUP BY code ORDER BY rapids DESC, code",
+        values,
+    )
+    accepted, refused = (int(verdicts.get(key, 0)) for key in (1, 0))
+    reasons = [Count(code=str(code), rapids=int(number)) for code, number in by_reason]
+    return Counts(axes=[*axes], searched=accepted + refused, accepted=accepted, refused=refused, by_reason=reasons)
+
+
+def rapid_of(window: StoredWindow, kept: Kept) -> Rapid:
+    """Return a stored window as the browser has it."""
+    return Rapid(
+        id=window.number,
+        axis=window.axis,
+        time=datetime.fromtimestamp(window.stamp.wall_s, UTC).isoformat(timespec="seconds"),
+        direction=window.direction,
+        accepted=window.accepted,
+        fit_percent=window.fit_percent,
+        unexplained_um=window.unexplained_um,
+        temperature_celsius=window.temperature_c,
+        reasons=[_said(reason) for reason in window.reasons],
+        warnings=[_said(warning) for warning in window.warnings],
+        nc=None if window.nc is None else NcSaid(**window.nc),
+        file=window.file,
+        kept=kept(window.file),
+    )
+
+
+def _said(reason: str) -> Said:
+    code, _, text = reason.partition(":")
+    return Said(code=code, text=typeset(text.strip()))
+
+
+def told_of(history: History, window: StoredWindow, kept: Kept) -> RapidTold:
+    """Return what the history has of one rapid."""
+    values = {"axis": window.axis, "id": window.number, "direction": window.direction}
+
+    def nearest(condition: str, order: str) -> int | None:
+        query = f"SELECT id FROM windows WHERE axis = :axis AND {condition} ORDER BY id {order} LIMIT 1"
+        return next((int(row[0]) for row in history.figures(query, values)), None)
+
+    return RapidTold(
+        rapid=rapid_of(window, kept),
+        parameters=[figure_of(name, told) for name, told in (window.parameters or {}).items()],
+        older_id=nearest("id < :id", "DESC"),
+        newer_id=nearest("id > :id", "ASC"),
+        alike_id=nearest("id < :id AND direction = :direction AND accepted = 1", "DESC"),
+    )
+
+
+def figure_of(name: str, told: dict[str, Any]) -> Figure:
+    """Return one parameter of a window with its interval."""
+    value, std = told.get("value"), told.get("std")
+    half = None if std is None else INTERVAL_95 * std
+    ends = (None, None) if value is None or half is None else (value - half, value + half)
+    unit = unit_of(name)
+    return Figure(
+        name=name,
+        unit=unit,
+        value=value,
+        std=std,
+        low=ends[0],
+        high=ends[1],
+        reason=None if told.get("reason") is None else typeset(str(told["reason"])),
+        shown=typeset(cell(name, value, half, " ")),
+        shown_unit=typeset(DISPLAY[name][0] if name in DISPLAY else unit or ""),
+    )
+
+
+def the_window(history: History, axis: str, number: int) -> StoredWindow:
+    """Return the window of an axis with this number; Refused when there is none, or it is damaged."""
+    found = history.chosen_windows("id = :id AND axis = :axis", {"id": number, "axis": axis}, 1)
+    if not found:
+        text = f"the history has no rapid {number} of axis {axis}"
+        raise Refused(404, "NoSuchRapid", text, "take one from the list of rapids")
+    return found[0]

@@ -1,0 +1,221 @@
+"""The signals of one rapid with the model laid over them, what is left, and the spectra of both. Pure."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel
+
+from fdhil.identification.windows import bridged, moving_range
+from fdhil.pipeline.overlay import Overlay
+from fdhil.records import Float, Reason, Window, rms
+from fdhil.report.typography import typeset
+from fdhil.web.pages.rapid_list import Said
+
+MOST_POINTS = 6000
+"""Points of one curve: a screen shows fewer, and a browser on a phone draws so many at once."""
+DIGITS = 6
+
+Points = list[float | None]
+
+
+class Signal(BaseModel):
+    """A signal in the unit that its name ends with: measured, modelled, and measured less modelled; null is not known.
+
+    ``model`` tells what made the modelled one: "voltage" (the drive under the measured voltage alone), "loop" (the
+    closed loop along the demand), or null. ``residual_rms`` is over the move. The spectra are amplitudes.
+    """
+
+    name: str
+    unit: str
+    shown_unit: str
+    model: str | None
+    measured: Points
+    modelled: Points | None
+    residual: Points | None
+    residual_rms: float | None
+    measured_spectrum: Points
+    residual_spectrum: Points | None
+
+
+class Replayed(BaseModel):
+    """What a replay of the recording says with the configuration of today."""
+
+    accepted: bool
+    fit_percent: float | None
+    unexplained_um: float | None
+    reasons: list[Said]
+    warnings: list[Said]
+
+
+class Stage(BaseModel):
+    """A stage of the move: "accelerate", "cruise" or "brake"."""
+
+    name: str
+    begin_s: float
+    end_s: float
+
+
+class RapidSignals(BaseModel):
+    """A rapid's signals: point k is ``time_s[k]`` after the first row; of long ones each ``every``-th row is told.
+
+    ``turns_hz`` is how often the motor turns in a second at the most: what comes with each turn shows there.
+    """
+
+    every: int
+    time_s: list[float]
+    move_begin_s: float
+    move_end_s: float
+    stages: list[Stage]
+    direction: int
+    turns_hz: float
+    frequency_hz: list[float]
+    signals: list[Signal]
+    replayed: Replayed
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Course:
+    """A signal (n,) with its name and unit, and the course (n,) that a model makes of it."""
+
+    name: str
+    unit: str
+    measured: Float
+    modelled: Float | None = None
+    model: str | None = None
+
+
+def signals_of(overlay: Overlay) -> RapidSignals:
+    """Return the signals of a rapid with its model."""
+    window = overlay.window
+    begin, end = moving_range(window)
+    every = max(1, -(-window.n // MOST_POINTS))
+    frequency = np.fft.rfftfreq(window.n, window.dt_s)
+    verdict = overlay.outcome.verdict
+    return RapidSignals(
+        every=every,
+        time_s=_digits(np.arange(0, window.n, every) * window.dt_s),
+        move_begin_s=begin * window.dt_s,
+        move_end_s=end * window.dt_s,
+        stages=_stages(window),
+        direction=window.direction,
+        turns_hz=float(np.nanmax(np.abs(window.speed_rad_s), initial=0.0)) / (2.0 * math.pi),
+        frequency_hz=_digits(frequency[:: _step(frequency.size)]),
+        signals=[_signal(course, slice(begin, end), every) for course in _courses(overlay)],
+        replayed=Replayed(
+            accepted=verdict.accepted,
+            fit_percent=verdict.fit_percent,
+            unexplained_um=verdict.unexplained_um,
+            reasons=[_said(reason) for reason in verdict.reasons],
+            warnings=[_said(warning) for warning in verdict.warnings],
+        ),
+    )
+
+
+def _stages(window: Window) -> list[Stage]:
+    spans = ((name, getattr(window.stages, name)) for name in ("accelerate", "cruise", "brake"))
+    return [Stage(name=n, begin_s=s[0] * window.dt_s, end_s=s[1] * window.dt_s) for n, s in spans if s is not None]
+
+
+def _said(reason: Reason) -> Said:
+    return Said(code=reason.code, text=typeset(reason.text), advice=typeset(reason.advice))
+
+
+def _courses(overlay: Overlay) -> list[_Course]:
+    """Return the signals that the rapid has, in the order in which they are read: cause, answer, error."""
+    window = overlay.window
+    speed, current, model = _modelled(overlay)
+    courses = [
+        *_voltage(window),
+        _Course("current_a", "A", window.current_a, current, model),
+        _Course("speed_rad_s", "rad/s", window.speed_rad_s, speed, model),
+    ]
+    followed = overlay.followed
+    predicted = None if followed is None else 1e3 * (followed.predicted_mm - window.demand_mm)
+    error = 1e3 * (window.position_mm - window.demand_mm)
+    if np.isfinite(error).any():
+        courses.append(_Course("following_error_um", "um", error, predicted, None if followed is None else "loop"))
+    if window.offset_mm is not None:
+        courses.append(_Course("offset_um", "um", 1e3 * window.offset_mm))
+    if window.table_mm is not None:
+        courses.append(_Course("table_error_um", "um", 1e3 * (window.table_mm - window.demand_mm)))
+    return courses
+
+
+def _modelled(overlay: Overlay) -> tuple[Float | None, Float | None, str | None]:
+    """Return speed and current (n,) as the measured voltage makes them, else as the closed loop does."""
+    window, driven, followed = overlay.window, overlay.driven, overlay.followed
+    if driven is not None:
+        time_s = np.arange(window.n) * window.dt_s
+        speed, current = (
+            np.interp(time_s, driven.time_s, course, math.nan, math.nan)
+            for course in (driven.speed_rad_s, driven.current_a)
+        )
+        return speed, current, "voltage"
+    if followed is not None:
+        return followed.response.speed_rad_s, followed.response.current_a, "loop"
+    return None, None, None
+
+
+def _voltage(window: Window) -> list[_Course]:
+    """Return the voltage on the window's rows; a slow sensor's value stands for its whole period."""
+    if window.voltage_v is not None:
+        return [_Course("voltage_v", "V", window.voltage_v)]
+    slow = window.slow_voltage
+    if slow is None:
+        return []
+    sample = np.floor((np.arange(window.n) * window.dt_s - slow.begin_s) / slow.period_s).astype(np.int64)
+    inside = (sample >= 0) & (sample < slow.voltage_v.size)
+    held = np.where(inside, slow.voltage_v[np.clip(sample, 0, slow.voltage_v.size - 1)], math.nan)
+    return [_Course("voltage_v", "V", held)]
+
+
+def _signal(course: _Course, moving: slice, every: int) -> Signal:
+    measured, modelled = course.measured, course.modelled
+    residual = None if modelled is None else measured - modelled
+    left = np.zeros(0) if residual is None else residual[moving][np.isfinite(residual[moving])]
+    return Signal(
+        name=course.name,
+        unit=course.unit,
+        shown_unit=typeset(course.unit),
+        model=course.model,
+        measured=_told(measured[::every]),
+        modelled=None if modelled is None else _told(modelled[::every]),
+        residual=None if residual is None else _told(residual[::every]),
+        residual_rms=rms(left) if left.size else None,
+        measured_spectrum=_told(spectrum(measured)),
+        residual_spectrum=None if residual is None else _told(spectrum(residual)),
+    )
+
+
+def spectrum(values: Float) -> Float:
+    """Return the amplitudes (m,) of a signal (n,) less its mean: a sine of amplitude 1 makes a peak of 1.
+
+    Hann's window, whose peaks are Harris' (1978); lost rows are bridged by a line. Of neighbours the largest is told.
+    """
+    if not np.isfinite(values).any():
+        return np.full(0, math.nan)
+    known = bridged(np.where(np.isfinite(values), values, math.nan))
+    taper = np.hanning(values.size + 1)[:-1]
+    amplitude = 2.0 * np.abs(np.fft.rfft((known - known.mean()) * taper)) / max(float(taper.sum()), 1e-300)
+    step = _step(amplitude.size)
+    padded = np.append(amplitude, np.zeros(-amplitude.size % step))
+    peaks: Float = padded.reshape(-1, step).max(axis=1)
+    return peaks
+
+
+def _step(size: int) -> int:
+    return max(1, -(-size // MOST_POINTS))
+
+
+def _told(values: Float) -> Points:
+    """Return numbers as JSON has them, null where there is none."""
+    return [float(f"{v:.{DIGITS}g}") if math.isfinite(v) else None for v in values.tolist()]
+
+
+def _digits(values: npt.NDArray[Any]) -> list[float]:
+    return [float(f"{v:.9g}") for v in values.tolist()]

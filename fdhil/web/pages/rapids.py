@@ -1,0 +1,119 @@
+"""The rapids: which were recorded, what was said of each, its signals with the model laid over, its recording."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path as FilePath
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, FastAPI, Path, Query
+from fastapi.responses import Response
+from starlette.requests import HTTPConnection
+
+from fdhil.daemon.outcome_store import WINDOWS_FOLDER
+from fdhil.errors import StoreError
+from fdhil.store.named_file import open_named
+from fdhil.store.windows import MAX_FILE_BYTES
+from fdhil.web.context import Asking, Context, Here
+from fdhil.web.pages.rapid_list import (
+    LARGEST_ID,
+    Counts,
+    Kept,
+    Rapids,
+    RapidTold,
+    Verdict,
+    counts_of,
+    page_of,
+    the_window,
+    told_of,
+)
+from fdhil.web.pages.rapid_signals import RapidSignals
+from fdhil.web.replayer import Replayer
+
+
+@asynccontextmanager
+async def _replaying(app: FastAPI) -> AsyncIterator[None]:
+    """End the process that replays with the one that serves."""
+    try:
+        yield
+    finally:
+        replayer_of(app).close()
+
+
+def replayer_of(app: FastAPI) -> Replayer:
+    """Return the one that replays for this application."""
+    if not hasattr(app.state, "replayer"):
+        app.state.replayer = Replayer(app.state.context.config)
+    replayer = app.state.replayer
+    assert isinstance(replayer, Replayer)
+    return replayer
+
+
+def _replayer(connection: HTTPConnection) -> Replayer:
+    return replayer_of(connection.app)
+
+
+router = APIRouter(prefix="/api/rapids", lifespan=_replaying)
+Replaying = Annotated[Replayer, Depends(_replayer)]
+LOG = logging.getLogger("fdhil.web")
+Axis = Annotated[str, Path(pattern="^[A-Z]$")]
+Number = Annotated[int, Path(ge=1, le=LARGEST_ID)]
+PARQUET = "application/vnd.apache.parquet"
+
+
+@router.get("")
+def rapids(
+    here: Here,
+    axis: Annotated[str | None, Query(pattern="^[A-Z]$")] = None,
+    verdict: Verdict | None = None,
+    code: Annotated[str | None, Query(max_length=64)] = None,
+    before: Annotated[int | None, Query(ge=1, le=LARGEST_ID)] = None,
+    limit: Annotated[int, Query(ge=1, le=200)] = 50,
+) -> Rapids:
+    """Return the newest rapids, or those ``before`` a number, of an axis, a verdict, a reason's class."""
+    with here.history() as history:
+        return page_of(history, _kept(here), axis, verdict, code, before, limit)
+
+
+@router.get("/counts")
+def counts(here: Here, axis: Annotated[str | None, Query(pattern="^[A-Z]$")] = None) -> Counts:
+    """Return how many of the newest rapids were accepted, and why the others were refused."""
+    with here.history() as history:
+        return counts_of(history, here.config.axis, axis)
+
+
+@router.get("/recordings/{name:path}", response_class=Response)
+def recording(here: Here, asking: Asking, name: str) -> Response:
+    """Return a recording as its file is, for ``fdhil replay`` and ``fdhil export``."""
+    try:
+        with open_named(_folder(here), name) as file:
+            content = file.read(MAX_FILE_BYTES)
+    except StoreError as error:
+        if error.code == "BadName":
+            LOG.warning("BadName: %a asked for a recording %a", asking.name, name[:200])
+        raise
+    return Response(content, media_type=PARQUET, headers={"Content-Disposition": f'attachment; filename="{name}"'})
+
+
+@router.get("/{axis}/{number}")
+def rapid(here: Here, axis: Axis, number: Number) -> RapidTold:
+    """Return what the history has of one rapid."""
+    with here.history() as history:
+        return told_of(history, the_window(history, axis, number), _kept(here))
+
+
+@router.get("/{axis}/{number}/signals", response_model=RapidSignals)
+def signals(replayer: Replaying, axis: Axis, number: Number) -> Response:
+    """Return a rapid's signals with the model laid over them, as a replay finds it now."""
+    return Response(replayer.signals(axis, number), media_type="application/json")
+
+
+def _folder(here: Context) -> FilePath:
+    return here.config.store.directory / WINDOWS_FOLDER
+
+
+def _kept(here: Context) -> Kept:
+    folder = _folder(here)
+    return lambda name: bool(name) and (folder / name).is_file()

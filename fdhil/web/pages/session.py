@@ -1,0 +1,63 @@
+"""Logs in and out, and tells the browser who it is. Open to everyone who reaches the address; it tells no secret."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Request
+from pydantic import BaseModel, Field
+
+from fdhil.config.users import LONGEST_PASSWORD, Role
+from fdhil.web.access import LIFE_S
+from fdhil.web.context import AtEntry
+from fdhil.web.gate import token_of
+
+router = APIRouter(prefix="/api/session")
+
+
+class Login(BaseModel):
+    """A name and a password."""
+
+    name: Annotated[str, Field(min_length=1, max_length=64)]
+    password: Annotated[str, Field(min_length=1, max_length=LONGEST_PASSWORD)]
+
+
+class Who(BaseModel):
+    """Who asks, and whether a login is needed: ``role`` is null where nothing may be read yet."""
+
+    name: str
+    role: Role | None
+    login_needed: bool
+    acting: bool
+
+
+class LoggedIn(Who):
+    """A login: the token that every further request carries, and for how long at most."""
+
+    token: str
+    life_s: float
+
+
+@router.get("")
+def who(request: Request, here: AtEntry) -> Who:
+    """Tell who asks."""
+    asker = here.access.asker(token_of(request.headers))
+    acting = here.web.acting
+    role, name = (asker.role, asker.name) if asker else (None, "")
+    return Who(name=name, role=role, login_needed=here.access.by_login, acting=acting and role == "operate")
+
+
+@router.post("")
+async def log_in(login: Login, request: Request, here: AtEntry) -> LoggedIn:
+    """Log in."""
+    address = request.client.host if request.client else ""
+    token, session = await here.access.log_in(login.name, login.password, address)
+    asker, acting = session.asker, here.web.acting and session.asker.role == "operate"
+    return LoggedIn(name=asker.name, role=asker.role, login_needed=True, acting=acting, token=token, life_s=LIFE_S)
+
+
+@router.delete("")
+def log_out(request: Request, here: AtEntry) -> Who:
+    """Log out: the token is worth nothing from now on."""
+    here.access.log_out(token_of(request.headers))
+    return who(request, here)

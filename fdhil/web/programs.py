@@ -1,0 +1,69 @@
+"""The NC programs that may be armed from a browser: plain files of one folder, by names that lead nowhere else."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from io import BufferedReader
+from pathlib import Path
+
+from pydantic import BaseModel, Field
+
+from fdhil.errors import StoreError
+from fdhil.store.named_file import open_named
+from fdhil.web.answers import Refused
+
+NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
+MOST = 500
+LARGEST = 64 * 1024 * 1024
+
+
+class Program(BaseModel):
+    """A program of the folder: its name, size and time of change; its digest where it was read."""
+
+    name: str
+    size_bytes: int
+    changed_wall_s: float
+    sha256: str = ""
+    path: str = Field("", exclude=True)
+
+
+def listed(folder: Path) -> list[Program]:
+    """Return the folder's programs, the newest first; none where the folder cannot be read."""
+    found = []
+    try:
+        with os.scandir(folder) as entries:
+            for entry in entries:
+                if re.fullmatch(NAME, entry.name) and entry.is_file(follow_symlinks=False):
+                    status = entry.stat(follow_symlinks=False)
+                    found.append(Program(name=entry.name, size_bytes=status.st_size, changed_wall_s=status.st_mtime))
+    except OSError:
+        return []
+    return sorted(found, key=lambda program: (-program.changed_wall_s, program.name))[:MOST]
+
+
+def look_at(folder: Path | None, name: str) -> Program:
+    """Return a program with its digest (blocking). Refused for a name that is no file of the folder."""
+    if folder is None:
+        text = "no folder is named whose programs may be armed from a browser"
+        raise Refused(409, "NoPrograms", text, "set web.programs_directory, or use fdhil arm CONFIG PROGRAM")
+    if not re.fullmatch(NAME, name):
+        raise Refused(422, "BadName", "this is no name of a program", "letters, digits, . _ and -, at most 64")
+    with _opened(folder, name) as file:
+        status = os.fstat(file.fileno())
+        if status.st_size > LARGEST:
+            raise Refused(422, "BadName", f"{name} is no program that can be armed here", "use fdhil arm")
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    path = str(folder.resolve() / name)
+    return Program(name=name, size_bytes=status.st_size, changed_wall_s=status.st_mtime, sha256=digest, path=path)
+
+
+def _opened(folder: Path, name: str) -> BufferedReader:
+    """Open a regular file of the folder itself. Refused."""
+    try:
+        return open_named(folder, name)
+    except StoreError as error:
+        if error.code == "BadName":
+            raise Refused(422, "BadName", f"{name} is no program that can be armed here", "use fdhil arm") from None
+        raise Refused(404, "NotFound", f"{name} is not there or cannot be read", "look at the list again") from None

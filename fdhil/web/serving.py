@@ -1,0 +1,145 @@
+"""Listens for browsers: where it may, with TLS where it must, until it is told to stop."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+import socket
+import ssl
+from collections.abc import Callable, Iterator
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
+
+from fdhil.config import MachineConfig
+from fdhil.config.web import Web, is_loopback
+from fdhil.errors import ConfigError, ConfigFault, ConnectError, FdhilError
+
+if TYPE_CHECKING:
+    import uvicorn
+    from fastapi import FastAPI
+
+NEEDED = ("fastapi", "uvicorn", "websockets")
+LARGEST_MESSAGE = 64 * 1024
+BACKLOG = 64
+KEEP_ALIVE_S = 15
+STOP_S = 3
+
+
+def require() -> None:
+    """Raise FdhilError where what serves the pages is not installed."""
+    if any(find_spec(name) is None for name in NEEDED):
+        raise FdhilError("fdhil web needs the extra 'web': pip install 'fdhil[web]'")
+
+
+def check_reach(web: Web) -> None:
+    """Refuse to listen where others could read or act unprotected. ConfigError with what to set."""
+    if web.on_loopback:
+        return
+    faults = []
+    where = f"{web.host} can be reached from other computers"
+    if web.tls_certificate_file is None and (web.acting or not web.unprotected):
+        faults.append(ConfigFault("web.tls_certificate_file", f"is missing, and {where}", _tls_advice(web)))
+    if web.users_file is None and not web.unprotected:
+        advice = "make users with fdhil web-user, or set web.unprotected = true to let all of them read"
+        faults.append(ConfigFault("web.users_file", f"is missing, and {where}", advice))
+    if faults:
+        raise ConfigError("web.host", faults)
+
+
+def _tls_advice(web: Web) -> str:
+    files = "give certificate and key"
+    if web.acting:
+        return f"{files}: who acts sends a password"
+    return f"{files}, or set web.unprotected = true to do without"
+
+
+def run(config: MachineConfig, ready: Callable[[str], None]) -> None:
+    """Serve the pages of a machine until SIGTERM or SIGINT; ``ready`` is told the address. FdhilError as below."""
+    require()
+    from fdhil.web.app import make_app
+
+    serve(config.web, lambda: make_app(config), ready)
+
+
+def serve(web: Web, make: Callable[[], FastAPI], ready: Callable[[str], None]) -> None:
+    """Serve an application until SIGTERM or SIGINT. FdhilError when it cannot start."""
+    require()
+    check_reach(web)
+    certificate = _tls(web)
+    with _listening(web) as listener:
+        asyncio.run(_serve(web, make, listener, certificate, ready))
+
+
+def url_of(web: Web, listener: socket.socket) -> str:
+    """Return the address to open in a browser."""
+    port = listener.getsockname()[1]
+    host = "localhost" if web.host in ("0.0.0.0", "::") else f"[{web.host}]" if ":" in web.host else web.host
+    return f"{'https' if web.tls_certificate_file else 'http'}://{host}:{port}"
+
+
+def _tls(web: Web) -> ssl.SSLContext | None:
+    if web.tls_certificate_file is None or web.tls_key_file is None:
+        return None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    try:
+        context.load_cert_chain(web.tls_certificate_file, web.tls_key_file)
+    except (OSError, ssl.SSLError) as error:
+        what = f"cannot be used: {error.strerror or error}"
+        fault = ConfigFault(str(web.tls_certificate_file), what, f"check it and its key {web.tls_key_file}")
+        raise ConfigError("web.tls_certificate_file", [fault]) from None
+    return context
+
+
+@contextlib.contextmanager
+def _listening(web: Web) -> Iterator[socket.socket]:
+    try:
+        family, _, _, _, address = socket.getaddrinfo(web.host, web.port, type=socket.SOCK_STREAM)[0]
+        if is_loopback(web.host) and not is_loopback(str(address[0])):
+            raise OSError("the name does not lead to this computer")
+        listener = socket.create_server(address[:2], family=family, backlog=BACKLOG)
+    except OSError as error:
+        text = f"cannot be listened at ({error.strerror or error}); set another web.host or web.port"
+        raise ConnectError(f"{web.host}:{web.port}", text) from None
+    with listener:
+        yield listener
+
+
+async def _serve(
+    web: Web,
+    make: Callable[[], FastAPI],
+    listener: socket.socket,
+    certificate: ssl.SSLContext | None,
+    ready: Callable[[str], None],
+) -> None:
+    server = server_of(make(), certificate, lambda: ready(url_of(web, listener)))
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, setattr, server, "should_exit", True)
+    await server.serve([listener])
+
+
+def server_of(app: FastAPI, certificate: ssl.SSLContext | None, ready: Callable[[], None]) -> uvicorn.Server:
+    """Return the server of an application; it calls ``ready`` when it has begun."""
+    import uvicorn  # late: the extra may be missing, and this must import without it
+
+    from fdhil.web.connections import MOST_CONNECTIONS, BoundedHttp, BoundedSocket
+
+    class Server(uvicorn.Server):
+        @contextlib.contextmanager
+        def capture_signals(self) -> Iterator[None]:
+            yield  # ours end it: uvicorn's would end the process by the signal, which systemd calls a failure
+
+        async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+            await super().startup(sockets)
+            ready()
+
+    settings = uvicorn.Config(
+        app,
+        log_config=None, log_level="error", access_log=False, server_header=False, proxy_headers=False,
+        http=BoundedHttp, ws=BoundedSocket, ws_max_size=LARGEST_MESSAGE, limit_concurrency=MOST_CONNECTIONS,
+        timeout_keep_alive=KEEP_ALIVE_S, timeout_graceful_shutdown=STOP_S,
+    )  # fmt: skip
+    settings.load()
+    settings.ssl = certificate
+    return Server(settings)

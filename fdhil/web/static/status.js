@@ -1,0 +1,36 @@
+// Asks how the machine is once a second, for all of the page that shows it. watch(f) calls f({told, status, fault}):
+// what /api/machine tells, the daemon's newest status document (kept while it is silent), and why it is silent, else null.
+
+import {get} from "/static/ask.js";
+
+const PERIOD_MS = 1000;
+const watchers = new Set();
+let last = null;
+let timer = null;
+let asking = false;
+
+async function look() {
+  if (asking) return;
+  asking = true;
+  clearTimeout(timer);
+  try {
+    const told = await get("/api/machine");
+    last = {told, status: told.status ?? last?.status ?? null, fault: told.fault};
+  } catch (fault) {
+    last = {told: last?.told ?? null, status: last?.status ?? null, fault};
+  }
+  asking = false;
+  for (const f of [...watchers]) f(last);
+  timer = watchers.size && !document.hidden ? setTimeout(look, PERIOD_MS) : null;
+}
+
+document.addEventListener("visibilitychange", () => { if (!document.hidden && watchers.size) look(); });
+
+export function watch(f) {
+  watchers.add(f);
+  if (last) f(last);
+  if (timer === null) look();
+  return () => watchers.delete(f);
+}
+
+export const lookNow = look;

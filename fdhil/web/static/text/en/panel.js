@@ -1,0 +1,17 @@
+export default {
+  "panel.title": "Panel – fdhil",
+  "panel.axes": "Axes",
+  "panel.axis": "axis",
+  "panel.offset": "offset (µm)",
+  "panel.skill": "model off (µm)",
+  "panel.temperature": "°C",
+  "panel.model": "model",
+  "panel.revision": "rev. {revision}",
+  "panel.unknown": "not identified",
+  "panel.nc": "NC: {motion}, line {line}, F {feed} mm/min, feed override {override}",
+  "panel.armed": "Armed: {program}, {promise}",
+  "panel.armed.none": "Nothing is armed.",
+  "panel.waiting": "{count} notices wait to be acknowledged.",
+  "panel.checking": "Checking {program}, line {line}",
+  "panel.pass": "Last pass of {program}: {measured} µm RMS measured, {predicted} predicted",
+};

@@ -1,0 +1,250 @@
+"""Long life: a week of work at speed-up, and real hours with faults (``python -m studies.soak``).
+
+The real daemon, guard, pages, publisher and simulated machine run as processes; after each round of rapids it is noted
+what each of them uses. The samples are kept below ``--folder`` as they come, one JSON object a line. With ``--rapids 0
+--hours 0`` nothing is run: the page is made of what is there so far.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from studies import pages
+from studies.soak_life import EVENTS, RAPIDS, RESTARTS, Life
+from studies.soak_shop import KEPT_WINDOWS, STORE_MB, Shop, document_of
+from studies.usage import Slope, slope
+
+PERIOD_S = 0.004
+A_DAY = 1440  # rapids of a machine in a day: one a minute, around the clock
+WEEK_H, REAL_H = 168.0, 8.0  # what the goal asks for
+MOST_MB_A_DAY = 1.0
+EMERGENCIES = 1_000_000
+RESTARTING = 0.15  # of the rounds, at the beginning, in which daemon and guard are restarted
+WARM = 0.5  # of a process' life, before anything is concluded: the pages read the newest 2,000 rapids of an axis
+OURS = ("daemon", "guard", "pages", "publisher")
+FLAT = ("descriptors", "threads", "children")
+
+
+# -- running
+
+
+def work(folder: Path, seed: int, rounds: int, hours: float, rest_s: float) -> None:
+    """Let a shop work for so many rounds, or, with ``hours``, in real time for so long with rests between."""
+    folder.mkdir(parents=True, exist_ok=True)
+    what = f"--rapids 0 --hours {hours:g} --rest {rest_s:g}" if hours else f"--rapids {rounds * RAPIDS} --hours 0"
+    run = pages.provenance(f"python -m studies.soak {what}") | {"seeds": str(seed)}
+    (folder / "run.json").write_text(json.dumps(run), "utf-8")
+    shop = Shop(folder, document_of(folder, PERIOD_S, lockstep=not hours), not hours)
+    began_s, restarting_s = time.monotonic(), RESTARTING * hours * 3600
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # all that was started is ended
+    try:
+        shop.open()
+        life = Life(shop, folder / "samples.jsonl", seed)
+        while time.monotonic() - began_s < 3600 * hours if hours else life.rounds < rounds:
+            early = time.monotonic() - began_s < restarting_s if hours else life.rounds < RESTARTING * rounds
+            life.round({**EVENTS, **RESTARTS} if early else EVENTS)
+            time.sleep(rest_s)
+    finally:
+        shop.close()
+
+
+# -- concluding
+
+
+def read(folder: Path) -> list[dict[str, Any]]:
+    """Return the samples of a run so far."""
+    file = folder / "samples.jsonl"
+    return [json.loads(line) for line in file.read_text("utf-8").splitlines()] if file.exists() else []
+
+
+def longest_life(samples: Sequence[Mapping[str, Any]], name: str) -> list[Mapping[str, Any]]:
+    """Return the samples of a part's process that lived longest, after its warm-up."""
+    lives: dict[int, list[Mapping[str, Any]]] = {}
+    for sample in samples:
+        if name in sample["process"]:
+            lives.setdefault(sample["process"][name]["pid"], []).append(sample)
+    longest = max(lives.values(), key=len, default=[])
+    return longest[int(WARM * len(longest)) :]
+
+
+def figures_of(folder: Path, per_day: bool) -> dict[str, Any]:
+    """Return what a run tells: growth of each process per day of work (``per_day``: of the clock), and all counts."""
+    samples = read(folder)
+    if not samples:
+        return {}
+    last = samples[-1]
+    day = 86400.0 if per_day else A_DAY / RAPIDS
+    where = "at_s" if per_day else "round"
+    processes = {}
+    for name in (*OURS, "machine"):
+        life = longest_life(samples, name)
+        if life:
+            processes[name] = _process(name, life, where, day)
+    return {
+        "run": json.loads((folder / "run.json").read_text("utf-8")),
+        "rounds": last["round"],
+        "rapids": last["round"] * RAPIDS,
+        "hours": last["at_s"] / 3600,
+        "processes": processes,
+        "store_mb": {name: [samples[0]["store_mb"][name], last["store_mb"][name]] for name in last["store_mb"]},
+        "log_mb": last["log_mb"],
+        "happened": last["happened"],
+        "failed": last["failed"],
+        "restarts": last["restarts"],
+        "dropped": last["dropped"],
+    }
+
+
+def _process(name: str, life: Sequence[Mapping[str, Any]], where: str, day: float) -> dict[str, Any]:
+    told = [sample["process"][name] for sample in life]
+    over = [sample[where] for sample in life]
+    grown = {
+        key: None if (found := slope(over, [each[key] for each in told])) is None else asdict(found.times(day))
+        for key in ("resident_mb", "anonymous_mb", *FLAT)
+    }
+    return {
+        "samples": len(life),
+        "resident_mb": [told[0]["resident_mb"], told[-1]["resident_mb"]],
+        "a_day": grown,
+        **{key: [min(each[key] for each in told), max(each[key] for each in told)] for key in FLAT},
+        "zombies": max(each["zombies"] for each in told),
+    }
+
+
+def goal(week: Mapping[str, Any], hours: Mapping[str, Any]) -> dict[str, Any]:
+    """Return whether the goal is met, and the figure that says so."""
+    met, told = True, []
+    for run, long_h, need_h, what in (
+        (week, week.get("rapids", 0) / A_DAY * 24, WEEK_H, "h of work at speed-up"),
+        (hours, hours.get("hours", 0.0), REAL_H, "real hours"),
+    ):
+        growth = {
+            name: run["processes"][name]["a_day"]["resident_mb"] for name in OURS if name in run.get("processes", {})
+        }
+        known = {name: each["value"] for name, each in growth.items() if each is not None}
+        met &= long_h >= need_h and len(known) == len(OURS) and all(v < MOST_MB_A_DAY for v in known.values())
+        steepest = max(known, key=lambda name: known[name], default=None)
+        grown = f", steepest {steepest} {known[steepest]:+.2f} MB a day" if steepest else ""
+        told.append(f"{long_h:.3g} of {need_h:.0f} {what}{grown}")
+    emergencies = sum(run.get("happened", {}).get("emergencies", 0) for run in (week, hours))
+    met &= emergencies >= EMERGENCIES
+    return {"met": met, "figure": f"{'; '.join(told)}; {emergencies:,} emergencies"}
+
+
+def measure(options: argparse.Namespace) -> dict[str, Any]:
+    """Run what is asked for, or read what is there, and conclude."""
+    with tempfile.TemporaryDirectory(prefix="fdhil-soak-") as temporary:
+        folder = options.folder or Path(temporary)
+        if options.rapids:
+            work(folder / "week", options.seed, -(-options.rapids // RAPIDS), 0.0, 0.0)
+        if options.hours:
+            work(folder / "hours", options.seed, 0, options.hours, options.rest)
+        week = figures_of(folder / "week", per_day=False)
+        hours = figures_of(folder / "hours", per_day=True)
+    return {"week": week, "hours": hours, "goals": {"R13": goal(week, hours)}}
+
+
+# -- the page
+
+
+def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
+    """Return the study's page."""
+    goal = figures["goals"]["R13"]
+    lines = pages.head("Long life: a week at speed-up, and real hours", "soak", run)
+    lines += pages.paragraph(
+        f"""Does anything grow? Goal: {WEEK_H:.0f} h of work at speed-up and {REAL_H:.0f} real hours with faults, memory
+        below {MOST_MB_A_DAY:g} MB a day after the warm-up, descriptors and threads flat, {EMERGENCIES:,} emergencies
+        absorbed. **{"Met" if goal["met"] else "Not met"}**: {goal["figure"]}."""
+    )
+    lines += pages.paragraph(
+        f"""The daemon, the guard, the pages, a publisher and the simulated machine of two axes (SYNC every
+        {PERIOD_S * 1e3:g} ms) run as processes. After each round of {RAPIDS} rapids it is noted what each
+        of them uses. In the first {RESTARTING:.0%} of a run daemon and guard are restarted and killed; growth is that
+        of the process that lived longest, in the second half of its life, as a straight line with its 95 %
+        interval. The store is a disk of {STORE_MB} MB in memory, so that it can be full, and keeps {KEPT_WINDOWS}
+        recordings instead of 10,000, so that it is full early."""
+    )
+    if figures["week"]:
+        lines += ["## A week at speed-up", "", *_week_words(figures["week"]), *_tables(figures["week"], "a day's work")]
+    if figures["hours"]:
+        lines += ["## Real hours", "", *_hours_words(figures["hours"]), *_tables(figures["hours"], "a day")]
+    return "\n".join(lines)
+
+
+def _week_words(week: Mapping[str, Any]) -> list[str]:
+    return pages.paragraph(
+        f"""{week["rapids"]:,} rapids, {week["rapids"] / A_DAY:.2g} days of a machine that makes one a
+        minute around the clock; it took {week["hours"]:.2g} h. Compressed: the standstill between rapids, and with it
+        whatever grows by the clock alone. Not compressed: each rapid, its frames, its fit, what is stored and told of
+        it, and what happens between. {_measured(week)}"""
+    )
+
+
+def _hours_words(hours: Mapping[str, Any]) -> list[str]:
+    return pages.paragraph(
+        f"""{hours["hours"]:.2f} h by the clock, {hours["rapids"]:,} rapids. {_measured(hours)} The pages read the
+        newest 2,000 rapids of each axis: what they use follows the history until it has as many, and no further."""
+    )
+
+
+def _measured(run: Mapping[str, Any]) -> str:
+    told = run["run"]
+    return f"Measured by `{told['command']}` on {told['date']}, commit {told['commit']}."
+
+
+def _tables(run: Mapping[str, Any], day: str) -> list[str]:
+    rows = [_row(name, told) for name, told in run["processes"].items()]
+    names = ("process", "samples", "memory, MB", f"MB in {day}", "descriptors", "threads", "children", "zombies")
+    sizes = [[name, f"{first:.2f}", f"{last:.2f}"] for name, (first, last) in run["store_mb"].items()]
+    sizes += [[f"log of {name}", "0.00", f"{size:.2f}"] for name, size in run["log_mb"].items()]
+    happened = [[name, f"{times:,}"] for name, times in sorted(run["happened"].items())]
+    failed = [f"* {times} times: {what}" for what, times in run["failed"].items()]
+    failed += [
+        f"* {name} ended by itself {times} times and was started again" for name, times in run["restarts"].items()
+    ]
+    return [
+        *pages.grid(names, rows), "",
+        *pages.grid(("in the store", "MB at first", "MB at last"), sizes), "",
+        *pages.grid(("what happened", "times"), happened), "",
+        *(["What did not answer as asked:", "", *failed, ""] if failed else []),
+    ]  # fmt: skip
+
+
+def _row(name: str, told: Mapping[str, Any]) -> list[str]:
+    first, last = told["resident_mb"]
+    grown = told["a_day"]["resident_mb"]
+    slope = "too few samples" if grown is None else _said(Slope(**grown))
+    spans = [_span(*told[key]) for key in FLAT]
+    return [name, str(told["samples"]), f"{first:.1f} to {last:.1f}", slope, *spans, str(told["zombies"])]
+
+
+def _span(low: int, high: int) -> str:
+    return str(low) if low == high else f"{low} to {high}"
+
+
+def _said(slope: Slope) -> str:
+    return f"{slope.value:+.2f} ({slope.low:+.2f} to {slope.high:+.2f})"
+
+
+def main() -> None:
+    """Run the study."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rapids", type=int, default=7 * A_DAY, help="of both axes together, at speed-up; 0: none")
+    parser.add_argument("--hours", type=float, default=REAL_H, help="by the clock; 0: none")
+    parser.add_argument("--rest", type=float, default=20.0, help="seconds between two rounds by the clock")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--folder", type=Path, help="where samples, logs and sockets are kept; left out: nowhere")
+    pages.conduct("soak", parser, lambda options: str(options.seed), measure)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,279 @@
+"""The processes of a shop that runs for long: machine, guard, daemon, pages and a publisher, each to be restarted."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from fdhil import config as machine_config
+from fdhil.cli.demo.machines import machine_document
+from fdhil.cli.demo.processes import Process, Twin
+from fdhil.cli.demo.toml import to_toml
+from fdhil.commissioning.record import save_record
+from fdhil.commissioning.steps import commission
+from fdhil.config import MachineConfig
+from fdhil.daemon.control import SOCKET_NAME, ask
+from fdhil.errors import ConnectError, FdhilError
+
+PATIENCE_S = 600.0
+LOOK_S = 0.1
+TRIES = 50
+CANNOT = "cannot be played"
+KEPT_WINDOWS = 400
+STORE_MB = 512
+
+
+def free_port() -> int:
+    """Return a TCP port of this computer that nobody has."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return int(listener.getsockname()[1])
+
+
+def document_of(folder: Path, period_s: float, lockstep: bool) -> dict[str, Any]:
+    """Return the configuration: the demonstration's two axes, with a store of its own and all ports chosen."""
+    document = machine_document()
+    document["machine"]["sync_period_s"] = period_s
+    document["sim"]["pace"] = "lockstep" if lockstep else "realtime"
+    document["guard"]["clock"] = "sync" if lockstep else "monotonic"
+    document["store"] = {
+        "directory": str(folder / "store" / "data"),
+        "run_directory": str(folder / "run"),
+        "keep_windows": KEPT_WINDOWS,
+    }
+    document["bus"] = {"can0": {"interface": "socketcand", "host": "127.0.0.1", "port": free_port()}}
+    document["publish"] = {"prometheus": {"port": free_port()}}
+    for axis in document["axis"].values():
+        axis["voltage"] = {"host": "127.0.0.1", "port": free_port()}  # of the drive; a thermometer is beside it
+        axis["temperature"] = {**axis["voltage"], "period_s": 1.0}
+    return document
+
+
+@dataclass
+class Shop:
+    """All processes of one machine below ``folder``. ``restarts`` counts who ended by itself and was started again."""
+
+    folder: Path
+    document: dict[str, Any]
+    lockstep: bool
+    config: MachineConfig = field(init=False)
+    twin: Twin = field(init=False)
+    processes: dict[str, Process] = field(default_factory=dict)
+    url: str = ""
+    restarts: dict[str, int] = field(default_factory=dict)
+    mounted: bool = False
+
+    @property
+    def file(self) -> Path:
+        """The machine's configuration."""
+        return self.folder / "machine.toml"
+
+    @property
+    def store(self) -> Path:
+        """The folder that the daemon writes to."""
+        return self.folder / "store" / "data"
+
+    @property
+    def logs(self) -> Path:
+        """The folder of the processes' own words."""
+        return self.folder / "logs"
+
+    def pids(self) -> Mapping[str, int]:
+        """Return the process of each part of fdhil, and the simulated machine's."""
+        return {name: process.pid for name, process in self.processes.items()} | {"machine": self.twin.pid}
+
+    # -- starting and ending
+
+    def open(self) -> None:
+        """Start everything, commissioned, with the NC on."""
+        for path in (self.folder / "store", self.logs):
+            path.mkdir(parents=True, exist_ok=True)
+        self._mount()
+        self.store.mkdir(parents=True, exist_ok=True)
+        self.start_twin()
+        for axis in self.config.axis:
+            save_record(commission(self.config, axis), self.store, self.config.store.commissioning_key)
+        for name in ("guard", "daemon", "pages", "publisher"):
+            self.start(name)
+        self.nc(on=True)
+
+    def _mount(self) -> None:
+        """Have a small disk of its own below the store, which can be full; only root may."""
+        if os.getuid() == 0:
+            command = ["mount", "-t", "tmpfs", "-o", f"size={STORE_MB}m", "fdhil-soak", str(self.folder / "store")]
+            self.mounted = subprocess.run(command, check=False, capture_output=True).returncode == 0
+
+    def start_twin(self) -> None:
+        """Switch the machine on; it has the ports that it had before."""
+        self.file.write_text(to_toml(self.document), "utf-8")
+        self.config = machine_config.load(self.file)
+        self.twin = Twin(self.file, self.logs / "machine.log")
+
+    def start(self, name: str) -> None:
+        """Start one of fdhil's processes and wait until it answers."""
+        config = str(self.file)
+        command = {
+            "guard": ["fdhil.cli.guard", config],
+            "daemon": ["fdhil", "run", config],
+            "pages": ["fdhil", "web", config, "--port", "0", "--json"],
+            "publisher": ["fdhil", "publish", "prometheus", config],
+        }[name]
+        self.processes[name] = process = Process(name, command, self.logs / f"{name}.log")
+        if name == "pages":
+            self.url = process.event("ready")["url"]
+        elif name == "daemon":
+            self.wait(lambda: self.status() is not None, "the daemon answers", process)
+        elif name == "publisher":
+            port = self.document["publish"]["prometheus"]["port"]
+            self.wait(lambda: _listens(port), "the publisher listens", process)
+        elif name == "guard":
+            guard_socket = self.config.guard_directory / "guard.sock"
+            self.wait(lambda: guard_socket.exists(), "the guard's socket is there", process)
+
+    def attend(self) -> None:
+        """Start again what has ended, as systemd would, and count it."""
+        for name, process in list(self.processes.items()):
+            try:
+                process.check()
+            except ConnectError:
+                process.stop()
+                self.restarts[name] = self.restarts.get(name, 0) + 1
+                self.start(name)
+
+    def restart(self, name: str, number: int = signal.SIGTERM) -> None:
+        """End one of fdhil's processes by a signal and start it again."""
+        process = self.processes[name]
+        os.kill(process.pid, number)
+        self.wait(lambda: _ended(process), f"{name} ends")
+        process.stop()
+        self.start(name)
+
+    def machine_off_and_on(self) -> None:
+        """Switch the machine off and on again: bus, drives, sensors and NC are gone meanwhile."""
+        self.twin.stop()
+        time.sleep(1.0)
+        self.attend_guard_without_bus()
+        self.start_twin()
+        self.attend()
+        self.wait(lambda: self.told("source").get("state") == "listening", "the daemon listens again")
+        self.check()
+
+    def attend_guard_without_bus(self) -> None:
+        """Let the guard end, which cannot be without a bus."""
+        guard = self.processes["guard"]
+        until_s = time.monotonic() + 10.0
+        while not _ended(guard) and time.monotonic() < until_s:
+            time.sleep(LOOK_S)
+        if not _ended(guard):
+            return
+        guard.stop()
+        del self.processes["guard"]
+        self._guard_waits = True
+
+    _guard_waits: bool = False
+
+    def check(self) -> None:
+        """Have the drives compared with what was signed off (they booted), then let the NC have them."""
+        if self._guard_waits:
+            self.start("guard")
+            self._guard_waits = False
+        self.nc(on=False)
+        self.command("check", fine=(0, 1, 3))
+        self.nc(on=True)
+
+    def close(self) -> None:
+        """End everything; what was measured stays."""
+        for process in (*self.processes.values(), self.twin):
+            process.stop()
+        if self.mounted:
+            subprocess.run(["umount", str(self.folder / "store")], check=False)
+
+    # -- talking to it
+
+    def command(self, *arguments: object, fine: tuple[int, ...] = (0,)) -> dict[str, Any]:
+        """Run a command of fdhil that answers in JSON."""
+        command = ["python", "-m", "fdhil", str(arguments[0]), str(self.file), *map(str, arguments[1:]), "--json"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
+        if done.returncode not in fine:
+            raise FdhilError(f"{' '.join(command)} ended with {done.returncode}: {done.stdout}{done.stderr}")
+        return dict(json.loads(done.stdout)) if done.stdout else {}
+
+    def ask(self, request: str, **more: Any) -> dict[str, Any]:
+        """Ask the daemon."""
+        return dict(ask(self.folder / "run" / SOCKET_NAME, {"request": request, **more}, timeout_s=PATIENCE_S))
+
+    def status(self) -> dict[str, Any] | None:
+        """Return the daemon's status, None while it does not answer."""
+        try:
+            return self.ask("status")
+        except FdhilError:
+            return None
+
+    def told(self, key: str) -> Any:
+        """Return a part of the daemon's status, empty while there is none."""
+        return (self.status() or {}).get(key) or {}
+
+    def wait(self, done: Callable[[], bool], what: str, process: Process | None = None) -> None:
+        """Wait until something holds; FdhilError when it does not within ten minutes, or a process has ended."""
+        until_s = time.monotonic() + PATIENCE_S
+        while not done():
+            (process or self.twin).check()
+            if time.monotonic() > until_s:
+                raise FdhilError(f"waited in vain: {what}; see {self.logs}")
+            time.sleep(LOOK_S)
+
+    def nc(self, on: bool) -> None:
+        """Switch the NC on or off, trying again while a drive is not ready for it."""
+        for _ in range(TRIES):
+            self.twin.command("nc", on=on)
+            if (told := self.event("nc")) and told["on"] is on:
+                return
+            time.sleep(LOOK_S)
+        raise FdhilError(f"the NC of the simulated machine does not get {'the drives' if on else 'out'}")
+
+    def fault(self, name: str, **keys: Any) -> None:
+        """Start a fault of the simulated machine."""
+        self.twin.command("fault", fault=name, **keys)
+
+    def event(self, kind: str) -> dict[str, Any] | None:
+        """Return the machine's next event of a kind, None where it cannot; its other complaints are of the faults."""
+        while True:
+            try:
+                return self.twin.event(kind)
+            except ConnectError as error:
+                self.twin.check()
+                if CANNOT in str(error):
+                    return None
+
+    def play(self, program: Path, meanwhile: Callable[[], None] = lambda: None) -> bool:
+        """Let the NC play a program; return whether no fault stopped it. An NC that has lost a drive is switched on."""
+        self.twin.command("play", file=str(program))
+        meanwhile()
+        finished = self.event("finished")
+        if finished is None:
+            self.nc(on=True)
+            self.twin.command("play", file=str(program))
+            finished = self.event("finished")
+        return finished is not None and not finished["stopped"]
+
+
+def _listens(port: int) -> bool:
+    with suppress(OSError), socket.create_connection(("127.0.0.1", port)):
+        return True
+    return False
+
+
+def _ended(process: Process) -> bool:
+    with suppress(ConnectError):
+        process.check()
+        return False
+    return True

@@ -1,0 +1,140 @@
+"""fdhil doctor looks at what goes to the works, and sends nothing."""
+
+from __future__ import annotations
+
+import socket
+import sqlite3
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import pytest
+
+from fdhil.cli.doctor.uplink import examine_uplink
+from fdhil.store import HISTORY_FILE
+from fdhil.store.outbox import POSITION_FILE, OutboxReader, Position, write_position
+from tests.fleet.machine import Machine, written
+
+JETSTREAM = b'INFO {"server_id":"A","jetstream":true}\r\n'
+
+
+@contextmanager
+def answering(words: bytes) -> Iterator[tuple[str, list[bytes]]]:
+    """Answer one caller with a server's greeting; yields the server, and what it was sent."""
+    sent: list[bytes] = []
+    with socket.create_server(("127.0.0.1", 0)) as door:
+
+        def answer() -> None:
+            caller, _ = door.accept()
+            with caller:
+                caller.sendall(words)
+                sent.append(caller.recv(100))
+
+        thread = threading.Thread(target=answer, daemon=True)
+        thread.start()
+        yield f"nats://127.0.0.1:{door.getsockname()[1]}", sent
+        thread.join(10)
+
+
+def recorded(folder: Path, **uplink: str) -> Machine:
+    """Return a machine that has recorded, and whose records of now are told to be all sent."""
+    machine = Machine(written(folder, **uplink))
+    machine.record(1)
+    machine.config.uplink_directory.mkdir()
+    with OutboxReader(machine.config.store.directory) as reader:
+        last = reader.entries(0, 100)[-1]
+        write_position(machine.config.uplink_directory, Position(reader.store, last.number, last.message))
+    machine.close()
+    return machine
+
+
+def codes(machine: Machine, offline: bool = True) -> list[str]:
+    troubles = list(examine_uplink(machine.config, offline))
+    assert all(trouble.what and trouble.means and trouble.mend for trouble in troubles)
+    return [trouble.code for trouble in troubles]
+
+
+def change(machine: Machine, statement: str) -> None:
+    with closing(sqlite3.connect(machine.config.store.directory / HISTORY_FILE)) as db, db:
+        db.execute(statement)
+
+
+def waits(machine: Machine) -> None:
+    (machine.config.uplink_directory / POSITION_FILE).unlink()
+    change(machine, "DELETE FROM outbox WHERE of = 'windows'")
+    change(machine, "UPDATE revisions SET wall_s = 5")  # damaged, and of no known time
+
+
+def damaged_position(machine: Machine) -> None:
+    (machine.config.uplink_directory / POSITION_FILE).write_text("{")
+
+
+def folder_is_a_file(machine: Machine) -> None:
+    (machine.config.uplink_directory / POSITION_FILE).unlink()
+    machine.config.uplink_directory.rmdir()
+    machine.config.uplink_directory.write_text("")
+
+
+def dropped(machine: Machine) -> None:
+    change(machine, "UPDATE outbox_of SET dropped = 3")
+
+
+PLANTED: dict[Callable[[Machine], None], list[str]] = {
+    waits: ["UplinkWaits"],
+    damaged_position: ["UplinkPosition"],
+    folder_is_a_file: ["UplinkFolder"],
+    dropped: ["UplinkDropped"],
+}
+
+
+@pytest.mark.parametrize("plant", PLANTED, ids=lambda plant: plant.__name__)
+def test_a_planted_trouble_is_told(plant: Callable[[Machine], None], tmp_path: Path) -> None:
+    machine = recorded(tmp_path)
+    assert codes(machine) == []
+    plant(machine)
+    assert codes(machine) == PLANTED[plant]
+
+
+def test_how_many_wait_and_since_when(tmp_path: Path) -> None:
+    machine = recorded(tmp_path)
+    waits(machine)
+    (trouble,) = examine_uplink(machine.config, True)
+    assert trouble.what == "5 records wait, the oldest since 1970-01-01 00:00"
+
+
+def test_a_file_of_the_credentials_that_is_not_there(tmp_path: Path) -> None:
+    assert codes(recorded(tmp_path, user="mill-1", password_file="none")) == ["UplinkCredentials"]
+
+
+def test_a_history_without_an_outbox(tmp_path: Path) -> None:
+    machine = recorded(tmp_path)
+    change(machine, "DROP TABLE outbox")
+    change(machine, "DROP TABLE outbox_of")
+    change(machine, "PRAGMA user_version = 6")
+    assert codes(machine) == ["UplinkOutbox"]
+
+
+def test_a_machine_that_tells_nobody_is_not_looked_at(tmp_path: Path) -> None:
+    machine = recorded(tmp_path)
+    waits(machine)
+    quiet = machine.config.model_copy(update={"uplink": None})
+    assert list(examine_uplink(quiet, False)) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "told"), [(JETSTREAM, ""), (b'INFO {"a":1}\r\n', "JetStream"), (b"220 mail\r\n", "kind")]
+)
+def test_who_answers_is_heard_and_told_nothing(words: bytes, told: str, tmp_path: Path) -> None:
+    with answering(words) as (server, sent):
+        machine = recorded(tmp_path, server=server)
+        troubles = list(examine_uplink(machine.config, False))
+    assert [trouble.code for trouble in troubles] == (["UplinkServer"] if told else [])
+    assert all(told in trouble.what for trouble in troubles)
+    assert sent == [b""]
+
+
+def test_nobody_answers(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    assert codes(recorded(tmp_path, server=f"nats://127.0.0.1:{port}"), offline=False) == ["UplinkServer"]

@@ -1,0 +1,90 @@
+"""The daemon itself as a kind of record: it hears rapids, and what its store took without a fault is acknowledged."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from unittest.mock import patch
+
+from fdhil.daemon import service
+from fdhil.daemon.outcome_store import WINDOWS_FOLDER, OutcomeStore
+from fdhil.daemon.service import InternalError, Service
+from fdhil.errors import FdhilError
+from fdhil.records import Notice, Outcome, ParameterSet, WindowOutcome
+from fdhil.store.history import FILE_NAME, History
+from fdhil.store.windows import read_window
+from tests.crash.keepers import configured
+from tests.daemon.machine import Machine, rapids
+
+RAPIDS = 2
+FIRST_RAPID = 403  # the tick at which it begins
+SETS = 100_000  # what a revision is numbered from, so that it is no rapid
+
+
+class Daemon:
+    """What a daemon left in its store."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.said: list[str] = []
+
+    def keep(self, number: int) -> None:
+        """Run a daemon until it has heard its rapids; ``number`` is not the daemon's."""
+        del number
+        _run(self.folder, lambda **_: None)
+
+    def found(self) -> set[int]:
+        """Return the rapids, whole with their files, and the published sets."""
+        if not (self.folder / FILE_NAME).exists():
+            return set()
+        with History.read(self.folder) as history:
+            windows, sets = history.windows("X"), history.revisions("X")
+        for row in windows[-RAPIDS:]:
+            assert read_window(self.folder / WINDOWS_FOLDER / row.file).start_tick == row.start_tick
+        return {row.start_tick for row in windows} | {SETS + told.set.revision for told in sets}
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def run_daemon(folder: Path, tell: Callable[..., None]) -> None:
+    """Run a daemon in this process; what it refuses, its start included, is told."""
+    try:
+        _run(folder, tell)
+    except InternalError as error:
+        raise AssertionError(str(error)) from None
+    except FdhilError as error:
+        tell(refused=str(error))
+
+
+def _run(folder: Path, tell: Callable[..., None]) -> None:
+    config = configured(folder)
+    heard = 0
+    before = OutcomeStore.keep
+
+    def keep(self: OutcomeStore, outcomes: Sequence[Outcome]) -> list[Notice]:
+        nonlocal heard
+        notices = before(self, outcomes)
+        for number in map(_number, outcomes) if self.fault is None else ():
+            if number is not None:
+                tell(kept=number)
+        for notice in notices:
+            if notice.severity == "MAJOR":
+                tell(refused=notice.text)
+        heard += sum(isinstance(outcome, WindowOutcome) for outcome in outcomes)
+        if heard == RAPIDS and signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:  # else it is ending already
+            os.kill(os.getpid(), signal.SIGTERM)
+        return notices
+
+    warmed = patch.object(service, "warm", lambda *_: None)  # the kernels are compiled already
+    with warmed, patch.object(OutcomeStore, "keep", keep):
+        asyncio.run(Service(config, Machine(rapids(config, count=RAPIDS)).open).run())
+
+
+def _number(outcome: Outcome) -> int | None:
+    if isinstance(outcome, WindowOutcome):
+        return outcome.window.start_tick
+    return SETS + outcome.revision if isinstance(outcome, ParameterSet) else None

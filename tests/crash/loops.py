@@ -1,0 +1,138 @@
+"""Every call of a process that keeps records fails, lies or ends it, one after the other; what is there then is judged.
+
+A record that was acknowledged and is not there is lost. One that is there and is another one was believed half. The
+start that follows must do, or say plainly what to do.
+"""
+
+from __future__ import annotations
+
+import random
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+from fdhil.store.history import History
+from tests.crash.daemon import FIRST_RAPID, Daemon, run_daemon
+from tests.crash.injected import (
+    Told,
+    Work,
+    calls_of,
+    faults_of,
+    injection,
+    keep_some,
+    kept_under,
+    looked_at,
+    wakes_of,
+    was_injected,
+)
+from tests.crash.keepers import KEEPERS, Keeper
+
+BEGUN_BEFORE = ("parameters", "notices", "the daemon")  # how a history is made is tried with the rapids
+LIES = "lied of 3 bytes"  # the kernel told what it had not done: no record can be promised, but none may be half
+MOST_TOLD = 20
+
+
+@dataclass
+class Found:
+    """What the runs of one kind of record found; ``wrong`` names what must not be."""
+
+    calls: Counter[str] = field(default_factory=Counter)
+    faults: int = 0  # that there are; ``tried`` of them
+    tried: int = 0
+    runs: Counter[str] = field(default_factory=Counter)
+    acknowledged: int = 0
+    refused: int = 0
+    lost: int = 0
+    wrong: list[str] = field(default_factory=list)
+    lost_by_lies: int = 0
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of record: how its store is opened, what a process does that keeps some, and what is kept afterwards."""
+
+    make: Callable[[Path], Keeper]
+    work: Work
+    later: int = 9
+
+
+KINDS = {name: Kind(make, partial(keep_some, make)) for name, make in KEEPERS.items()}
+KINDS["the daemon"] = Kind(Daemon, run_daemon, FIRST_RAPID)
+
+
+def tried(name: str, folder: Path, most: int | None = None) -> Found:
+    """Try a kind of record with each fault at each call, or at ``most`` of them by chance."""
+    kind = KINDS[name]
+    found, begun = Found(), _begun(kind, folder, name in BEGUN_BEFORE)
+    for fault_at in _faults(begun, kind, folder, found, most):
+        store, trace = folder / "store", folder / "trace"
+        shutil.rmtree(store, ignore_errors=True)
+        shutil.copytree(begun, store)
+        told = kept_under(kind.work, store, injection(*fault_at), trace)
+        if was_injected(trace):
+            _judged(fault_at, told, looked_at(kind.make, store, kind.later), found)
+    return found
+
+
+def _begun(kind: Kind, folder: Path, before: bool) -> Path:
+    """Return an empty store, or one that was begun ``before``; all that the work takes is loaded then."""
+    used, begun = folder / "used", folder / "begun"
+    for place in (used, begun):
+        place.mkdir(parents=True)
+    keeper = kind.make(used)
+    keeper.keep(1)
+    assert keeper.found()
+    keeper.close()
+    if before:
+        History.open(begun).close()
+    return begun
+
+
+def _faults(begun: Path, kind: Kind, folder: Path, found: Found, most: int | None) -> Iterator[tuple[str, int, str]]:
+    """Yield call, number and fault, for each call that a run makes without one."""
+    store, trace = folder / "first", folder / "first.trace"
+    shutil.copytree(begun, store)
+    told = kept_under(kind.work, store, None, trace)
+    assert told.ended, told
+    assert not told.refused, told
+    found.calls, wakes = calls_of(trace), wakes_of(trace)
+    every = [
+        (call, nth, fault)
+        for call, count in found.calls.items()
+        for nth in range(1, count + 1)
+        if call != "write" or nth not in wakes
+        for fault in faults_of(call)
+    ]
+    chosen = every if most is None or most >= len(every) else random.Random(1).sample(every, most)
+    found.faults, found.tried = len(every), len(chosen)
+    yield from chosen
+
+
+def _judged(at: tuple[str, int, str], told: Told, after: Told, found: Found) -> None:
+    """Judge one run, and the start after it."""
+    call, nth, fault = at
+    found.runs[fault] += 1
+    found.acknowledged += len(told.kept)
+    found.refused += len(told.refused)
+    lost = set(told.kept) - set(after.found)
+    wrong = []
+    if fault == LIES:
+        found.lost_by_lies += len(lost)
+    elif lost:
+        found.lost += len(lost)
+        wrong.append(f"{sorted(lost)} lost")
+    if not told.ended and fault != "killed":
+        wrong.append(f"it ended: {told.wrong}")
+    wrong += [f"refused without a word: {text}" for text in told.refused if "; " not in text]
+    if not after.ended and (fault != LIES or not _is_plain(after)):
+        wrong.append(f"the next start: {after.wrong}")
+    wrong += [f"the next start says no more than: {text}" for text in after.said if "; " not in text]
+    found.wrong += [f"{call} {nth} {fault}: {text}" for text in wrong]
+
+
+def _is_plain(after: Told) -> bool:
+    """Whether a start that did not do said what to do: of what lied nobody can begin as if nothing had been."""
+    return all(text.startswith("StoreError: ") and "; " in text for text in after.wrong)

@@ -1,0 +1,134 @@
+"""What was acknowledged is there after any call failed or was the last, and on full and read-only disks."""
+
+from __future__ import annotations
+
+import errno
+import os
+from datetime import UTC, datetime, timedelta
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fdhil.commissioning.progress import Progress
+from fdhil.daemon import blackbox
+from fdhil.errors import StoreError
+from fdhil.store import atomic
+from tests.crash import clocks, disks, injected
+from tests.crash.keepers import KEEPERS, Plain
+from tests.crash.loops import KINDS, Kind, tried
+
+OF_EACH = 8  # faults, of the hundreds that the study tries
+
+
+@pytest.mark.debian
+@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.fault("F1", "F3", "F4", "F6")
+def test_what_was_acknowledged_outlives_any_call_that_fails_or_is_the_last(name: str, tmp_path: Path) -> None:
+    found = tried(name, tmp_path, OF_EACH)
+    assert found.wrong == []
+    assert found.acknowledged > 0
+    assert sum(found.runs.values()) > 0
+
+
+class Careless(Plain):
+    """Numbers in a file that is emptied before it is written anew."""
+
+    def keep(self, number: int) -> None:
+        """Write all numbers so far."""
+        numbers = {*self.found(), number}
+        (self.folder / "numbers").write_text(" ".join(map(str, sorted(numbers))))
+
+    def found(self) -> set[int]:
+        """Return the numbers."""
+        file = self.folder / "numbers"
+        return set(map(int, file.read_text().split())) if file.exists() else set()
+
+
+@pytest.mark.debian
+def test_a_store_that_empties_a_file_before_it_writes_it_is_found_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keep = partial(injected.keep_some, Careless)
+    monkeypatch.setitem(KINDS, "careless", Kind(Careless, keep))
+    found = tried("careless", tmp_path)
+    assert found.lost > 0
+    assert any(text.startswith("write 2 killed: [1] lost") for text in found.wrong)
+
+
+@pytest.mark.parametrize("name", KEEPERS)
+@pytest.mark.fault("F3")
+def test_a_full_disk_takes_nothing_back(name: str, tmp_path: Path) -> None:
+    make = KEEPERS[name]
+    told = disks.filled(make, tmp_path, free_bytes=0)
+    assert (told.wrong, told.ended) == ([], True)
+    assert set(told.kept) - {9} <= set(told.found)
+    assert 1 in told.found
+    assert all("the disk is full" in text or "No space left" in text or "told before" in text for text in told.refused)
+    assert told.refused or name == "audit"  # a line may still fit into the page that the file has
+
+
+@pytest.mark.parametrize("name", KEEPERS)
+@pytest.mark.fault("F5")
+def test_a_read_only_disk_takes_nothing_and_loses_nothing(name: str, tmp_path: Path) -> None:
+    told = disks.read_only(KEEPERS[name], tmp_path)
+    assert (told.wrong, told.ended) == ([], True)
+    assert (told.kept, {1, 2} <= set(told.found)) == ([1, 2, 9], True)
+    (text,) = told.refused
+    assert any(words in text for words in ("it may not be written", "Read-only file system", "told before"))
+
+
+def test_steps_that_cannot_be_read_now_are_not_written_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Progress(tmp_path, "X").keep("sign test", "this drive", {"um": 10.0})
+
+    def refuses(*_: Any, **__: Any) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "open", refuses)
+        with pytest.raises(StoreError, match=r"cannot be read .* check the disk, or move it away"):
+            Progress(tmp_path, "X")
+    assert Progress(tmp_path, "X").done().keys() == {"sign test"}
+
+
+@pytest.mark.fault("F9")
+def test_the_newest_black_box_stays_whatever_the_clock_shows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Clock:
+        """A clock that goes back a day each time."""
+
+        strptime = datetime.strptime
+        shown = datetime(2026, 11, 23, tzinfo=UTC)
+
+        @classmethod
+        def now(cls, zone: Any) -> datetime:
+            """Return what it shows."""
+            cls.shown -= timedelta(days=1)
+            return cls.shown.astimezone(zone)
+
+    monkeypatch.setattr(blackbox, "datetime", Clock)
+    (tmp_path / blackbox.FOLDER).mkdir()
+    (tmp_path / blackbox.FOLDER / "20261120T010203.000004Z-Old.log").write_text("of before there were numbers")
+    for number in range(12):
+        assert blackbox.dump(tmp_path, f"Made{number}", dict).code == "BlackBox"
+    assert [box.code for box in blackbox.kept(tmp_path)] == [f"Made{number}" for number in range(4, 12)]
+
+
+@pytest.mark.fault("F9")
+def test_the_newest_file_stays_whatever_the_clock_shows(tmp_path: Path) -> None:
+    for number in range(6):
+        file = tmp_path / str(number)
+        others = list(tmp_path.iterdir())
+        file.touch()
+        os.utime(file, (1000.0 - number, 1000.0 - number))
+        atomic.keep_newest(file, others, most=3)
+    assert {file.name for file in tmp_path.iterdir()} == {"3", "4", "5"}
+
+
+@pytest.mark.debian
+@pytest.mark.parametrize("name", ["set on an hour", "set back to 1970"])
+@pytest.mark.fault("A28", "F9")
+def test_no_frame_of_a_ramp_changes_with_the_clock(name: str, tmp_path: Path) -> None:
+    usual = clocks.ramp(tmp_path / "usual", clocks.NEVER_SET)
+    assert len(usual) > clocks.FAULT_ROW - clocks.FIRST_ROW
+    assert clocks.ramp(tmp_path / "set", clocks.CLOCKS[name]) == usual

@@ -1,0 +1,226 @@
+"""Who may ask the daemon for what, by the kernel's word, and what of it is in the audit."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import stat
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from fdhil import config as machine_config
+from fdhil.cli.main import cli
+from fdhil.config import Access
+from fdhil.daemon.audited import Audited
+from fdhil.daemon.control import ControlServer
+from fdhil.daemon.peers import NEEDS, Peer, role_of
+from fdhil.guard.peers import Role
+from fdhil.store import audit
+from tests.daemon.machine import Machine, config_of
+from tests.daemon.test_service import serving
+from tests.listening import tcp_ports
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+ACCESS = Access(watch=("looker",), operate=("operator",))
+STRANGER = 65534
+
+
+@pytest.mark.parametrize(
+    ("user", "uid", "role"),
+    [
+        ("root", 0, Role.COMMISSION),
+        ("me", os.getuid(), Role.COMMISSION),
+        ("operator", 4711, Role.OPERATE),
+        ("looker", 4712, Role.WATCH),
+        ("stranger", 4713, Role.NOBODY),
+    ],
+)
+def test_the_role_of_a_user(user: str, uid: int, role: Role) -> None:
+    assert role_of(user, uid, ACCESS) is role
+
+
+def test_what_is_not_listed_needs_the_most_and_whoever_may_look_may_disarm() -> None:
+    watcher = Peer("looker", 4712, 1, Role.WATCH)
+    assert [what for what in (*NEEDS, "stop", "anything") if watcher.may(what)] == ["status", "live", "disarm"]
+    operator = Peer("operator", 4711, 1, Role.OPERATE)
+    assert not operator.may("stop")
+    assert not operator.may("anything")
+
+
+class Desk:
+    """Counts what reaches it."""
+
+    def __init__(self) -> None:
+        self.done: list[str] = []
+
+    async def handle(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        self.done.append(str(request["request"]))
+        return {"ok": True, "text": "armed part.ngc"}
+
+
+@pytest.mark.fault("G1")
+@pytest.mark.parametrize("role", list(Role))
+async def test_every_request_without_the_role_is_refused_has_no_effect_and_is_in_the_audit(
+    role: Role, tmp_path: Path
+) -> None:
+    desk = Desk()
+    audited = Audited(desk.handle, tmp_path)
+    peer = Peer("somebody", 4711, 99, role)
+    for what in (*NEEDS, "stop"):
+        answer = await audited.of({"request": what, "token": "SECRET"}, peer)
+        assert answer["ok"] == peer.may(what) == (what in desk.done)
+        assert answer["ok"] or answer["code"] == "AuthRequired"
+        await audited.written()
+    told = [(entry.get("asked") or entry["answered"], entry.get("result")) for entry, _ in audit.entries(tmp_path)]
+    refused = [what for what, result in told if result == "AuthRequired"]
+    assert refused == [what for what in (*NEEDS, "stop") if not peer.may(what)]
+    assert {what for what, result in told if result == "done"} == set(desk.done) - {"status", "live"}
+    assert b"SECRET" not in b"".join(path.read_bytes() for path in tmp_path.iterdir())
+
+
+async def test_who_acts_for_whom_is_written_before_it_is_done_and_the_answer_is_in_the_journal_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    at_that_time: list[dict[str, Any]] = []
+
+    async def handle(request: Mapping[str, Any]) -> dict[str, Any]:
+        at_that_time.extend(entry for entry, _ in audit.entries(tmp_path))
+        return {"ok": False, "code": "ModelStale", "text": "too old"}
+
+    peer = Peer("fdhil-web", 990, 99, Role.OPERATE)
+    await Audited(handle, tmp_path).of({"request": "arm", "program": "/p/part.ngc", "by": "anna"}, peer)
+    assert [(entry["asked"], entry["by"], entry["who"]["user"]) for entry in at_that_time] == [
+        ("arm", "anna", "fdhil-web")
+    ]
+    last = list(audit.entries(tmp_path))[-1][0]
+    assert (last["answered"], last["result"], last["program"]) == ("arm", "ModelStale", "/p/part.ngc")
+    assert "fdhil-web (process 99) for anna asked to arm: ModelStale" in capsys.readouterr().err
+
+
+@pytest.mark.fault("F5")
+async def test_what_cannot_be_written_down_is_not_done_but_disarming_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    desk, peer = Desk(), Peer("me", os.getuid(), 99, Role.COMMISSION)
+    audited = Audited(desk.handle, tmp_path / "not there")
+    for what in ("arm", "acknowledge", "disarm", "stop"):
+        answer = await audited.of({"request": what}, peer)
+        assert answer["ok"] == (what in ("disarm", "stop"))
+    await audited.written()
+    assert desk.done == ["disarm", "stop"]
+    assert capsys.readouterr().err.count("is not in the audit") == 4
+
+
+@pytest.mark.fault("F12")
+async def test_a_flood_of_requests_does_not_fill_the_disk(tmp_path: Path) -> None:
+    desk = Desk()
+    audited = Audited(desk.handle, tmp_path)
+    stranger, owner = Peer("stranger", 4713, 1, Role.NOBODY), Peer("me", os.getuid(), 1, Role.COMMISSION)
+    for _ in range(300):
+        assert (await audited.of({"request": "arm"}, stranger))["code"] == "AuthRequired"
+        assert (await audited.of({"request": "disarm"}, owner))["ok"]
+    await audited.written()
+    assert desk.done == ["disarm"] * 300
+    assert len(list(audit.entries(tmp_path))) < 100
+
+
+@pytest.mark.fault("F12")
+async def test_requests_of_ever_new_and_long_names_fill_neither_the_disk_nor_the_memory(tmp_path: Path) -> None:
+    audited, watcher = Audited(Desk().handle, tmp_path), Peer("looker", 4712, 1, Role.WATCH)
+    for k in range(100):
+        assert (await audited.of({"request": f"{k}" + "x" * 60_000}, watcher))["code"] == "AuthRequired"
+    kept = list(audit.entries(tmp_path))
+    assert 1 <= len(kept) < 50
+    assert [fault for _, fault in kept if fault] == []
+    assert max(len(entry["answered"]) for entry, _ in kept) <= 500
+
+
+@pytest.fixture
+def open_folder() -> Iterator[Path]:
+    """A folder that every user may enter."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        folder.chmod(0o755)
+        yield folder
+
+
+def test_nobody_but_the_owner_may_open_the_socket_unless_users_are_named(open_folder: Path) -> None:
+    async def mode(access: Access) -> int:
+        async with ControlServer(Audited(Desk().handle, open_folder).of, lambda: None, print, access).serving(
+            open_folder / "s"
+        ):
+            return stat.S_IMODE((open_folder / "s").stat().st_mode)
+
+    open_folder.chmod(0o700)
+    assert asyncio.run(mode(Access())) == 0o600
+    assert stat.S_IMODE(open_folder.stat().st_mode) == 0o700
+    assert asyncio.run(mode(ACCESS)) == 0o660
+    assert stat.S_IMODE(open_folder.stat().st_mode) == 0o710  # they come as far as the socket
+
+
+ASK = """
+import json, os, sys
+from pathlib import Path
+from fdhil.daemon.control import ask
+os.setgroups([])
+os.setuid(int(sys.argv[2]))
+print(json.dumps([ask(Path(sys.argv[1]), {"request": what}) for what in ("status", "disarm", "arm", "stop")]))
+"""
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root may become another user")
+@pytest.mark.parametrize("role", [Role.WATCH, Role.OPERATE])
+async def test_another_user_of_this_computer_is_known_by_the_kernel(role: Role, open_folder: Path) -> None:
+    desk = Desk()
+    access = Access(**{role.name.lower(): ("nobody",)})
+    control = ControlServer(Audited(desk.handle, open_folder).of, lambda: None, print, access)
+    async with control.serving(open_folder / "s"):
+        command = [sys.executable, "-c", ASK, str(open_folder / "s"), str(STRANGER)]
+        asked = await asyncio.to_thread(subprocess.run, command, capture_output=True, timeout=60, check=True)
+    assert [answer["ok"] for answer in json.loads(asked.stdout)] == [True, True, role is Role.OPERATE, False]
+    who = {entry["who"]["user"] for entry, _ in audit.entries(open_folder)}
+    assert who == {"nobody"}
+
+
+def test_the_command_shows_the_audit_and_whether_it_was_changed(tmp_path: Path) -> None:
+    config = tmp_path / "machine.toml"
+    config.write_text((CONFIGS / "sim.toml").read_text())
+    folder = machine_config.load(config).store.directory
+    folder.mkdir()
+    for program in ("a.ngc", "b.ngc"):
+        audit.append(
+            folder, {"who": {"user": "fdhil-web", "uid": 1, "pid": 2}, "asked": "arm", "by": "anna", "program": program}
+        )
+    shown = CliRunner().invoke(cli, ["audit", str(config)], standalone_mode=False)
+    assert shown.return_value == 0
+    assert "fdhil-web for anna  arm a.ngc (asked)" in shown.output
+    assert "2 entries, each as it was written" in shown.output
+    path = folder / audit.FILE_NAME
+    path.write_text(path.read_text().replace("a.ngc", "c.ngc"))
+    shown = CliRunner().invoke(cli, ["audit", str(config), "--json"], standalone_mode=False)
+    assert shown.return_value == 1
+    assert json.loads(shown.output)["broken"] == [1]
+    assert CliRunner().invoke(cli, ["audit", str(config)], standalone_mode=False).output.count("NOT AS WRITTEN") == 1
+
+
+def test_who_may_look_at_the_machine_is_not_the_machine(tmp_path: Path) -> None:
+    assert config_of(tmp_path).digest == config_of(tmp_path, access={"watch": ["looker"]}).digest
+    assert config_of(tmp_path).digest != config_of(tmp_path, guard={"node_id": 99}).digest
+
+
+@pytest.mark.fault("G3")
+async def test_the_daemon_listens_at_no_tcp_port(tmp_path: Path) -> None:
+    before = tcp_ports(os.getpid())
+    async with serving(config_of(tmp_path), Machine()):
+        assert tcp_ports(os.getpid()) == before
+        server = await asyncio.start_server(lambda *_: None, "127.0.0.1", 0)
+        assert len(tcp_ports(os.getpid()) - before) == 1  # one that did would be seen
+        server.close()

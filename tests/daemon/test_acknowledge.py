@@ -1,0 +1,95 @@
+"""What an operator should know waits until somebody answers for it; who did, and when, is kept and told everywhere."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fdhil.daemon import notice_book
+from fdhil.daemon.control import ask
+from fdhil.daemon.notice_book import NotAcknowledged, NoticeBook, acknowledgement_of
+from fdhil.records import Notice
+from fdhil.store.history import History
+from fdhil.store.rows import StoredNotice
+from tests.daemon.machine import Machine, config_of
+from tests.daemon.test_service import _quick_start, serving, status_when  # noqa: F401 (a fixture)
+from tests.store.made import STAMP
+
+DOWN = Notice("BusDown", "MAJOR", "Bus can0: gone; it is tried again until it is back.")
+BACK = Notice("BusDown", "info", "Bus can0 is back.")
+DUE = Notice("MaintenanceDue", "minor", "ft will reach its limit soon; plan it.", "X")
+
+
+async def _acknowledged(path: Path, **request: Any) -> dict[str, Any]:
+    return await asyncio.to_thread(ask, path, {"request": "acknowledge", **request})
+
+
+async def test_a_notice_waits_until_somebody_answers_for_it_also_over_a_restart(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = config_of(tmp_path)
+    async with serving(config, Machine([DOWN, BACK, DUE])) as path:
+        told = await status_when(path, lambda s: s["unacknowledged"]["count"] == 2)
+        assert told["unacknowledged"]["MAJOR"] == 1
+        assert [n["code"] for n in told["unacknowledged"]["newest"]] == ["BusDown", "MaintenanceDue"]
+        number = told["unacknowledged"]["newest"][0]["number"]
+        answer = await _acknowledged(path, notices=[number], by="anna", note="plug was out")
+        assert (answer["ok"], answer["acknowledged"]) == (True, [number])
+        told = await status_when(path, lambda s: True)
+        by_text = {notice["text"]: notice for notice in told["notices"]}
+        assert by_text[DOWN.text]["acknowledged"]["who"] == "anna"
+        assert by_text[DUE.text]["acknowledged"] is None
+        again = await _acknowledged(path, notices=[number], by="ben")
+        assert (again["ok"], again["acknowledged"]) == (True, [])
+    assert "notice 1 acknowledged by anna" in capsys.readouterr().err
+    async with serving(config, Machine()) as path:
+        told = await status_when(path, lambda s: True)
+        assert [n["code"] for n in told["unacknowledged"]["newest"]] == ["MaintenanceDue"]
+        answer = await _acknowledged(path, up_to=told["unacknowledged"]["newest"][-1]["number"], by="ben")
+        assert answer["ok"]
+    with History.read(config.store.directory) as history:
+        known = {n.notice.text: n.acknowledged for n in history.notices() if n.notice.severity != "info"}
+    assert {text: given.who for text, given in known.items() if given} == {DOWN.text: "anna", DUE.text: "ben"}
+    assert [given.note for given in known.values() if given] == ["plug was out", ""]
+
+
+@pytest.mark.parametrize(
+    ("request_", "code"),
+    [
+        ({}, "BadRequest"),
+        ({"notices": []}, "BadRequest"),
+        ({"notices": ["1"]}, "BadRequest"),
+        ({"notices": [True]}, "BadRequest"),
+        ({"notices": [1], "up_to": 1}, "BadRequest"),
+        ({"notices": [2]}, "NoSuchNotice"),  # one of severity info asks for nobody
+        ({"notices": [99]}, "NoSuchNotice"),
+        ({"notices": [1], "by": ""}, "BadRequest"),
+        ({"notices": [1], "by": "x" * 65}, "BadRequest"),
+        ({"notices": [1], "by": "anna", "note": 5}, "BadRequest"),
+        ({"notices": [1], "by": "anna", "note": "x" * 201}, "BadRequest"),
+    ],
+)
+def test_what_cannot_be_met_is_refused_with_what_to_give(request_: dict[str, Any], code: str) -> None:
+    book = NoticeBook()
+    book.begin([StoredNotice(1, DOWN, STAMP), StoredNotice(2, BACK, STAMP)])
+    with pytest.raises(NotAcknowledged) as refused:
+        acknowledgement_of(request_, book.chosen(request_))
+    assert refused.value.answer["code"] == code
+    assert refused.value.answer["advice"]
+    assert book.status()["count"] == 1
+
+
+def test_a_name_cannot_forge_a_line_of_the_log() -> None:
+    given = acknowledgement_of({"by": "anna\x1b[2J\n", "note": "a\nb"}, [1])
+    assert (given.who, given.note) == ("anna\\x1b[2J", "a\\nb")
+
+
+def test_only_the_newest_notices_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(notice_book, "NEWEST", 3)
+    book = NoticeBook()
+    for number in range(1, 6):
+        book.stored(DOWN, number, STAMP)
+    assert [told["number"] for told in book.status()["newest"]] == [3, 4, 5]

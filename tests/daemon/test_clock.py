@@ -1,0 +1,45 @@
+"""A clock that is set or behind is told once, and the daemon says so at its start and while it runs."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from fdhil.daemon.clock import ClockWatch, newest_record_s
+from fdhil.records import Notice
+from fdhil.store.history import History
+from fdhil.store.rows import Stamp
+from tests.daemon.machine import Machine, config_of
+from tests.daemon.test_service import serving, status_when
+
+NOW_S = 1_800_000_000.0
+
+
+@pytest.mark.fault("A28")
+@pytest.mark.parametrize("jump_s", [3600.0, -3600.0, -NOW_S])
+def test_a_clock_that_is_set_is_told_once(jump_s: float) -> None:
+    watch = ClockWatch(None)
+    assert [watch.look(NOW_S + k, 5.0 + k) for k in (0, 10, 20)] == [[], [], []]
+    (told,) = watch.look(NOW_S + 30 + jump_s, 35.0)
+    way = "forward" if jump_s > 0 else "back"
+    assert (told.code, f"{way} by {abs(jump_s):.0f} s" in told.text) == ("ClockJump", True)
+    assert watch.look(NOW_S + 40 + jump_s, 45.0) == []
+
+
+def test_a_clock_that_is_slewed_is_not_told() -> None:
+    watch = ClockWatch(NOW_S + 30.0)  # a record of half a minute later: two clocks of one machine
+    assert [watch.look(NOW_S + 1.0005 * 10 * k, 10.0 * k) for k in range(100)] == [[]] * 100
+
+
+@pytest.mark.fault("F9")
+async def test_a_clock_that_is_behind_the_history_is_told_at_the_start(tmp_path: Path) -> None:
+    config = config_of(tmp_path)
+    assert newest_record_s(config.store.directory) is None
+    with History.open(config.store.directory) as history:
+        history.add_notice(Notice("Armed", "info", "in two hours"), Stamp(time.time() + 7200.0, "boot", 1))
+    async with serving(config, Machine()) as path:
+        status = await status_when(path, lambda told: told["unacknowledged"]["newest"])
+    told = {notice["code"]: notice["text"] for notice in status["unacknowledged"]["newest"]}
+    assert "the newest record is from 2.0 h later" in told["ClockJump"]

@@ -1,0 +1,190 @@
+"""The daemon's stream of samples: what passes is told to who looks, and nobody who looks can hold the daemon up."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil.config import Access
+from fdhil.daemon.control import ControlServer
+from fdhil.daemon.live import MAX_VIEWERS, MAX_WAITING, SIGNALS, LiveStream, unpacked
+from fdhil.records import AxisSamples, Temperature, TickTimes, VoltageSamples, frozen, frozen_ints
+from tests.bench import bench_axis
+from tests.daemon.machine import Machine, config_of, rapids
+from tests.daemon.test_service import serving
+
+Line = dict[str, Any]
+
+
+def block(tick: Any, axis: str = "X", voltage: bool = True) -> AxisSamples:
+    """Return samples whose signals are the tick, times 1, 2, 3, and 4 um of error, 5 um of offset."""
+    tick = np.asarray(tick)
+    one = tick.astype(float)
+    return AxisSamples(
+        axis,
+        frozen_ints(tick),
+        demand_mm=frozen(one * 4e-3),
+        position_mm=frozen(0 * one),
+        speed_rad_s=frozen(3 * one),
+        current_a=frozen(2 * one),
+        voltage_v=frozen(one) if voltage else None,
+        offset_mm=frozen(one * 5e-3),
+        statusword=frozen_ints(0 * tick),
+    )
+
+
+@asynccontextmanager
+async def streaming(stream: LiveStream, folder: Path) -> AsyncIterator[Path]:
+    """Serve a stream alone on a control socket."""
+
+    async def handle(_request: Any, _peer: Any) -> Any:
+        return stream.begin()
+
+    async with ControlServer(handle, lambda: None, lambda: None, Access(), stream.serve).serving(folder / "s"):
+        yield folder / "s"
+
+
+async def ask_live(path: Path) -> tuple[Line, asyncio.StreamReader, asyncio.StreamWriter]:
+    """Ask for the stream; return the answer and the connection."""
+    reader, writer = await asyncio.open_unix_connection(str(path), limit=2**22)
+    writer.write(b'{"request": "live"}\n')
+    return json.loads(await reader.readline()), reader, writer
+
+
+async def line_of(reader: asyncio.StreamReader, kind: str) -> Line:
+    """Return the next line of a kind."""
+    while True:
+        line: Line = json.loads(await asyncio.wait_for(reader.readline(), 60.0))
+        if line["live"] == kind:
+            return line
+
+
+def values_of(line: Line) -> Any:
+    """Return the signals (5, n) of a block."""
+    return unpacked(line["values"], "<f4").reshape(len(SIGNALS), -1)
+
+
+async def test_a_running_daemon_tells_its_samples_as_they_pass(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr("fdhil.daemon.service.warm", lambda config, method: None)
+    config = config_of(tmp_path)
+    machine = Machine()
+    async with serving(config, machine) as path:
+        answer, reader, writer = await ask_live(path)
+        assert (answer["ok"], answer["axes"], answer["sync_period_s"]) == (True, ["X"], 0.001)
+        assert tuple(answer["signals"]) == SIGNALS
+        await line_of(reader, "alive")
+        records = rapids(config, count=1)
+        machine.give(*records)
+        sent = [record for record in records if isinstance(record, AxisSamples)]
+        told = [await line_of(reader, "samples") for _ in sent]
+        writer.close()
+    assert [line["tick"] for line in told] == [int(record.tick[0]) for record in sent]
+    current = np.concatenate([values_of(line)[SIGNALS.index("current_a")] for line in told])
+    np.testing.assert_allclose(current, np.concatenate([record.current_a for record in sent]), atol=1e-4)
+
+
+async def test_signals_units_gaps_and_sensors_of_their_own(tmp_path: Path) -> None:
+    config = config_of(tmp_path)
+    stream = LiveStream(config)
+    stream.take(Temperature("X", 0, 21.5, "slideway"))
+    async with streaming(stream, tmp_path) as path:
+        _, reader, writer = await ask_live(path)
+        assert (await line_of(reader, "temperature"))["celsius"] == 21.5  # what was last read is told at once
+        for empty in (block([]), TickTimes(frozen_ints([]), frozen_ints([]))):
+            stream.take(empty)  # no sample of a block is whole
+        stream.take(block([100, 101, 103]))
+        stream.take(block([104], voltage=False))
+        stream.take(VoltageSamples("v", "X", *(frozen_ints([5, 6]),) * 3, frozen([1.0, 2.0]), 1000.0))
+        stream.take(TickTimes(frozen_ints([100]), frozen_ints([0])))  # no sensor of its own: nobody needs it
+        whole, single = await line_of(reader, "samples"), await line_of(reader, "samples")
+        voltage = await line_of(reader, "voltage")
+        writer.close()
+    assert unpacked(whole["ticks"], "<i4").tolist() == [0, 1, 3]
+    np.testing.assert_allclose(values_of(whole)[:, 1], [101, 202, 303, 404, 505])
+    assert "ticks" not in single
+    assert np.isnan(values_of(single)[0, 0])
+    assert unpacked(voltage["t_ns"], "<i8").tolist() == [5, 6]
+    assert unpacked(voltage["values"], "<f4").tolist() == [1.0, 2.0]
+
+
+async def test_the_times_of_the_ticks_are_told_where_a_sensor_has_its_own_clock(tmp_path: Path) -> None:
+    axis = {**bench_axis(), "voltage": {"source": "modbus"}}
+    stream = LiveStream(config_of(tmp_path, axis={"X": axis}))
+    async with streaming(stream, tmp_path) as path:
+        _, reader, writer = await ask_live(path)
+        await line_of(reader, "alive")
+        stream.take(TickTimes(frozen_ints([]), frozen_ints([])))
+        stream.take(TickTimes(frozen_ints([7, 8, 9]), frozen_ints([70, 80, 90])))
+        assert await line_of(reader, "times") == {"live": "times", "tick": [7, 9], "t_ns": [70, 90]}
+        writer.close()
+
+
+async def test_a_viewer_that_does_not_read_loses_lines_and_is_told_the_others_lose_none(tmp_path: Path) -> None:
+    stream = LiveStream(config_of(tmp_path))
+    async with streaming(stream, tmp_path) as path:
+        _, slow, slow_writer = await ask_live(path)
+        slow_writer.transport.pause_reading()  # type: ignore[attr-defined]
+        _, quick, quick_writer = await ask_live(path)
+        await line_of(quick, "alive")
+        ticks = range(0, 4 * MAX_WAITING * 1000, 1000)
+        for tick in ticks:
+            stream.take(block(np.arange(tick, tick + 1000)))
+            assert (await line_of(quick, "samples"))["tick"] == tick
+        slow_writer.transport.resume_reading()  # type: ignore[attr-defined]
+        got = 0
+        while True:
+            line = json.loads(await asyncio.wait_for(slow.readline(), 60.0))
+            got += line["live"] == "samples"
+            if line["live"] == "skipped":
+                break
+        assert got + line["lines"] == len(ticks)
+        assert got < MAX_WAITING + 100
+        slow_writer.close()
+        quick_writer.close()
+
+
+async def test_viewers_are_few_and_who_leaves_makes_room(tmp_path: Path) -> None:
+    stream = LiveStream(config_of(tmp_path))
+    async with streaming(stream, tmp_path) as path:
+        viewers = [await ask_live(path) for _ in range(MAX_VIEWERS)]
+        for _, reader, _ in viewers:
+            await line_of(reader, "alive")
+        refused, _, writer = await ask_live(path)
+        assert (refused["ok"], refused["code"]) == (False, "Busy")
+        writer.close()
+        viewers[0][2].close()
+        answer = refused
+        while not answer["ok"]:
+            stream.take(block([0]))
+            await asyncio.sleep(0.01)
+            answer, _, writer = await ask_live(path)
+            writer.close()
+        for _, _, each in viewers[1:]:
+            each.close()
+
+
+def test_nobody_looks_nothing_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fdhil.daemon.live._line", lambda told: pytest.fail("a line was made for nobody"))
+    LiveStream(config_of(tmp_path)).take(block([1, 2, 3]))
+
+
+async def test_who_comes_at_the_same_time_finds_no_more_places_than_there_are(tmp_path: Path) -> None:
+    stream = LiveStream(config_of(tmp_path))
+    async with streaming(stream, tmp_path) as path, asyncio.timeout(60.0):
+        opened = [await asyncio.open_unix_connection(str(path)) for _ in range(2 * MAX_VIEWERS)]
+        for _, writer in opened:
+            writer.write(b'{"request": "live"}\n')
+        granted = 0
+        for reader, _ in opened:
+            if json.loads(await reader.readline())["ok"] and (await reader.readline()):
+                granted += 1
+        for _, writer in opened:
+            writer.close()
+    assert granted == MAX_VIEWERS

@@ -1,0 +1,61 @@
+"""Every class of notice has its effect and its next action, each said in one place."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import fdhil
+from fdhil.daemon.notice_words import WORDS, words_of
+from fdhil.guard.interlocks import CATALOGUE, EFFECT, Alarm, Reaction
+from fdhil.records import Notice
+
+CALLED = {"Notice", "_notice", "_tell"}
+
+
+def codes() -> set[str]:
+    """Return the classes that the code gives notices, as far as its text says them."""
+    found = {"BusOff", "BusRestarted", "TransceiverFault", "NotAcknowledged", "ErrorPassive", "NcSilent", "LoadChanged"}
+    for path in Path(fdhil.__file__).parent.rglob("*.py"):
+        for call in (node for node in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(node, ast.Call)):
+            name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+            first = call.args[0] if name in CALLED and call.args else None
+            if isinstance(first, ast.Constant) and isinstance(first.value, str):
+                found.add(first.value)
+    return found
+
+
+@pytest.mark.parametrize("code", sorted(codes()))
+def test_a_class_of_notice_has_effect_and_action(code: str) -> None:
+    effect, action = words_of(Notice(code, "minor", "why"))
+    assert effect
+    assert action
+    assert not effect.endswith(".")
+    assert not action.endswith(".")
+
+
+def test_what_the_guard_stopped_has_the_guards_own_words() -> None:
+    alarm = Alarm("EchoMismatch", "X")
+    told = words_of(Notice("GuardTripped", "MAJOR", f"EchoMismatch: {alarm.sentence()}", "X"))
+    assert told == (EFFECT[Reaction.RAMP_DOWN], CATALOGUE["EchoMismatch"][2])
+
+
+def test_a_refusal_has_the_action_of_its_cause_and_no_effect_on_a_machine_that_was_not_corrected() -> None:
+    effect, action = words_of(Notice("ArmRefused", "minor", "ModelStale: the model is 11 h old"))
+    assert (effect, action) == (WORDS["ArmRefused"][0], CATALOGUE["ModelStale"][2])
+
+
+def test_what_the_daemon_hears_too_tells_the_guards_effect_for_a_correction_that_runs() -> None:
+    effect, action = words_of(Notice("SyncLost", "MAJOR", "SYNC stopped, nothing is sampled; start the NC."))
+    assert effect == f"while a correction runs: {EFFECT[CATALOGUE['SyncLost'][0]]}"
+    assert action == CATALOGUE["SyncLost"][2]
+
+
+def test_no_class_has_words_in_two_places() -> None:
+    assert set(WORDS) & set(CATALOGUE) == {"CorruptFile"}  # the guard's is a table, the daemon's its history
+
+
+def test_a_class_that_is_not_known_is_left_to_its_text() -> None:
+    assert words_of(Notice("Unheard", "minor", "why")) == ("", "")

@@ -1,0 +1,107 @@
+"""What the daemon uses of its computer is known, and told before it is used up."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fdhil.daemon.control import ask
+from fdhil.daemon.resources import ResourceWatch, Use, uses
+from tests.daemon.machine import Machine, config_of, rapids
+from tests.daemon.test_service import serving, status_when
+
+
+def used() -> dict[str, int]:
+    return {use.name: use.used for use in uses()}
+
+
+GROW = """
+import os, threading
+from fdhil.daemon.resources import uses
+used = lambda: [use.used for use in uses()]
+before = used()
+block, pipe, ended = bytearray(os.urandom(1) * 20_000_000), os.pipe(), threading.Event()
+threading.Thread(target=ended.wait).start()
+after = used()
+ended.set()
+print(*(b - a for a, b in zip(before, after)))
+"""
+
+
+@pytest.mark.fault("F10")
+def test_what_grows_is_seen_to_grow() -> None:
+    """In a process of its own: what other tests left behind may end just then."""
+    told = subprocess.run([sys.executable, "-c", GROW], capture_output=True, text=True, check=True)
+    memory, descriptors, threads = map(int, told.stdout.split())
+    assert 15e6 < memory < 40e6
+    assert (descriptors, threads) == (2, 1)
+
+
+@pytest.mark.parametrize(("group", "told"), [("0::/system.slice/fdhil.service\n", (1 << 30, 64)), ("", (None, None))])
+def test_the_bounds_are_those_of_the_unit(group: str, told: tuple[int | None, int | None], tmp_path: Path) -> None:
+    process, groups = tmp_path / "self", tmp_path / "cgroup"
+    mine = groups / "system.slice" / "fdhil.service"
+    for folder in (process / "fd", process / "task" / "1", mine):
+        folder.mkdir(parents=True)
+    (process / "statm").write_text("900 100 5\n")
+    (process / "cgroup").write_text(group)
+    (mine / "memory.max").write_text(f"{1 << 30}\n")
+    (mine / "pids.max").write_text("64\n")
+    memory, _, threads = uses(process, groups)
+    assert (memory.allowed, threads.allowed) == told
+    assert (memory.used, threads.used) == (100 * os.sysconf("SC_PAGE_SIZE"), 1)
+    (mine / "memory.max").write_text("max\n")
+    assert uses(process, groups)[0].allowed is None
+
+
+@pytest.mark.fault("F10")
+def test_it_is_told_once_when_it_is_high_and_once_when_it_is_over() -> None:
+    watch = ResourceWatch()
+    told = [watch.look((Use("memory_bytes", used, 1000), Use("threads", used, None))) for used in range(700, 950, 50)]
+    told += [watch.look((Use("memory_bytes", used, 1000),)) for used in (750, 690, 500)]
+    assert [[(notice.code, notice.severity) for notice in notices] for notices in told if notices] == [
+        [("ResourceHigh", "minor")],
+        [("ResourceHigh", "info")],
+    ]
+
+
+async def test_the_status_says_what_is_used(tmp_path: Path) -> None:
+    async with serving(config_of(tmp_path), Machine()) as path:
+        status = await status_when(path, lambda told: told["resources"])
+    assert {name: told["used"] > 0 for name, told in status["resources"].items()} == dict.fromkeys(used(), True)
+
+
+@pytest.mark.fault("F10")
+async def test_clients_that_come_and_go_leave_descriptors_and_threads_as_they_were(tmp_path: Path) -> None:
+    """Two hundred clients, of which half leave without a word."""
+    config = config_of(tmp_path)
+    machine = Machine(rapids(config, count=2))
+    async with serving(config, machine) as path:
+        await status_when(path, lambda told: told["axes"]["X"]["accepted"] == 2)
+        before = used()
+        for _ in range(100):
+            assert (await asyncio.to_thread(ask, path, {"request": "status"}))["ok"]
+            _, writer = await asyncio.open_unix_connection(str(path))
+            writer.close()
+        await status_when(path, lambda _: used()["descriptors"] <= before["descriptors"])
+        after = used()
+    assert after["descriptors"] <= before["descriptors"]
+    assert after["threads"] <= before["threads"] + 2  # the pool of the event loop may not have been full yet
+
+
+@pytest.mark.parametrize(("number", "told"), [(errno.EMFILE, ["descriptors"]), (errno.EIO, [])])
+@pytest.mark.fault("F10")
+def test_what_cannot_be_looked_at_ends_nothing(number: int, told: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuses(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(Path, "iterdir", refuses)
+    found = uses()
+    assert [use.name for use in found] == told
+    assert all(use.share == 1.0 for use in found)

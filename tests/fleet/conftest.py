@@ -1,0 +1,22 @@
+"""One PostgreSQL for all tests, empty at the beginning of each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from tests.fleet.servers import Postgres, postgres
+
+
+@pytest.fixture(scope="session")
+def running_database() -> Iterator[Postgres]:
+    with postgres() as server:
+        yield server
+
+
+@pytest.fixture
+def database(running_database: Postgres) -> Postgres:
+    """The database, empty."""
+    running_database.ask("DROP SCHEMA IF EXISTS fleet CASCADE")
+    return running_database

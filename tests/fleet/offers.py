@@ -1,0 +1,54 @@
+"""A works with a key, and a machine whose operator trusts it."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+from fdhil.fleet.offer import Offer, make_key, sign
+from tests.fleet.machine import written
+
+NOW = int(time.time())
+TOLD: dict[str, Any] = {
+    "name": "friction",
+    "version": 3,
+    "text": "Friction of the X axis, from twelve machines",
+    "labels": {"type": "V-800"},
+    "axis_labels": {},
+    "values": {"axis.X.nominal.ft": 0.061},
+    "stage": 1,
+    "machines": ("mill-1",),
+    "by": "Anna",
+    "made_s": NOW - 60,
+    "expires_s": NOW + 86_400,
+}
+
+
+class Works:
+    """The works: its key, and the offers that it signs."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.key = folder / "works.key"
+        self.public = make_key(self.key)
+
+    def document(self, **changes: Any) -> bytes:
+        """Return a signed offer."""
+        return sign(Offer(**(TOLD | changes)), self.key)
+
+    def carried(self, **changes: Any) -> Path:
+        """Return the file of a signed offer, as it is carried to a machine."""
+        place = self._folder / "carried.offer"
+        place.write_bytes(self.document(**changes))
+        return place
+
+
+def machine_of(works: Works, folder: Path, *more: str, **uplink: Any) -> Path:
+    """Write the configuration of a machine that trusts the works, with comments in it, and return its file."""
+    told = {"axis_labels": {"X": {"screw": "A"}, "Y": {"screw": "B"}}} | uplink
+    file = written(folder, **told)
+    text = file.read_text().replace("ft = 0.05", "ft = 0.05  # by the data sheet", 1)
+    tail = "\n".join(["", "# what follows is the operator's", "[offers]", f'trust = ["{works.public}"]', *more, ""])
+    file.write_text(text + tail)
+    return file

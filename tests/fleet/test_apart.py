@@ -1,0 +1,24 @@
+"""The daemon and the guard need nothing of what gathers many machines."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+
+@pytest.mark.parametrize("module", ["fdhil.daemon.service", "fdhil.guard.process", "fdhil.cli.main", "fdhil.cli.fleet"])
+def test_it_runs_without_the_extra(module: str) -> None:
+    code = f"import sys, {module}; print([name for name in ('nats', 'psycopg', 'distributed') if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_the_uplink_is_light() -> None:
+    """It runs beside an NC: none of the numeric libraries is loaded for it."""
+    code = (
+        "import sys, fdhil.fleet.uplink; print([n for n in ('numba', 'scipy', 'pyarrow', 'can') if n in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,73 @@
+"""Three NATS servers that each keep every message: the first of them is killed, and nothing that it took is lost."""
+
+from __future__ import annotations
+
+import json
+import signal
+from pathlib import Path
+
+import pytest
+from nats.aio.client import Client
+
+from tests.fleet.machine import Machine, written
+from tests.fleet.servers import NatsServer, Postgres, free_port, until
+from tests.fleet.test_whole import counted, running
+
+pytestmark = pytest.mark.debian
+
+
+def cluster(folder: Path) -> list[NatsServer]:
+    """Return three servers of one cluster."""
+    ports = [free_port() for _ in range(3)]
+    routes = ", ".join(f"nats-route://127.0.0.1:{port}" for port in ports)
+    servers = []
+    for k, port in enumerate(ports):
+        place = folder / f"nats-{k}"
+        place.mkdir()
+        clustered = f"cluster {{ name: works, listen: '127.0.0.1:{port}', routes: [{routes}] }}\n"
+        servers.append(NatsServer(place, f"server_name: n{k}\n{clustered}"))
+    return servers
+
+
+async def leader(url: str) -> str:
+    """Return which server leads the stream."""
+    client = Client()
+    await client.connect(url)
+    try:
+        answer = await client.request("$JS.API.STREAM.INFO.fdhil", b"", timeout=5)
+        return str(json.loads(answer.data)["cluster"]["leader"])
+    finally:
+        await client.close()
+
+
+async def test_the_leader_is_killed_and_nothing_is_lost(tmp_path: Path, database: Postgres) -> None:
+    servers = cluster(tmp_path)
+    together = ",".join(server.url for server in servers)
+    works = tmp_path / "fleet.toml"
+    works.write_text(
+        f'[server]\nserver = "{together}"\n[stream]\nreplicas = 3\nmax_bytes = {1 << 26}\n'
+        f'[database]\nconnection = "{database.connection}"\n'
+    )
+    file = written(tmp_path / "mill", "mill-1", server=together, windows="none")
+    machine = Machine(file)
+    try:
+        for server in servers:
+            server.start()
+        with (
+            running(tmp_path / "collect.log", "fleet", "collect", works) as collector,
+            running(tmp_path / "uplink.log", "uplink", file) as uplink,
+        ):
+            expected = machine.record(5)
+            until(lambda: counted(database) == expected, f"the first are there: {collector.said} {uplink.said}")
+            first = int((await leader(servers[0].url))[1:])
+            expected += machine.record(30)
+            servers[first].stop(signal.SIGKILL)
+            expected += machine.record(5)
+            until(lambda: counted(database) == expected, "all are there, from two servers")
+    finally:
+        for server in servers:
+            server.stop(signal.SIGKILL)
+        machine.close()
+    rows = database.ask("SELECT sequence FROM fleet.records WHERE sequence > 0 ORDER BY stored_at, sequence")
+    assert [sequence for (sequence,) in rows] == list(range(1, expected + 1))
+    assert database.ask("SELECT records, missing FROM fleet.machines") == [(expected, 0)]

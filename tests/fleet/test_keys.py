@@ -1,0 +1,116 @@
+"""Users known by a key: an nkey's seed alone, and a .creds file whose token an operator's account has signed."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import secrets
+from pathlib import Path
+from typing import Any, cast
+
+import nats.errors
+import nkeys
+import pytest
+
+from fdhil.config.uplink import NatsServer
+from fdhil.errors import ConnectError
+from fdhil.fleet import transport
+from tests.fleet import servers
+from tests.fleet.servers import NatsServer as Server
+
+
+def key_of(prefix: int) -> tuple[str, nkeys.KeyPair]:
+    """Return a new seed and its pair."""
+    seed = nkeys.encode_seed(secrets.token_bytes(32), prefix)
+    return seed.decode(), nkeys.from_seed(bytearray(seed))
+
+
+def public(pair: nkeys.KeyPair) -> str:
+    return bytes(pair.public_key).decode()
+
+
+def token(subject: nkeys.KeyPair, issuer: nkeys.KeyPair, name: str, claims: dict[str, Any]) -> str:
+    """Return what ``issuer`` says of ``subject``, as NATS wants it signed."""
+    told: dict[str, Any] = {"iat": 1_800_000_000, "iss": public(issuer), "name": name, "sub": public(subject)}
+    told["nats"] = claims | {"version": 2}
+    told["jti"] = base64.b32encode(hashlib.sha256(json.dumps(told).encode()).digest()).decode().rstrip("=")
+    parts = [_plain({"typ": "JWT", "alg": "ed25519-nkey"}), _plain(told)]
+    signed = base64.urlsafe_b64encode(issuer.sign(".".join(parts).encode())).decode().rstrip("=")
+    return ".".join([*parts, signed])
+
+
+def _plain(document: dict[str, Any]) -> str:
+    return base64.urlsafe_b64encode(json.dumps(document).encode()).decode().rstrip("=")
+
+
+def operated(folder: Path) -> tuple[str, str]:
+    """Return the server's part of an operator with one account, and the .creds file of its user mill-1."""
+    (_, operator), (_, account) = key_of(nkeys.PREFIX_BYTE_OPERATOR), key_of(nkeys.PREFIX_BYTE_ACCOUNT)
+    _, system = key_of(nkeys.PREFIX_BYTE_ACCOUNT)
+    seed, user = key_of(nkeys.PREFIX_BYTE_USER)
+    (folder / "operator.jwt").write_text(token(operator, operator, "works", {"type": "operator"}))
+    limits = dict.fromkeys(("subs", "conn", "leaf", "imports", "exports", "data", "payload"), -1)
+    of_account = token(account, operator, "machines", {"type": "account", "limits": limits | {"wildcards": True}})
+    rights = {"pub": {"allow": ["fdhil.v1.mill-1.>"]}, "sub": {"allow": ["_INBOX_fdhil-mill-1.>"]}}
+    of_user = token(user, account, "mill-1", {"type": "user", "subs": -1, "data": -1, "payload": -1, **rights})
+    creds = (
+        f"-----BEGIN NATS USER JWT-----\n{of_user}\n------END NATS USER JWT------\n\n"
+        f"-----BEGIN USER NKEY SEED-----\n{seed}\n------END USER NKEY SEED------\n"
+    )
+    resolver = f"operator: '{folder}/operator.jwt'\nresolver: MEMORY\n"
+    of_system = token(system, operator, "system", {"type": "account", "limits": limits})
+    tokens = f"{{ {public(account)}: '{of_account}', {public(system)}: '{of_system}' }}"
+    return f"{resolver}resolver_preload: {tokens}\nsystem_account: {public(system)}\n", creds
+
+
+def entering(server: Server, file: Path, secret: str) -> NatsServer:
+    file.write_text(secret)
+    return NatsServer(server=server.url, credentials_file=file)
+
+
+async def told_and_refused(server: Server, known: NatsServer, foreign: NatsServer) -> None:
+    """Whoever is known tells under its own name; nobody else enters."""
+    async with transport.connected(known, "fdhil-mill-1", "uplink") as client:
+        await client.publish("fdhil.v1.mill-1.records", b"")
+        await client.flush()
+        assert client.last_error is None
+        with pytest.raises(nats.errors.Error):
+            await client.request("fdhil.v1.mill-2.records", b"", timeout=1.0)
+        assert "it refuses us" in transport.cause_of(
+            cast(BaseException, client.last_error)
+        )  # a timeout alone would not be it
+    for other in (foreign, NatsServer(server=server.url)):
+        with pytest.raises(transport.ERRORS) as error:
+            await transport.connected(other, "fdhil-mill-1", "uplink").__aenter__()
+        assert "it refuses us" in transport.cause_of(error.value)
+
+
+@pytest.mark.debian
+async def test_a_user_known_by_its_nkey(tmp_path: Path) -> None:
+    seed, pair = key_of(nkeys.PREFIX_BYTE_USER)
+    rights = '{ publish: ["fdhil.v1.mill-1.>"], subscribe: ["_INBOX_fdhil-mill-1.>"] }'
+    guard = f"authorization {{ users = [ {{ nkey: {public(pair)}, permissions: {rights} }} ] }}\n"
+    with servers.nats(tmp_path, guard) as server:
+        known = entering(server, tmp_path / "seed", seed)
+        foreign = entering(server, tmp_path / "other", key_of(nkeys.PREFIX_BYTE_USER)[0])
+        await told_and_refused(server, known, foreign)
+
+
+@pytest.mark.debian
+async def test_a_user_whose_token_an_account_has_signed(tmp_path: Path) -> None:
+    guard, creds = operated(tmp_path)
+    (tmp_path / "another").mkdir()
+    _, of_another = operated(tmp_path / "another")
+    with servers.nats(tmp_path, guard) as server:
+        known = entering(server, tmp_path / "mill-1.creds", creds)
+        await told_and_refused(server, known, entering(server, tmp_path / "other.creds", of_another))
+
+
+@pytest.mark.parametrize("content", ["", "SUAA", "-----BEGIN NATS USER JWT-----\nx\n"])
+def test_a_file_without_a_seed_is_told_before_anything_is_tried(content: str, tmp_path: Path) -> None:
+    (tmp_path / "creds").write_text(content)
+    with pytest.raises(ConnectError, match="holds no user's seed"):
+        transport.check_credentials(NatsServer(credentials_file=tmp_path / "creds"), "uplink")
+    with pytest.raises(ConnectError, match="cannot be used"):
+        transport.check_credentials(NatsServer(credentials_file=tmp_path / "none"), "uplink")

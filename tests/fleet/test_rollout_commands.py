@@ -1,0 +1,181 @@
+"""The commands of the roll-out, as an operator and a person at the works call them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fdhil import config as machine_config
+from fdhil.commissioning.record import axis_digest, save_record
+from fdhil.config import MachineConfig
+from fdhil.daemon.offer_watch import OfferWatch
+from fdhil.store import audit
+from fdhil.store.offers import ANSWERS_FILE
+from tests.commissioning.test_record import RECORD
+from tests.daemon.shop import fdhil
+from tests.fleet.offers import NOW, Works, machine_of
+
+CHANGE = """
+name = "friction"
+version = 3
+text = "Friction, from twelve machines"
+[axis_labels]
+screw = "A"
+[set.axis."*".nominal]
+ft = 0.061
+[set.maintenance]
+ft = 0.8
+"""
+
+
+@pytest.fixture
+def works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Works:
+    monkeypatch.chdir(tmp_path)
+    return Works(tmp_path)
+
+
+@pytest.fixture
+def file(works: Works, tmp_path: Path) -> Path:
+    return machine_of(works, tmp_path / "mill")
+
+
+def lay(works: Works, file: Path, **changes: Any) -> MachineConfig:
+    """Lay an offer where the uplink would."""
+    config = machine_config.load(file)
+    config.offers_directory.mkdir(parents=True, exist_ok=True)
+    version = changes.get("version", 3)
+    (config.offers_directory / f"friction-{version}.offer").write_bytes(works.document(**changes))
+    return config
+
+
+def test_from_the_works_to_a_machine_by_hand(works: Works, file: Path, capsys: Any) -> None:
+    Path("change.toml").write_text(CHANGE)
+    _, said, _ = fdhil("fleet", "key", "works.key", capsys=capsys)
+    assert said.splitlines() == ["works.key is there already; its public key, for [offers] trust of each machine:",
+                                 works.public]  # fmt: skip
+    signed = ["fleet", "sign", "change.toml", "--key", "works.key", "--by", "Anna", "--machine", "mill-1"]
+    assert fdhil(*signed, "--out", "stick.offer", capsys=capsys)[0] == 0
+    before = file.read_bytes()
+    code, said, _ = fdhil("offers", "list", file, "stick.offer", capsys=capsys)
+    assert (code, file.read_bytes()) == (0, before)
+    assert said.splitlines()[:3] == [
+        "friction version 3, stage 1, by Anna: Friction, from twelve machines",
+        "  axis.X.nominal.ft 0.05 -> 0.061",
+        "  maintenance.ft 1 -> 0.8",
+    ]
+    code, said, _ = fdhil("offers", "accept", file, "stick.offer", "--by", "Bert", capsys=capsys)
+    assert code == 0
+    assert "machine.toml.before-friction-3" in said
+    assert said.splitlines()[-1].endswith("until it is started anew: systemctl restart fdhil; nothing is armed by it")
+    code, said, _ = fdhil("offers", "list", file, "stick.offer", "--json", capsys=capsys)
+    (told,) = json.loads(said)["offers"]
+    assert (told["changes"], told["answers"][0]["by"]) == ([], "Bert")
+
+
+def test_who_accepted_what_is_in_the_audit(works: Works, file: Path, capsys: Any) -> None:
+    store = lay(works, file).store.directory
+    assert fdhil("offers", "accept", file, "friction", "--by", "Bert", capsys=capsys)[0] == 0
+    assert fdhil("offers", "reject", file, "friction", "--by", "Bert\x1b[2J", "--reason", "no", capsys=capsys)[0] == 0
+    told = [{key: entry.get(key) for key in ("by", "asked", "answered", "offer", "result")} for entry, _ in
+            audit.entries(store)]  # fmt: skip
+    assert told == [
+        {"by": "Bert", "asked": "accept an offer", "answered": None, "offer": "friction", "result": None},
+        {"by": "Bert", "asked": None, "answered": "accept an offer", "offer": "friction", "result": "done"},
+        {"by": "Bert\\x1b[2J", "asked": "reject an offer", "answered": None, "offer": "friction", "result": None},
+        {"by": "Bert\\x1b[2J", "asked": None, "answered": "reject an offer", "offer": "friction", "result": "done"},
+    ]
+    assert "accept an offer friction: done, axis.X.nominal.ft 0.05 -> 0.061" in fdhil("audit", file, capsys=capsys)[1]
+
+
+def test_where_the_audit_cannot_be_written_nothing_is_accepted(works: Works, file: Path, capsys: Any) -> None:
+    store = lay(works, file).store.directory
+    (store / audit.FILE_NAME).mkdir(parents=True)
+    before = file.read_bytes()
+    assert fdhil("offers", "accept", file, "friction", "--by", "Bert", capsys=capsys)[0] == 3
+    assert file.read_bytes() == before
+    assert not (store / ANSWERS_FILE).exists()
+
+
+def test_a_refused_offer_is_exit_1_and_says_why(works: Works, file: Path, capsys: Any) -> None:
+    lay(works, file, expires_s=NOW - 5)
+    code, _, said = fdhil("offers", "accept", file, "friction", "--by", "Bert", capsys=capsys)
+    assert code == 1
+    assert "it was valid until" in said
+    assert "cannot be accepted: it was valid until" in fdhil("offers", "list", file, capsys=capsys)[1]
+    place = works.carried()
+    place.write_bytes(b"junk")
+    assert fdhil("offers", "list", file, place, capsys=capsys)[0] == 1
+    assert fdhil("offers", "list", file, "absent.offer", capsys=capsys)[0] == 3
+    code, _, said = fdhil("offers", "accept", file, "wear", "--by", "Bert", capsys=capsys)
+    assert (code, "these do: friction" in said) == (2, True)
+    for by in ("", " ", "x" * 65):
+        assert fdhil("offers", "accept", file, "friction", "--by", by, capsys=capsys)[0] == 2
+
+
+def test_the_newest_of_a_name_is_meant(works: Works, file: Path, capsys: Any) -> None:
+    lay(works, file)
+    lay(works, file, version=10, values={"axis.X.nominal.ft": 0.07})
+    assert fdhil("offers", "accept", file, "friction", "--by", "Bert", capsys=capsys)[0] == 0
+    assert machine_config.load(file).axis["X"].nominal.ft == 0.07
+
+
+def test_a_limit_that_is_loosened_has_its_own_line(works: Works, file: Path, capsys: Any) -> None:
+    lay(works, file, values={"maintenance.ft": 2.0})
+    line = "  LOOSENS maintenance.ft 1 -> 2: more is let through than before; accepted with --loosens alone"
+    assert line in fdhil("offers", "list", file, capsys=capsys)[1].splitlines()
+    assert fdhil("offers", "accept", file, "friction", "--by", "Bert", capsys=capsys)[0] == 1
+    assert fdhil("offers", "accept", file, "friction", "--by", "Bert", "--loosens", capsys=capsys)[0] == 0
+
+
+def test_what_becomes_void_is_said(works: Works, file: Path, capsys: Any) -> None:
+    config = lay(works, file, values={"axis.X.correction.max_offset_um": 5.0, "axis.Y.nominal.ft": 0.06})
+    for axis in "XY":
+        save_record(replace(RECORD, axis=axis, config_digest=axis_digest(config, axis)), config.store.directory)
+    said = fdhil("offers", "list", file, capsys=capsys)[1]
+    assert "the commissioning record of axis X holds no longer" in said
+    assert "record of axis Y" not in said
+    assert "none is armed until the axes are identified anew" in said
+
+
+def test_a_machine_that_trusts_nobody_is_told_so(works: Works, file: Path, capsys: Any) -> None:
+    lay(works, file)
+    file.write_text(file.read_text().partition("# what follows")[0])
+    assert "which is no key of [offers] trust" in fdhil("offers", "list", file, capsys=capsys)[1]
+    assert OfferWatch(machine_config.load(file)).look() == []
+
+
+def test_the_daemon_tells_of_an_offer_once_until_it_is_answered(works: Works, file: Path, capsys: Any) -> None:
+    config = lay(works, file)
+    (config.offers_directory / "notes.txt").write_text("none of ours")
+    watch = OfferWatch(config)
+    (notice,) = watch.look()
+    assert (notice.code, notice.severity) == ("OfferWaits", "minor")
+    assert notice.text == "the works offers a change: friction version 3"
+    assert watch.look() == []
+    lay(works, file, version=4)
+    assert [each.text for each in watch.look()] == ["the works offers a change: friction version 4"]
+    fdhil("offers", "reject", file, "friction", "--by", "Bert", "--reason", "another oil", capsys=capsys)
+    assert [each.text[-1] for each in OfferWatch(config).look()] == ["3"]
+    (config.store.directory / ANSWERS_FILE).write_text("{")
+    assert "is damaged" in OfferWatch(config).look()[0].text
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('name = "friction"', 'name = "Friction!"', "name"),
+        ("ft = 0.061", "friction = 1.0", "no key"),
+        ("[set.maintenance]", "[set.guard]", "set up at the machine alone"),
+        ("[set.maintenance]", "[sets]", "sets"),
+        ("version = 3", "", "version"),
+    ],
+)
+def test_a_change_that_cannot_be_offered_is_2(old: str, new: str, words: str, works: Works, capsys: Any) -> None:
+    Path("change.toml").write_text(CHANGE.replace(old, new))
+    signed = ["fleet", "sign", "change.toml", "--key", "works.key", "--by", "Anna", "--machine", "mill-1"]
+    code, _, said = fdhil(*signed, "--out", "stick.offer", capsys=capsys)
+    assert (code, words in said, Path("stick.offer").exists()) == (2, True, False), said

@@ -1,0 +1,119 @@
+"""Any call of an acceptance fails or is the last: the configuration is the old one or the new one, never half."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import tempfile
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from fdhil import config as machine_config
+from fdhil.cli.main import cli, run_safely
+from fdhil.config.editing import edited
+from fdhil.errors import ConfigError, FdhilError, StoreError
+from fdhil.store.atomic import write_file
+from fdhil.store.offers import read_answers
+from tests.crash import disks, injected
+from tests.crash.keepers import Plain
+from tests.crash.loops import KINDS, Kind, tried
+from tests.fleet.offers import Works, machine_of
+
+KEY = "axis.X.nominal.ft"
+VERSIONS = (1, 2, 3, 4, 9)
+STATES = (0, *VERSIONS)
+
+
+class Refused(FdhilError):
+    """The command said no."""
+
+
+class Acceptances(Plain):
+    """A machine that accepts one version after another, each by the command itself; a record is a version."""
+
+    offers: Path
+    first: str  # the configuration before any
+
+    @classmethod
+    def prepare(cls, folder: Path) -> None:
+        """Sign the offers."""
+        works = Works(folder)
+        cls.first = machine_of(works, folder / "first").read_text()
+        for version in VERSIONS:
+            values = {KEY: cls.value(version)}
+            (folder / f"{version}.offer").write_bytes(works.document(version=version, values=values))
+        cls.offers = folder
+
+    @staticmethod
+    def value(version: int) -> float:
+        """Return what a version sets."""
+        return 0.05 + version * 0.001
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.file = folder / "machine.toml"
+        if not self.file.exists():
+            write_file(self.file, self.first.encode())
+
+    def keep(self, number: int) -> None:
+        """Accept a version."""
+        words = ["offers", "accept", self.file, self.offers / f"{number}.offer", "--by", "Bert"]
+        said = io.StringIO()
+        with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(said):
+            patch.setattr("sys.argv", ["fdhil", *map(str, words)])
+            with contextlib.redirect_stdout(io.StringIO()):
+                code = run_safely(cli)
+        if code:
+            raise Refused(said.getvalue().replace(" (check", "; check"))
+
+    def found(self) -> set[int]:
+        """Return the versions that were noted as accepted; AssertionError where a file is none that there ever was.
+
+        A kernel that lies of what it wrote leaves one that is none, and is found out when it is read: StoreError.
+        """
+        try:
+            machine_config.load(self.file)
+        except ConfigError as error:
+            raise StoreError(f"{error}; bring the old one back") from None
+        texts = [self._text(version) for version in STATES]
+        for kept in self.folder.glob("machine.toml.before-*"):
+            assert kept.read_text() in texts, f"{kept.name} is half"
+        assert self.file.read_text() in texts, "the configuration is half"
+        now = STATES[texts.index(self.file.read_text())]
+        accepted = {each.version for each in read_answers(self.folder / "fdhil-data")}
+        assert now >= max(accepted, default=0), f"version {now} is in force"
+        return accepted
+
+    def _text(self, version: int) -> str:
+        note = f"friction version {version}"
+        return edited(self.first, {KEY: self.value(version)}, note) if version else self.first
+
+
+@pytest.fixture
+def offers(tmp_path: Path) -> Path:
+    folder = Path(tempfile.mkdtemp(dir=tmp_path))
+    Acceptances.prepare(folder)
+    return folder
+
+
+@pytest.mark.debian
+def test_an_acceptance_is_whole_whatever_call_fails_or_is_the_last(
+    offers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(KINDS, "acceptances", Kind(Acceptances, partial(injected.keep_some, Acceptances)))
+    found = tried("acceptances", tmp_path / "tried", most=16)
+    assert found.wrong == []
+    assert found.acknowledged > 0
+    assert sum(found.runs.values()) > 8
+
+
+def test_a_full_disk_takes_nothing_back(offers: Path, tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    told = disks.filled(Acceptances, tmp_path / "disk", free_bytes=0)
+    assert (told.wrong, told.ended) == ([], True)
+    assert set(told.kept) - {9} <= set(told.found)
+    assert 1 in told.found
+    assert told.refused
+    assert all("the disk is full" in text or "No space left" in text for text in told.refused)

@@ -1,0 +1,182 @@
+"""An offer is believed when a trusted key has signed just these bytes, and it offers what may be offered."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import nkeys
+import pytest
+from pydantic import ValidationError
+
+from fdhil.config.from_afar import FROM_AFAR, NEVER, loosens, never
+from fdhil.config.offers import Offers
+from fdhil.config.template import sections
+from fdhil.errors import ConfigError
+from fdhil.fleet.offer import SCHEMA, Offer, OfferRefused, canonical, make_key, public_key, read, sign
+from tests.fleet.offers import TOLD, Works
+
+
+@pytest.fixture
+def works(tmp_path: Path) -> Works:
+    return Works(tmp_path)
+
+
+def test_a_signed_offer_is_read_as_it_was_meant(works: Works) -> None:
+    values = {
+        "axis.*.nominal.ft": 0.1 + 0.2,
+        "nc.smoothing_s": (0.06, 0.03),
+        "nc.rapid_stop": False,
+        "nc.profile": "fir",
+    }
+    document = works.document(values=values, axis_labels={"screw": "Müller"})
+    offer = read(document, {works.public})
+    assert dict(offer.values) == values
+    assert (offer.axis_labels, offer.machines, offer.version) == ({"screw": "Müller"}, ("mill-1",), 3)
+
+
+@pytest.mark.parametrize("bit", [0x01, 0x20, 0x80])
+def test_each_byte_of_an_offer_matters(bit: int, works: Works) -> None:
+    document = works.document()
+    believed = []
+    for at in range(len(document)):
+        changed = bytearray(document)
+        changed[at] ^= bit
+        try:
+            read(bytes(changed), {works.public})
+        except OfferRefused:
+            continue
+        believed.append(at)
+    assert believed == []
+
+
+def test_what_is_cut_off_longer_or_doubled_is_no_offer(works: Works) -> None:
+    document = works.document()
+    wrong = [document[:at] for at in range(len(document))]
+    wrong += [document + b"\n", document + b" ", b" " + document, document * 2, document.upper()]
+    for each in wrong:
+        with pytest.raises(OfferRefused):
+            read(each, {works.public})
+
+
+def test_whoever_is_not_listed_offers_nothing_and_several_keys_may_be(works: Works, tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    other = Works(tmp_path / "other")
+    with pytest.raises(OfferRefused, match="no key of \\[offers\\] trust"):
+        read(other.document(), {works.public})
+    with pytest.raises(OfferRefused, match="no key"):
+        read(works.document(), ())
+    for signer in (works, other):  # while one key follows another
+        assert read(signer.document(), {works.public, other.public}).version == 3
+    stolen = other.document().replace(other.public.encode(), works.public.encode())
+    with pytest.raises(OfferRefused, match="changed after it was signed"):
+        read(stolen, {works.public})
+
+
+def test_what_is_signed_but_not_written_as_offers_are_is_refused(works: Works) -> None:
+    pair = nkeys.from_seed(works.key.read_bytes().strip())
+
+    def signed(line: bytes) -> bytes:
+        return line + f"\n{SCHEMA} {works.public} {pair.sign(SCHEMA.encode() + bytes([10]) + line).hex()}\n".encode()
+
+    line = canonical(Offer(**TOLD))
+    assert read(signed(line), {works.public}).version == 3
+    told = json.loads(line)
+    wrong = [
+        line.replace(b'"version":3', b'"version":"3"'),
+        line.replace(b'"version":3', b'"version":2,"version":3'),
+        line.replace(b":", b": ", 1),
+        json.dumps(told | {"values": {"guard.node_id": 5}}, sort_keys=True, separators=(",", ":")).encode(),
+        json.dumps(told | {"more": 1}, sort_keys=True, separators=(",", ":")).encode(),
+        b"[" * 5000,
+        b"",
+        b"\xff",
+    ]
+    for each in wrong:
+        with pytest.raises(OfferRefused):
+            read(signed(each), {works.public})
+    plain = line + f"\n{SCHEMA} {works.public} {pair.sign(line).hex()}\n".encode()  # signed for another purpose
+    with pytest.raises(OfferRefused, match="changed"):
+        read(plain, {works.public})
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"values": {"guard.node_id": 5}}, "set up at the machine alone"),
+        ({"values": {"axis.X.drive.sign": -1}}, "known at the machine alone"),
+        ({"values": {"axis.X.setpoints.max_speed_mm_s": 5.0}}, "set up at the machine alone"),
+        ({"values": {"offers.trust": "O"}}, "decided at the machine alone"),
+        ({"values": {"access.operate": "anna"}}, "decided at the machine alone"),
+        ({"values": {"store.directory": "/"}}, "those of this computer"),
+        ({"values": {"axis.*.nominal.ft": 1.0}}, "say which"),
+        ({"values": {"axis.X.nominal.ft": float("nan")}}, "finite"),
+        ({"values": {}}, "at least 1"),
+        ({"labels": {}, "machines": ()}, "neither machines nor labels"),
+        ({"name": "../../etc"}, "match pattern"),
+        ({"version": 0}, "greater than"),
+    ],
+)
+def test_what_may_not_be_offered_cannot_be_signed(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValidationError, match=words):
+        Offer(**(TOLD | changes))
+
+
+def test_a_value_that_no_machine_could_have_is_not_signed(works: Works) -> None:
+    for path, value in (("axis.X.nominal.ft", -1.0), ("axis.*.nominal.friction", 1.0), ("nc.profile", "magic")):
+        with pytest.raises(ConfigError):
+            works.document(values={path: value}, axis_labels={"screw": "A"})
+
+
+def test_every_key_of_the_configuration_is_decided_upon() -> None:
+    """A section that is new needs a decision: it is named, or a table above it is."""
+    for table in sections():
+        for key, _ in table.keys:
+            path = f"{table.path}.{key}"
+            assert never(path) != "no offer may change it", path
+    assert all(never(path.replace("*", "X")) for path in NEVER)
+    assert not any(never(path.replace("axis.*", "axis.Z")) for path in FROM_AFAR)
+    assert never("nothing.of_the_kind")
+
+
+def test_a_larger_limit_loosens_and_a_smaller_one_does_not() -> None:
+    path = "axis.X.correction.max_offset_um"
+    assert (loosens(path, 50.0, 60.0), loosens(path, 50.0, 40.0), loosens(path, 50.0, 50.0)) == (True, False, False)
+    assert loosens("correction.learning", False, True)
+    assert not loosens("correction.learning", True, False)
+    assert loosens("identification.tolerance_um", None, 1.0)  # which of the two is larger depends
+    assert not loosens("axis.X.nominal.ft", 1.0, 2.0)
+
+
+def test_a_key_is_its_owner_s_alone(tmp_path: Path) -> None:
+    file = tmp_path / "key"
+    told = make_key(file)
+    assert file.stat().st_mode & 0o777 == 0o600
+    assert public_key(file) == told
+    assert Offers(trust=(told,)).trust == (told,)
+    with pytest.raises(FileExistsError):
+        make_key(file)
+    file.chmod(0o640)
+    with pytest.raises(ConfigError, match="may be read by others"):
+        sign(Offer(**TOLD), file)
+    file.chmod(0o600)
+    seed = file.read_bytes()
+    users = nkeys.encode_seed(b"7" * 32, nkeys.PREFIX_BYTE_USER)  # that of a server's user
+    for wrong in (b"", b"\xff", seed[:20], users, b"A" * 58):
+        file.write_bytes(wrong)
+        with pytest.raises(ConfigError, match="is no key to sign with"):
+            public_key(file)
+    with pytest.raises(ConfigError, match="fdhil fleet key makes one"):
+        public_key(tmp_path / "absent")
+
+
+def test_a_mistyped_key_is_found_in_the_configuration(tmp_path: Path) -> None:
+    told = make_key(tmp_path / "key")
+    for at in range(len(told)):
+        wrong = told[:at] + ("A" if told[at] != "A" else "B") + told[at + 1 :]
+        with pytest.raises(ValidationError, match="mistyped"):
+            Offers(trust=(wrong,))
+    user = nkeys.from_seed(nkeys.encode_seed(b"7" * 32, nkeys.PREFIX_BYTE_USER)).public_key.decode()
+    with pytest.raises(ValidationError, match="no key of a works"):
+        Offers(trust=(user,))

@@ -1,0 +1,260 @@
+"""A change from the works to machines and their answers back, stage by stage, with real servers between."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import AsyncIterator, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import nats.errors
+import nats.js.errors
+import pytest
+
+from fdhil import config as machine_config
+from fdhil.config import MachineConfig
+from fdhil.config import fleet as fleet_config
+from fdhil.config.fleet import Stream
+from fdhil.fleet import delivery
+from fdhil.fleet.delivery import Letterbox
+from fdhil.fleet.offer import Offer
+from fdhil.fleet.transport import connected, prepare_stream
+from fdhil.records import Notice
+from fdhil.store.offers import lying
+from tests.daemon.shop import fdhil
+from tests.fleet import servers
+from tests.fleet.machine import Machine
+from tests.fleet.offers import TOLD, Works, machine_of
+from tests.fleet.servers import NatsServer, Postgres, until
+from tests.fleet.test_guarded import SECRET, entering
+from tests.fleet.test_whole import of_the_works, running
+from tests.fleet.works import gather, told_by
+from tests.shopfloor.mosquitto import certify
+from tests.store.made import published
+
+pytestmark = pytest.mark.debian
+CHANGE = """
+name = "friction"
+version = 3
+text = "Friction of the X axis, from twelve machines"
+[labels]
+type = "V-800"
+[set.axis.X.nominal]
+ft = 0.061
+"""
+MACHINES = ("mill-1", "mill-2", "mill-3")
+
+
+class Shop:
+    """A works with its servers and machines, each with its uplink."""
+
+    def __init__(self, folder: Path, database: Postgres, server: NatsServer, capsys: Any) -> None:
+        self._folder, self._capsys = folder, capsys
+        self.works = Works(folder)
+        self.database = database
+        self.fleet = of_the_works(folder, server, database)
+        self.change = folder / "change.toml"
+        self.change.write_text(CHANGE)
+        told = {"server": server.url}
+        self.files = {name: machine_of(self.works, folder / name, machine=name, **told) for name in MACHINES}
+
+    def config(self, name: str) -> MachineConfig:
+        return machine_config.load(self.files[name])
+
+    def fdhil(self, code: int, *words: object) -> Any:
+        """Run a command of fdhil with --json, and return what it tells."""
+        done = fdhil(*map(str, words), "--json", capsys=self._capsys)
+        assert done[0] == code, done
+        return json.loads(done[1])
+
+    def uplink(self, name: str) -> None:
+        """Run a machine's uplink until it has fetched and sent what there is."""
+        log = self._folder / f"{name}.log"
+        log.unlink(missing_ok=True)
+        with running(log, "uplink", self.files[name]) as process:
+            until(lambda: "all that was recorded is sent" in process.said, "it has sent all")
+
+    def lying(self, name: str) -> list[str]:
+        """Return the offers that lie at a machine."""
+        return [path.name for path in lying(self.config(name).offers_directory)]
+
+    def stage(self, code: int, *options: object) -> Any:
+        """Look at the roll-out, or open a stage with the options."""
+        return self.fdhil(code, "fleet", "stage", self.fleet, self.change, *options)
+
+    def opened(self, code: int, *options: object) -> Any:
+        return self.stage(code, "--key", self.works.key, "--by", "Anna", *options)
+
+    def told(self, query: str) -> Any:
+        return self.database.ask(query)
+
+
+@pytest.fixture
+async def shop(tmp_path: Path, database: Postgres, capsys: Any) -> AsyncIterator[Shop]:
+    with servers.nats(tmp_path) as server:
+        shop = Shop(tmp_path, database, server, capsys)
+        for file in shop.files.values():
+            machine = Machine(file)
+            await gather(fleet_config.load(shop.fleet), told_by(machine))
+            machine.close()
+        yield shop
+
+
+@pytest.fixture
+def collected(shop: Shop, tmp_path: Path) -> Iterator[Shop]:
+    """The works while its collector runs."""
+    with running(tmp_path / "collect.log", "fleet", "collect", shop.fleet) as collector:
+        until(lambda: "the server and the database are there" in collector.said, "it collects")
+        yield shop
+
+
+def test_a_change_goes_out_stage_by_stage(collected: Shop) -> None:
+    shop = collected
+    assert shop.stage(0)["left"] == list(MACHINES)
+    assert shop.opened(0, "--machine", "mill-1")["opened"] == {"stage": 1, "machines": ["mill-1"]}
+    shop.uplink("mill-1")
+    assert shop.lying("mill-1") == ["friction-3.offer"]
+    assert "no answer yet" in shop.opened(1, "--count", 1)["error"]["text"]
+
+    before = {name: file.read_bytes() for name, file in shop.files.items()}
+    (listed,) = shop.fdhil(0, "offers", "list", shop.files["mill-1"])["offers"]
+    assert listed["changes"] == [{"key": "axis.X.nominal.ft", "old": 0.05, "new": 0.061, "loosens": False}]
+    assert shop.files["mill-1"].read_bytes() == before["mill-1"]
+    shop.fdhil(0, "offers", "accept", shop.files["mill-1"], "friction", "--by", "Bert")
+    shop.uplink("mill-1")
+    until(lambda: shop.told("SELECT count(*) FROM fleet.offer_answers") == [(1,)], "the answer has come")
+    assert "nothing was identified with it yet" in shop.opened(1, "--count", 1)["error"]["text"]
+
+    machine = Machine(shop.files["mill-1"])  # the daemon, started anew
+    digest = shop.config("mill-1").digest
+    noticed = Notice("MaintenanceDue", "minor", "Friction rises; look at the lubrication.", "X", 1000)
+    lies = Notice("OfferWaits", "minor", "the works offers a change: friction version 4")
+    assert machine.store.keep([replace(published(), config_digest=digest), noticed, lies]) == []
+    machine.close()
+    shop.uplink("mill-1")
+    until(
+        lambda: shop.told(f"SELECT count(*) FROM fleet.parameter_sets WHERE config_digest = '{digest}'") != [(0,)],
+        "a set of the new configuration has come",
+    )
+    (stands,) = shop.stage(1)["offered"]
+    assert (stands["machine"], stands["in_use"], stands["notices"]) == ("mill-1", True, 1)
+    assert "1 notices since" in shop.opened(1, "--count", 1)["error"]["text"]
+    opened = shop.opened(0, "--count", 1, "--despite", "a drift that was known before")
+    assert opened["opened"] == {"stage": 2, "machines": ["mill-2"]}
+
+    shop.uplink("mill-2")
+    assert shop.lying("mill-2") == ["friction-3.offer"]
+    shop.fdhil(0, "offers", "reject", shop.files["mill-2"], "friction", "--by", "Cleo", "--reason", "another oil")
+    shop.uplink("mill-2")
+    until(lambda: shop.told("SELECT count(*) FROM fleet.offer_answers") == [(2,)], "the answer has come")
+    assert "mill-2: rejected by Cleo: another oil" in shop.opened(1)["error"]["text"]
+    assert shop.lying("mill-3") == []
+    assert shop.stage(0, "--withdraw")["withdrawn"] == ["mill-2"]
+    shop.uplink("mill-2")
+    assert (shop.lying("mill-1"), shop.lying("mill-2")) == (["friction-3.offer"], [])
+    assert {name: shop.files[name].read_bytes() for name in MACHINES[1:]} == {n: before[n] for n in MACHINES[1:]}
+    kept = shop.told("SELECT stage, machines, opened_by, despite FROM fleet.offers ORDER BY stage")
+    assert kept == [(1, ["mill-1"], "Anna", ""), (2, ["mill-2"], "Anna", "a drift that was known before")]
+
+
+def test_a_version_is_one_change_and_only_rises(shop: Shop) -> None:
+    shop.opened(0, "--machine", "mill-1")
+    assert "mill-1: not known" in shop.opened(1, "--machine", "mill-1", "--despite", "x")["error"]["text"]
+    shop.change.write_text(CHANGE.replace("0.061", "0.07"))
+    assert "with other values" in shop.stage(1)["error"]["text"]
+    shop.change.write_text(CHANGE.replace("version = 3", "version = 2"))
+    assert "give the file version 4" in shop.stage(1)["error"]["text"]
+    shop.change.write_text(CHANGE.replace("version = 3", "version = 4").replace("V-800", "V-900"))
+    assert shop.stage(0)["left"] == []
+    assert "no machine left" in shop.opened(1)["error"]["text"]
+
+
+def test_where_the_server_is_away_no_stage_is_opened(shop: Shop, tmp_path: Path) -> None:
+    shop.fleet = of_the_works(tmp_path, NatsServer(tmp_path), shop.database)  # which is not started
+    assert "was not opened" in shop.opened(3)["error"]["text"]
+    assert shop.told("SELECT count(*) FROM fleet.offers") == [(0,)]
+
+
+# what a machine's own user may, and the folder of the offers -------------------------------------------------------
+
+
+def guarded(folder: Path) -> str:
+    """Return the part of the server's configuration as the document has it."""
+    certify(folder)
+    tls = f'tls {{ cert_file: "{folder}/broker.pem", key_file: "{folder}/broker.key" }}\n'
+    rights = (
+        'permissions: {{ publish: ["fdhil.v1.{0}.>", "$JS.API.DIRECT.GET.fdhil-offers.fdhil.offers.v1.{0}"], '
+        'subscribe: ["_INBOX_fdhil-{0}.>"] }}'
+    )
+    users = [f"{{ user: {name}, password: {SECRET}, {rights.format(name)} }}" for name in ("mill-1", "mill-2")]
+    return tls + f"authorization {{ users = [ {{ user: works, password: {SECRET} }}, {', '.join(users)} ] }}\n"
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[NatsServer]:
+    (tmp_path / "password").write_text(SECRET)
+    with servers.nats(tmp_path, guarded(tmp_path)) as running:
+        yield running
+
+
+async def look(config: MachineConfig, letterbox: Letterbox | None = None) -> list[str]:
+    """Have a machine's letterbox look, and return which offers lie there then."""
+    assert config.uplink is not None
+    async with connected(config.uplink, f"fdhil-{config.works_name}", "uplink") as client:
+        await (letterbox or Letterbox(config)).look(client.jetstream(), "5" * 32)
+    return sorted(path.name for path in lying(config.offers_directory))
+
+
+async def test_a_machine_fetches_its_own_offers_and_no_others(server: NatsServer, tmp_path: Path) -> None:
+    works = Works(tmp_path)
+    keys = {"server": server.url, "password_file": str(tmp_path / "password"), "tls_ca_file": str(tmp_path / "ca.pem")}
+    files = {name: machine_of(works, tmp_path / name, machine=name, user=name, **keys) for name in MACHINES[:2]}
+    first, second = (machine_config.load(file) for file in files.values())
+    async with connected(entering(server, tmp_path, "works"), "fdhil-offers", "server") as client:
+        stream = client.jetstream()
+        await prepare_stream(stream, Stream(max_bytes=1 << 26))
+        await delivery.prepare(stream, 1)
+        await delivery.prepare(stream, 1)
+
+        async def publish(machine: str, **changes: Any) -> None:
+            document = works.document(**changes)
+            await delivery.publish(stream, machine, document, Offer(**(TOLD | changes)))
+
+        assert await look(first) == []
+        await publish("mill-1")
+        await publish("mill-1", name="other")
+        assert await look(first) == ["friction-3.offer", "other-3.offer"]
+        assert await look(second) == []
+        await publish("mill-1", version=4)  # takes the place of the older one
+        assert await look(first) == ["friction-4.offer", "other-3.offer"]
+        forged = works.document(name="forged").replace(b"0.061", b"0.099")
+        await stream.publish(delivery.subject_of("mill-1"), forged + works.document(name="right"))
+        assert await look(first) == ["right-3.offer"]
+
+        assert first.uplink is not None
+        async with connected(first.uplink, "fdhil-mill-1", "uplink") as machine:
+            own = machine.jetstream(timeout=2.0)
+            assert (await delivery._open_for(own, "mill-1"))[1]
+            with pytest.raises(nats.errors.Error):  # those of another
+                await delivery._open_for(own, "mill-2")
+            with pytest.raises(nats.errors.Error):  # nor does it write any
+                await own.publish(delivery.subject_of("mill-1"), b"", timeout=2.0)
+        await stream.purge_stream(delivery.STREAM)
+        assert await look(first) == []
+
+
+async def test_without_the_right_or_the_stream_what_lies_there_stays(
+    server: NatsServer, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    works = Works(tmp_path)
+    keys = {"server": server.url, "password_file": str(tmp_path / "password"), "tls_ca_file": str(tmp_path / "ca.pem")}
+    file = machine_of(works, tmp_path / "mill-1", machine="mill-1", user="mill-1", **keys)
+    config = machine_config.load(file)
+    config.offers_directory.mkdir(parents=True)
+    (config.offers_directory / "friction-3.offer").write_bytes(works.document())
+    letterbox = Letterbox(config)
+    assert await look(config, letterbox) == ["friction-3.offer"]
+    letterbox._next_s = 0.0
+    assert await look(config, letterbox) == ["friction-3.offer"]
+    assert capfd.readouterr().err.count("no offers can be fetched") == 1

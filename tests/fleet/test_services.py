@@ -1,0 +1,115 @@
+"""What a service changed is told with its interval; age and limits count from it; what is due is listed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil.fleet.services import step_of
+from fdhil.fleet.sets import asking, newest_sets
+from fdhil.records import Float
+from tests.daemon.shop import fdhil
+from tests.fleet.machine import Machine, written
+from tests.fleet.servers import Postgres
+from tests.fleet.works import at_days, fleet_of, keep
+
+BEGIN = datetime(2026, 3, 1, tzinfo=UTC)
+DAYS = 40
+SERVICED = 20
+
+
+def test_the_interval_of_a_change_holds_it_in_95_of_100() -> None:
+    """Beside wear that goes on, and a temperature that moves."""
+    rng = np.random.default_rng(1)
+    days: Float = np.arange(20.0) - 11.5
+    held = 0
+    for _ in range(400):
+        at_c = rng.uniform(15, 35, 20)
+        values = 1.0 - 0.3 * (days > 0) + 0.02 * days - 0.01 * at_c + 0.05 * rng.normal(size=20)
+        step = step_of(values, np.full(20, 0.01), days, at_c)
+        held += bool(abs(step.size + 0.3) < 2.12 * step.std)  # Student's t of 16
+        assert (step.freedom, step.at_constant_temperature) == (16, True)
+    assert 366 <= held <= 392  # 380 expected, +- 3 standard deviations
+
+
+def test_a_temperature_that_is_not_known_is_not_told_apart() -> None:
+    days, unknown = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0]), np.full(6, np.nan)
+    values = np.array([1.0, 1.1, 0.9, 2.0, 2.1, 1.9])
+    step = step_of(values, np.full(6, 0.01), days, unknown)
+    assert (step.before, step.size) == pytest.approx((1.0, 1.0))
+    assert not step.at_constant_temperature
+    assert step_of(values, np.full(6, 0.5), days, unknown).std > step.std  # as their own deviations promise
+
+
+@pytest.fixture
+async def works(database: Postgres, tmp_path: Path) -> Path:
+    """A machine whose X gets 1 % stiffer a day until it is lubricated, and then again."""
+    machine = Machine(written(tmp_path / "mill", "mill-1"))
+    for day in range(DAYS):
+        since = day if day < SERVICED else day - SERVICED
+        machine.record(1, axes=("X",), parameters={"ft": 0.05 * (1 + 0.01 * since + 0.002 * (-1) ** day)})
+    machine.close()
+    await keep(fleet_of(database, tmp_path), at_days(machine, BEGIN))
+    file = tmp_path / "fleet.toml"
+    file.write_text(f'[database]\nconnection = "{database.connection}"\n')
+    return file
+
+
+@pytest.fixture
+def asked(works: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
+    def ask(*words: str) -> tuple[int, str]:
+        code, out, err = fdhil("fleet", words[0], str(works), *words[1:], capsys=capsys)
+        return code, out or err
+
+    return ask
+
+
+@pytest.mark.debian
+async def test_a_service_is_entered_and_what_it_changed_is_told(
+    asked: Callable[..., tuple[int, str]], database: Postgres, tmp_path: Path
+) -> None:
+    assert "no service was entered" in asked("services")[1]
+    assert due(asked) == []  # as far as is known it rises and falls
+    day = (BEGIN + timedelta(days=SERVICED)).date().isoformat()
+    words = ("--machine", "mill-1", "--axis", "X", "--date", day)
+    code, text = asked("service", *words, "--note", "lubricated")
+    assert (code, "age and its limits count from there" in text) == (0, True)
+    code, out = asked("services", "--json")
+    (told,) = json.loads(out)["services"]
+    change = next(each for each in told["changes"] if each["parameter"] == "ft")
+    assert change["low"] < -0.01 < change["high"] < 0.0  # 20 % of 0.05
+    assert change["before"] == pytest.approx(0.06, rel=0.01)
+    assert change["sure"]
+    assert not next(each for each in told["changes"] if each["parameter"] == "R")["sure"]
+    assert f"{day}T00:00:00+00:00  mill-1 axis X  lubricated" in asked("services")[1]
+
+    with asking(fleet_of(database, tmp_path)) as db:
+        rows = newest_sets(db, 100)["mill-1", "X"]
+    assert [row["at"] for row in rows] == [BEGIN + timedelta(days=k) for k in range(SERVICED, DAYS)]
+    (since,) = due(asked)
+    reached = datetime.fromisoformat(since["date"]) - BEGIN
+    assert reached / timedelta(days=1) == pytest.approx(SERVICED + 100, abs=4)  # 1 % a day
+    assert since["earliest"] < since["date"] < since["latest"]
+    assert "mill-1 axis X: ft = " in asked("status")[1]
+
+    code, text = asked("service", *words, "--remove")
+    assert (code, "is taken out" in text) == (0, True)
+    assert asked("service", *words, "--remove")[0] == 3
+
+
+def due(asked: Callable[..., tuple[int, str]]) -> list[dict[str, Any]]:
+    found = json.loads(asked("status", "--json")[1])["due"]
+    return [each for each in found if each["parameter"] == "ft"]
+
+
+@pytest.mark.debian
+def test_what_is_not_known_cannot_be_serviced(asked: Callable[..., tuple[int, str]]) -> None:
+    code, text = asked("service", "--machine", "mill-1", "--axis", "Q")
+    assert (code, "axis Q of mill-1 were collected" in text) == (3, True)
+    assert "see fdhil fleet status" in text

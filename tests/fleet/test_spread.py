@@ -1,0 +1,96 @@
+"""How work is cut in tasks, and what becomes of a task whose worker dies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future
+from typing import Any
+
+import pytest
+
+from fdhil.fleet.spread import Crew, Here
+
+
+class Died(Exception):
+    """As of a worker that is gone."""
+
+
+class Elsewhere(Executor):
+    """Ends tasks with their errors, as another process does."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        done: Future[Any] = Future()
+        try:
+            done.set_result(fn(*args))
+        except Died as error:
+            done.set_exception(error)
+        return done
+
+
+class OneWorker(Elsewhere):
+    """Where a task kills the worker, the task before it is lost, too, though its result is not yet fetched."""
+
+    def __init__(self) -> None:
+        self._before: Future[Any] = Future()
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        done = super().submit(fn, *args)
+        if done.exception() is not None and self._before.done():
+            self._before._exception = done.exception()
+        self._before = done
+        return done
+
+
+def doubled(numbers: Sequence[int]) -> list[int]:
+    """Double each, and die over 5 and 6."""
+    if {5, 6} & set(numbers):
+        raise Died
+    return [2 * number for number in numbers]
+
+
+def test_each_item_is_done_once_in_tasks_of_so_many() -> None:
+    crew: Crew[int, int] = Crew(Here(), 4, 1)
+    tasks = list(crew.spread(lambda numbers: [2 * number for number in numbers], iter(range(10))))
+    assert [list(task) for task, _ in tasks] == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
+    assert [result for _, results in tasks for result in results] == [2 * k for k in range(10)]
+    assert list(crew.spread(doubled, [])) == []
+
+
+def test_only_what_kills_its_worker_is_lost() -> None:
+    crew: Crew[int, int] = Crew(Elsewhere(), 8, 3, (Died,), lambda number: -number)
+    results = {
+        item: result for task, told in crew.spread(doubled, range(20)) for item, result in zip(task, told, strict=True)
+    }
+    assert results == {k: -k if k in (5, 6) else 2 * k for k in range(20)}
+
+
+def test_who_was_beside_it_is_not_lost() -> None:
+    crew: Crew[int, int] = Crew(OneWorker(), 1, 3, (Died,), lambda number: -number)
+    results = {task[0]: told[0] for task, told in crew.spread(doubled, range(20))}
+    assert results == {k: -k if k in (5, 6) else 2 * k for k in range(20)}
+
+
+def test_no_more_is_taken_than_may_be_on_its_way() -> None:
+    taken: list[int] = []
+
+    def items() -> Any:
+        for k in range(100):
+            taken.append(k)
+            yield k
+
+    class Never(Executor):
+        def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+            done: Future[Any] = Future()
+            if len(taken) <= 10:
+                done.set_result([0] * len(args[0]))
+            return done
+
+    crew: Crew[int, int] = Crew(Never(), 5, 3)
+    next(crew.spread(doubled, items()))
+    assert len(taken) == 15
+
+
+def test_another_error_ends_the_work() -> None:
+    crew: Crew[int, int] = Crew(Elsewhere(), 8, 3)
+    with pytest.raises(Died):
+        list(crew.spread(doubled, range(20)))

@@ -1,0 +1,134 @@
+"""Fuzzes one target with atheris: ``python -m tests.fuzz NAME --inputs N``; the figures are printed as JSON.
+
+Only fdhil is instrumented, but for the modules that numba compiles. What hurts is kept, once for each way in which it
+hurts, and the search goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import hashlib
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from tests.fuzz import TARGETS
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+COMPILED = ("njit", "@compiled", "@inlined")
+
+
+def kernels() -> list[str]:
+    """Return the modules with functions that are compiled, which bear no instrument."""
+    files = (ROOT / "fdhil").rglob("*.py")
+    found = [path for path in files if any(word in path.read_text("utf-8") for word in COMPILED)]
+    return [".".join(path.relative_to(ROOT).with_suffix("").parts) for path in found]
+
+
+def main() -> None:
+    """Read the options and fuzz; the process ends with 1 when anything hurt."""
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz")
+    parser.add_argument("name", choices=TARGETS)
+    parser.add_argument("--inputs", type=int, default=10_000)
+    parser.add_argument("--seconds", type=float, default=1e9, help="end sooner after this long")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--corpus", type=Path, help="where what is interesting is kept from run to run")
+    parser.add_argument("--found", type=Path, default=ROOT / "out" / "fuzz" / "found")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        _fuzz(options, options.corpus or Path(folder) / "corpus", Path(folder))
+
+
+def _fuzz(options: argparse.Namespace, corpus: Path, folder: Path) -> None:
+    try:
+        import atheris
+    except ImportError:
+        sys.exit("atheris is not installed; there is one for Linux and Python below 3.14: make setup with that")
+
+    with atheris.instrument_imports(include=["fdhil"], exclude=kernels(), enable_loader_override=False):
+        from tests.fuzz.targets import target_of
+        from tests.fuzz.tasting import judged
+
+        target = target_of(options.name)
+        for seed in target.seeds:  # what is imported late is imported here
+            judged(target, seed)
+    gc.collect()
+    gc.freeze()  # what was imported is not looked through again and again
+    corpus.mkdir(parents=True, exist_ok=True)
+    for seed in target.seeds:
+        (corpus / hashlib.sha256(seed).hexdigest()[:16]).write_bytes(seed)
+    words = folder / "words"
+    words.write_text("".join(f'"{_escaped(word)}"\n' for word in target.words))
+    search = _Search(options, target, judged)
+    kept = options.found / options.name  # an input that ends the process itself
+    kept.mkdir(parents=True, exist_ok=True)
+    flags = [f"-seed={options.seed}", f"-max_len={target.longest}", f"-dict={words}", "-verbosity=0", "-timeout=600"]
+    atheris.Setup([sys.argv[0], *flags, "-rss_limit_mb=4096", f"-artifact_prefix={kept}/", str(corpus)], search.taste)
+    atheris.Fuzz()
+
+
+def _escaped(word: bytes) -> str:
+    return "".join(f"\\x{byte:02x}" for byte in word)
+
+
+class _Search:
+    """Counts inputs, keeps what hurt, and ends the process when enough were tasted."""
+
+    def __init__(self, options: argparse.Namespace, target: Any, judged: Any) -> None:
+        self._options, self._target, self._judged = options, target, judged
+        self._count, self._slowest_s = 0, 0.0
+        self._found: dict[tuple[str, str], int] = {}
+        self._begin_s, self._begin_cpu_s = time.monotonic(), time.process_time()
+
+    def taste(self, data: bytes) -> None:
+        """Taste one input of the fuzzer's."""
+        begin_s = time.process_time()
+        finding = self._judged(self._target, data)
+        self._slowest_s = max(self._slowest_s, time.process_time() - begin_s)
+        self._count += 1
+        if finding is not None:
+            self._keep(finding, data)
+        if self._count >= self._options.inputs or time.monotonic() - self._begin_s > self._options.seconds:
+            self._end()
+
+    def _keep(self, finding: Any, data: bytes) -> None:
+        place = (finding.kind, finding.place)
+        self._found[place] = self._found.get(place, 0) + 1
+        if self._found[place] == 1:
+            folder = self._options.found / self._target.name
+            folder.mkdir(parents=True, exist_ok=True)
+            name = f"{finding.kind}-{hashlib.sha256(data).hexdigest()[:8]}"
+            (folder / name).write_bytes(data)
+            print(
+                f"{self._target.name}: {finding.kind} at {finding.place}, kept as {name}\n{finding.text}",
+                file=sys.stderr,
+            )
+
+    def _end(self) -> None:
+        import resource
+
+        figures = {
+            "target": self._target.name,
+            "inputs": self._count,
+            "cpu_s": time.process_time() - self._begin_cpu_s,
+            "slowest_s": self._slowest_s,
+            "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            "found": _told(self._found),
+        }
+        print(json.dumps(figures), flush=True)
+        sys.stderr.flush()
+        os._exit(bool(self._found))  # the fuzzer's own end would tell again what is told
+
+
+def _told(found: dict[tuple[str, str], int]) -> Sequence[dict[str, Any]]:
+    return [{"kind": kind, "place": place, "inputs": count} for (kind, place), count in found.items()]
+
+
+if __name__ == "__main__":
+    main()

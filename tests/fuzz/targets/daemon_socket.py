@@ -1,0 +1,95 @@
+"""Lines on the daemon's socket, whoever sends them: each has one JSON answer, and arms nothing without the token."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+from fdhil.arming.answers import Answer
+from fdhil.config import Access
+from fdhil.daemon import journal
+from fdhil.daemon.control import ControlServer
+from fdhil.daemon.peers import Peer
+from fdhil.daemon.service import Service
+from fdhil.guard.peers import Role
+from tests.daemon.machine import Machine, config_of
+from tests.fuzz.tasting import Target
+
+_FOLDER = tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None)
+_LOOP = asyncio.new_event_loop()
+PEERS = (Peer("o", 0, 1, Role.COMMISSION), Peer("w", 1, 2, Role.WATCH), Peer("n", 2, 3, Role.NOBODY))
+SAID: list[dict[str, Any]] = [
+    {"request": "status"},
+    {"request": "live"},
+    {"request": "arm", "program": "/nowhere/part.ngc", "method": "inverse", "token": "t", "whole": True},
+    {"request": "disarm"},
+    {"request": "acknowledge", "notices": [1], "up_to": 3, "note": "seen", "by": "me"},
+    {"request": "stop", "progress": True},
+]
+
+
+async def _server() -> ControlServer:
+    config = config_of(Path(_FOLDER.name))
+    config.store.directory.mkdir(parents=True)
+    service = Service(config, Machine().open)
+
+    async def handle(request: Mapping[str, Any], peer: Peer) -> Answer:
+        answer = await service._audit.of(request, peer)
+        await service._audit.written()
+        return answer
+
+    return ControlServer(handle, lambda: None, lambda: None, Access())
+
+
+_SERVER = _LOOP.run_until_complete(_server())
+
+
+class _Client:
+    """Stands for the writer of a connection."""
+
+    def write(self, data: bytes) -> None:
+        json.loads(data)
+
+    def is_closing(self) -> bool:
+        return False
+
+
+async def _answered(data: bytes) -> None:
+    reader = asyncio.StreamReader(loop=_LOOP)
+    peer, client = PEERS[data[0] % len(PEERS)], _Client()
+    answer = await _SERVER._attended(data[1:], peer, reader, client)  # type: ignore[arg-type] # stands for it
+    line = json.dumps(answer)
+    assert type(answer["ok"]) is bool
+    assert answer.get("armed") is None
+    assert len(line) < 1 << 16
+
+
+def taste(data: bytes) -> None:
+    """Let the user that the first byte says send the rest as a line."""
+    if data:
+        with patch.object(journal, "write_line"):
+            _LOOP.run_until_complete(_answered(data))
+
+
+def target() -> Target:
+    """Return the target."""
+    seeds = [bytes([k % 3]) + json.dumps(said).encode() for k, said in enumerate(SAID)]
+    seeds += [b"\0" + json.dumps(said).encode() for said in SAID]
+    words = [
+        b'"request"',
+        b'"arm"',
+        b'"acknowledge"',
+        b'"disarm"',
+        b"NaN",
+        b"1e999",
+        b"null",
+        b"\\ud800",
+        b"[[[[",
+        b"9" * 30,
+    ]
+    return Target("daemon_socket", seeds, taste, words, 600)

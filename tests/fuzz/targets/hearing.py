@@ -1,0 +1,80 @@
+"""Frames of a bus into the daemon: a hub's text into the ring, any frames through grid, decoders and watches."""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections import Counter
+
+from fdhil.daemon.hearing import Hearing
+from fdhil.drivers.can.frames import EXTENDED_FLAG, FrameRing, frames_of
+from fdhil.drivers.can.socketcand import HubClock, SocketcandPort
+from fdhil.drivers.cia402.bus_decoder import BusDecoder
+from fdhil.drivers.moves import load_event_source
+from fdhil.records import AxisSamples, TickTimes
+from tests.drivers.wire import Row, Wire, machine
+from tests.fuzz.tasting import Target
+
+CONFIG = machine(axes="X")
+FLAGS = (0, 0, 0, 0, 0, 0x20000000, 0x40000000, EXTENDED_FLAG)
+_ROW = struct.Struct("<hHBB8s")  # how much later than the one before (10 us), identifier, length, flags, data
+
+
+def taste(data: bytes) -> None:
+    """Decode what comes; an even first byte means a hub's text."""
+    decoder, hearing = BusDecoder("can0", CONFIG), Hearing(CONFIG, 0.0)
+    sources = [load_event_source(CONFIG.g0.source)(axis, CONFIG) for axis in decoder.axes]
+    hearing.source_opened(0.0)
+    ring = FrameRing(1 << 10)
+    if data and data[0] % 2 == 0:
+        _text(data[1:], ring)
+    else:
+        for row in _rows(data[1:])[: 1 << 10]:
+            ring.append(*row)
+    frames = ring.drain()
+    now_ns = 2_000_000_000
+    half = frames.size // 2 if len(data) % 2 else 0
+    for block in (frames[:half], frames[half:]) if half else (frames,):
+        now_ns += 400_000_000
+        for record in decoder.feed(block, now_ns):
+            if isinstance(record, AxisSamples | TickTimes):
+                for source in sources:
+                    source.feed(record)
+            hearing.record_came(record, now_ns * 1e-9)  # type: ignore[arg-type] # inputs and tables pass it by
+        hearing.counted(Counter({"frames": int(frames.size), "can0.frames": int(frames.size)}), now_ns * 1e-9)
+        hearing.status(now_ns * 1e-9)
+        hearing.troubles({}, now_ns * 1e-9)
+    decoder.counters()
+
+
+def _text(data: bytes, ring: FrameRing) -> None:
+    port = object.__new__(SocketcandPort)  # it would connect
+    port._rest, port._clock, port.malformed = b"", HubClock(), 0
+    for piece in (data[: len(data) // 2], data[len(data) // 2 :]):
+        port._split(piece, ring, time.monotonic_ns())
+
+
+def _rows(data: bytes) -> list[Row]:
+    at_ns, found = 1_000_000_000, []
+    for later, can_id, length, flags, payload in _ROW.iter_unpack(data[: len(data) // _ROW.size * _ROW.size]):
+        at_ns += 10_000 * later
+        found.append((at_ns, can_id & 0x7FF | FLAGS[flags % 8], payload[: length % 9]))
+    return found
+
+
+def target() -> Target:
+    """Return the target."""
+    seeds = []
+    for counter in (True, False):
+        rows, at_ns, packed = Wire(6, counter=counter).rows(), 1_000_000_000, b""
+        for t_ns, can_id, payload in rows:
+            packed += _ROW.pack((t_ns - at_ns) // 10_000, can_id, len(payload), 0, payload)
+            at_ns = t_ns
+        seeds.append(b"\1" + packed)
+        text = "".join(f"< frame {i:03X} {t * 1e-9:.6f} {d.hex(' ')} >" for t, i, d in rows[:20])
+        seeds.append(b"\0" + text.encode())
+    emergency = _ROW.pack(1, 0x81, 8, 0, bytes(8)) + _ROW.pack(1, 0x701, 1, 0, b"\0") + _ROW.pack(1, 4, 8, 5, b"\0\x30")
+    assert frames_of([(0, 0x80, b"")]).size == 1
+    return Target(
+        "hearing", [*seeds, b"\1" + emergency], taste, [b"< frame ", b" >", b"nan", b"inf", b"< error "], 3000
+    )

@@ -1,0 +1,83 @@
+"""What comes over a serial line with Modbus RTU units: an answer or a declared error, never another unit's value."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Coroutine, Sequence
+
+from fdhil.config.sensors import ModbusPlace
+from fdhil.drivers.modbus.line import Answer, Request
+from fdhil.drivers.modbus.rtu import READ_COILS, READ_HOLDING, READ_INPUT, WRITE_REGISTER, crc16, framed
+from fdhil.drivers.modbus.rtu_line import RtuLine
+from fdhil.drivers.serial.port import Chunk
+from fdhil.errors import DeviceError
+from tests.fuzz.tasting import Target
+
+FUNCTIONS = (READ_INPUT, READ_HOLDING, READ_COILS, WRITE_REGISTER)
+PLACE = ModbusPlace(device="/dev/none")
+
+
+class _Port:
+    """Stands for the port: gives these pieces, then is silent."""
+
+    is_open, last_ns, character_s = True, 0, 1e-4
+
+    def __init__(self, pieces: Sequence[bytes]) -> None:
+        self._pieces = list(pieces)
+
+    def discard(self) -> bool:
+        return False
+
+    def wire_ns(self, _count: int) -> int:
+        return 0
+
+    def send(self, _name: str, _data: bytes) -> int:
+        return time.monotonic_ns()
+
+    async def receive(self, _name: str, _until_ns: int) -> Chunk | None:
+        return Chunk(self._pieces.pop(0), time.monotonic_ns()) if self._pieces else None
+
+
+def _at_once(asking: Coroutine[None, None, Answer]) -> Answer:
+    """Run what never has to wait, without a loop."""
+    try:
+        asking.send(None)
+    except StopIteration as end:
+        assert isinstance(end.value, Answer)
+        return end.value
+    raise AssertionError("it waits, though all has come")
+
+
+def taste(data: bytes) -> None:
+    """Ask for what the first two bytes say, hear the rest in pieces of a length that the third says."""
+    kind, count, size = (*data[:3], 0, 0, 0)[:3]
+    request = Request("sensor", 1 + kind % 3, FUNCTIONS[kind % 4], 100, 1 + count % 9, 0.0)
+    came, size = data[3:], 1 + size
+    line = RtuLine(PLACE)
+    line._port, line.silence_s = _Port([came[k : k + size] for k in range(0, len(came), size)]), 0.0  # type: ignore[assignment] # stands for it
+    try:
+        answer = _at_once(line.ask(request))
+    except DeviceError as error:
+        assert len(str(error)) < 500
+        return
+    assert len(answer.registers) == request.count
+    assert any(_is_frame_of(came[k:], request.unit) for k in range(len(came)))
+
+
+def _is_frame_of(data: bytes, unit: int) -> bool:
+    return data[0] == unit and any(not crc16(data[:size]) for size in range(5, min(len(data), 64) + 1))
+
+
+def target() -> Target:
+    """Return the target."""
+    read = framed(1, b"\x04\x02\x01\x00")
+    seeds = [
+        b"\0\0\xff" + read,
+        b"\0\0\2" + b"\xff\xff" + read,
+        b"\1\1\xff" + framed(2, b"\x03\x04" + bytes(4)),
+        b"\2\7\xff" + framed(3, b"\x01\x01\x55"),
+        b"\3\0\xff" + framed(1, b"\x06\x00\x64\x00\x01"),
+        b"\0\0\xff" + framed(1, b"\x84\x02"),
+        b"\0\0\xff" + framed(2, b"\x04\x02\x01\x00") + read,
+    ]
+    return Target("modbus_rtu", seeds, taste, [read, read[-2:], b"\x84\x02", b"\x01\x04"], 300)

@@ -1,0 +1,168 @@
+"""What an NC's interfaces and a shop floor's hosts say: LinuxCNC's bridge, MTConnect over HTTP, SHDR, Sparkplug."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+
+import numpy as np
+
+from fdhil.daemon.nc_watch import NcWatch
+from fdhil.drivers.moves.told import ToldG0
+from fdhil.drivers.nc.http_stream import Parts, Response
+from fdhil.drivers.nc.linuxcnc import SCHEMA, LinuxCnc
+from fdhil.drivers.nc.mtconnect import MtConnect
+from fdhil.drivers.nc.mtconnect_xml import read_streams
+from fdhil.errors import DeviceError
+from fdhil.records import AxisSamples, TickTimes, frozen, frozen_ints
+from fdhil.shopfloor.mtconnect import Adapter
+from fdhil.shopfloor.published import published
+from fdhil.shopfloor.sparkplug import host_state, wants_rebirth
+from tests.drivers.wire import machine
+from tests.fuzz.tasting import Target
+
+CONFIG = machine(axes="X", g0={"source": "linuxcnc"})
+AGENT = machine(axes="X", g0={"source": "mtconnect"})
+_LOOP = asyncio.new_event_loop()
+
+
+def _block(first: int) -> tuple[TickTimes, AxisSamples]:
+    """Forty SYNCs, in which the axis goes on and stands again."""
+    tick = first + np.arange(40)
+    way_mm, zeros = np.clip(0.1 * (tick - 20.0), 0.0, 4.0), np.zeros(40)
+    samples = AxisSamples(
+        "X",
+        frozen_ints(tick),
+        demand_mm=frozen(way_mm),
+        position_mm=frozen(way_mm),
+        speed_rad_s=frozen(zeros),
+        current_a=frozen(zeros),
+        voltage_v=frozen(zeros),
+        offset_mm=frozen(zeros),
+        statusword=frozen_ints(zeros),
+    )
+    return TickTimes(frozen_ints(tick), frozen_ints(tick * 1_000_000)), samples
+
+
+HEARD, LATER = (*_block(0), *_block(40)), (*_block(80), *_block(2000))
+
+
+def _reader(data: bytes) -> asyncio.StreamReader:
+    reader = asyncio.StreamReader(loop=_LOOP)
+    reader.feed_data(data)
+    reader.feed_eof()
+    return reader
+
+
+async def _linuxcnc(data: bytes) -> None:
+    bridge, moves, watch = LinuxCnc(CONFIG), ToldG0("X", CONFIG), NcWatch()
+    for record in HEARD:
+        moves.feed(record)
+    bridge._reader = _reader(data)
+    bridge._greet(await bridge._next())
+    try:
+        while True:
+            for state in await bridge.read():
+                moves.feed(state)
+                watch.note(state, 1.0)
+                json.dumps(watch.status(1.0), allow_nan=False)
+                published(("X",), ("can0",), {"nc": watch.status(1.0)}, 1)
+    finally:
+        for record in LATER:
+            moves.feed(record)
+
+
+async def _http(data: bytes) -> None:
+    response = Response("agent", _reader(data))
+    await response.head()
+    if response.headers.get("content-type", "").startswith("multipart"):
+        parts = Parts("agent", response.headers["content-type"])
+        while came := await response.some():
+            for part in parts.feed(came):
+                read_streams(part, "agent")
+    else:
+        await _xml(await response.document())
+
+
+async def _xml(data: bytes) -> None:
+    streams, agent = read_streams(data, "agent"), MtConnect(AGENT)
+    agent._choose(streams)
+    for state in agent._states(streams):
+        json.dumps(published(("X",), ("can0",), {"nc": {"line": state.line, "heard_s_ago": 0.0}}, 1)[-1].value)
+
+
+class _Agent:
+    """Stands for the connection of an agent."""
+
+    class transport:  # noqa: N801 - as asyncio names it
+        @staticmethod
+        def get_write_buffer_size() -> int:
+            return 0
+
+    def write(self, data: bytes) -> None:
+        assert data.endswith(b"\n")
+
+    def close(self) -> None:
+        pass
+
+
+async def _shdr(data: bytes) -> None:
+    await Adapter().attend(_reader(data), _Agent())  # type: ignore[arg-type] # stands for it
+
+
+async def _sparkplug(data: bytes) -> None:
+    assert type(wants_rebirth(data)) is bool
+    host_state(data)
+
+
+WAYS: tuple[Callable[[bytes], Awaitable[None]], ...] = (_linuxcnc, _http, _xml, _shdr, _sparkplug)
+
+
+def taste(data: bytes) -> None:
+    """Let the rest of the bytes come the way that the first says."""
+    if data:
+        with suppress(DeviceError):
+            _LOOP.run_until_complete(WAYS[data[0] % len(WAYS)](data[1:]))
+
+
+HELLO = json.dumps({"schema": SCHEMA, "servo_period_s": 0.001})
+STATE = json.dumps(
+    {
+        "stamp_ns": 30_000_000,
+        "error_ns": 1000,
+        "motion": "rapid",
+        "line": 3,
+        "feed_mm_min": 1.0,
+        "mm": {"X": 1.5},
+        "cycle": 7,
+    }
+)
+STREAMS = (
+    '<?xml version="1.0"?><MTConnectStreams xmlns="urn:mtconnect.org:MTConnectStreams:2.0"><Header instanceId="1" '
+    'nextSequence="9" bufferSize="100"/><Streams><DeviceStream name="m" uuid="u"><ComponentStream component="Path" '
+    'name="p" componentId="c"><Events><Line dataItemId="l" sequence="3" timestamp="2026-01-01T00:00:00Z">12</Line>'
+    '<Execution dataItemId="e" sequence="4" timestamp="2026-01-01T00:00:00Z">ACTIVE</Execution>'
+    '<Block dataItemId="b" sequence="5" timestamp="2026-01-01T00:00:00.5Z">G0 X1</Block>'
+    '<ToolNumber dataItemId="t" sequence="6" timestamp="2026-01-01T00:00:01Z">7</ToolNumber>'
+    "</Events></ComponentStream></DeviceStream></Streams></MTConnectStreams>"
+)
+HEAD = b"HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=a\r\nTransfer-Encoding: chunked\r\n\r\n"
+
+
+def target() -> Target:
+    """Return the target."""
+    part = b"--a\r\nContent-length: %d\r\n\r\n%s" % (len(STREAMS), STREAMS.encode())
+    seeds = [
+        f"\0{HELLO}\n{STATE}\n{STATE}\n".encode(),
+        b"\1" + HEAD + b"%x\r\n%s\r\n0\r\n\r\n" % (len(part), part),
+        b"\1HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n%s" % (len(STREAMS), STREAMS.encode()),
+        b"\2" + STREAMS.encode(),
+        b"\3* PING\r\n* PING\n",
+        b"\4" + bytes.fromhex("12180a144e6f646520436f6e74726f6c2f5265626972746820017001"),
+        b'\4{"online": true, "timestamp": 1}',
+    ]
+    return Target(
+        "nc_lines", seeds, taste, [b"NaN", b"1e999", b"null", b"* PING", b"<", b'sequence="', b"chunked"], 2000
+    )

@@ -1,0 +1,11 @@
+"""Recordings as HDF5 files."""
+
+from __future__ import annotations
+
+from tests.fuzz.targets import recording
+from tests.fuzz.tasting import Target
+
+
+def target() -> Target:
+    """Return the target."""
+    return recording.target_of("hdf5", 12000, [b"TREE", b"SNOD", b"HEAP", b"OHDR", b"GCOL"])

@@ -1,0 +1,11 @@
+"""Recordings as MAT files."""
+
+from __future__ import annotations
+
+from tests.fuzz.targets import recording
+from tests.fuzz.tasting import Target
+
+
+def target() -> Target:
+    """Return the target."""
+    return recording.target_of("mat", 4000, [b"\\x0e\\x00\\x00\\x00", b"\\x09\\x00\\x00\\x00", b"\\x00\\x01IM"])

@@ -1,0 +1,11 @@
+"""Recordings as ASAM MDF 4 files."""
+
+from __future__ import annotations
+
+from tests.fuzz.targets import recording
+from tests.fuzz.tasting import Target
+
+
+def target() -> Target:
+    """Return the target."""
+    return recording.target_of("mdf4", 12000, [b"##HD", b"##DG", b"##CG", b"##CN", b"##DT", b"##TX", b"##DZ", b"##CC"])

@@ -1,0 +1,11 @@
+"""Recordings as Parquet files."""
+
+from __future__ import annotations
+
+from tests.fuzz.targets import recording
+from tests.fuzz.tasting import Target
+
+
+def target() -> Target:
+    """Return the target."""
+    return recording.target_of("parquet", 6000, [b"PAR1", b"\\x15\\x00", b"\\xff\\xff\\xff\\x0f"])

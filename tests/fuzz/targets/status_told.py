@@ -1,0 +1,60 @@
+"""What the daemon tells of names, texts and numbers that others chose, on its way to a shop floor: lines stay lines."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from fdhil.shopfloor.mqtt import Session
+from fdhil.shopfloor.news import Listener
+from fdhil.shopfloor.shdr import lines, notice, picture
+from tests.daemon.machine import config_of
+from tests.fuzz.tasting import Target
+from tests.shopfloor.made import NOW_MS, status, trouble
+from tests.shopfloor.made import notice as noticed
+
+CONFIG = config_of(Path("/nowhere"), ("X",))
+
+
+def taste(data: bytes) -> None:
+    """Put what the bytes hold, a JSON list or a text at each zero byte, where others choose what stands there."""
+    told = _told(data)
+    text, number = [str(item) for item in told[:4]], [x for x in told if type(x) in (int, float)]
+    said = status(
+        "X",
+        troubles=[trouble("StoreFault", "X", text=text[1])],
+        notices=[noticed("Armed", 5.0, text=text[3])],
+        armed={"program": text[0], "method": text[1]},
+        may_stand={"nothing": False, "text": text[2]},
+    )
+    said["nc"] |= {
+        "program": text[3],
+        "line": number[0] if number else None,
+        "feed_mm_min": number[-1] if number else 1,
+    }
+    listener, session = Listener(CONFIG), Session(CONFIG.publish.mqtt, "node")
+    listener.news({**said, "notices": []}, NOW_MS)
+    news = listener.news(json.loads(json.dumps(said)), NOW_MS)
+    for line in [*lines(None, picture(news)), *map(notice, news.events)]:
+        assert line.count("|") >= 2
+        assert line.isprintable(), line
+        line.encode()
+    session.node.births(*session._metrics(news), NOW_MS)
+
+
+def _told(data: bytes) -> list[Any]:
+    try:
+        found = json.loads(data)
+    except (ValueError, RecursionError):
+        found = data.decode("utf-8", "surrogateescape").split("\0")
+    found = found if isinstance(found, list) else [found]
+    return [*found, *[""] * 4]
+
+
+def target() -> Target:
+    """Return the target."""
+    seeds = [b"part|1.ngc\0a\nb\0c|d\0\x1b[31mred", b'["part.ngc", 17, 1e3, "\\ud800", -1]', "Fräser\u2028\0µ".encode()]
+    return Target(
+        "status_told", seeds, taste, [b"|", b"\n", b"\\n", b"\\u2028", b"1e308", b"9" * 320, b"\xc2\x85"], 600
+    )

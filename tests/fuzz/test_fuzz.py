@@ -1,0 +1,80 @@
+"""A little of ``make fuzz`` in every test run: true examples, what once hurt, and some hundred changed examples."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from studies import fuzz, slips
+from tests.fuzz import TARGETS, tasting
+from tests.fuzz.mutation import mutants
+from tests.fuzz.targets import target_of
+from tests.fuzz.tasting import Target, found_inputs, judged
+
+FEW = {"recording_mdf4": 2, "hearing": 60, "guard_can": 60, "status_told": 60}
+MANY = 100
+SLOW = [{"kind": "slow", "place": "x", "inputs": 1}]
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_true_and_changed_examples_have_a_declared_answer(name: str) -> None:
+    target = target_of(name)
+    for data in [*target.seeds, *mutants(target, FEW.get(name, MANY), seed=1)]:
+        finding = judged(target, data)
+        assert finding is None, (data, finding)
+
+
+@pytest.mark.parametrize(
+    "path", [path for name in TARGETS for path in found_inputs(name)], ids=lambda p: f"{p.parent.name}-{p.name}"
+)
+def test_what_once_hurt_does_so_no_more(path: Path) -> None:
+    finding = judged(target_of(path.parent.name), path.read_bytes())
+    assert finding is None, finding
+
+
+def test_what_is_not_declared_is_a_finding() -> None:
+    """Also what takes for ever, and what takes too much memory."""
+
+    def taste(data: bytes) -> None:
+        if data == b"for ever":
+            while True:
+                pass
+        if data == b"slow":
+            sum(range(10_000_000))
+        if data == b"large":
+            bytearray(64 << 20)
+        raise KeyError(data)
+
+    def kind(data: bytes) -> str:
+        finding = judged(Target("made up", [], taste), data)
+        assert finding is not None
+        return finding.kind
+
+    with pytest.MonkeyPatch.context() as changed:
+        changed.setattr(tasting, "GIVEN_UP_S", 0.2)
+        assert [kind(data) for data in (b"x", b"for ever")] == ["KeyError", "slow"]
+
+
+def test_a_slip_of_one_character_changes_nothing_but_what_was_mistyped() -> None:
+    text = slips.SAMPLE.read_text("utf-8")
+    counts, wrong = slips.judged(slips.sample(text, 500, seed=2), text)
+    assert wrong == []
+    assert min(counts[outcome] for outcome in ("same", "refused", "value")) > 0
+
+
+def test_runs_add_up_and_the_goals_say_what_was_found() -> None:
+    one = {"inputs": 600_000, "cpu_s": 1.0, "slowest_s": 0.5, "peak_mib": 9.0, "found": SLOW}
+    two = {**one, "slowest_s": 0.1, "found": []}
+    parts = {name: fuzz.added(fuzz.added(None, one), two) for name in TARGETS}
+    assert parts["web"] == {"inputs": 1_200_000, "cpu_s": 2.0, "slowest_s": 0.5, "peak_mib": 9.0, "found": []}
+    letters = {"count": 3, "all": True, "outcomes": {"same": 2, "refused": 1}, "wrong": [], "met": True}
+    figures: dict[str, Any] = {"targets": parts, "mended": {"web": ["a-b"]}, "slips": letters}
+    assert {goal: said["met"] for goal, said in fuzz.goals(figures).items()} == {"R12": True, "R17": True}
+    run = {"command": "c", "commit": "d", "date": "e", "versions": "v", "seeds": "1"}
+    assert "None of them" in fuzz.page(run, figures)
+    figures["targets"] = parts | {"web": fuzz.added(two, one)}
+    figures["slips"] = letters | {"met": False, "wrong": ["elsewhere: 'x'"], "outcomes": {"elsewhere": 3}}
+    assert {goal: said["met"] for goal, said in fuzz.goals(figures).items()} == {"R12": False, "R17": False}
+    assert "slow at x" in fuzz.page(run, figures)

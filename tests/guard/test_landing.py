@@ -1,0 +1,113 @@
+"""The last way to zero, when the loop itself has failed: each of its frames, and that it ends."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import pytest
+
+from fdhil.guard.can_socket import Frame
+from fdhil.guard.feedforward import armed
+from fdhil.guard.landing import land
+from fdhil.guard.limits import follow
+from fdhil.guard.protocol import Mode
+from fdhil.guard.settings import Settings
+from fdhil.guard.state import State, initial
+from tests.guard import machine
+from tests.guard.fed import LAW, fed_settings
+from tests.guard.shop import Wire
+
+SYNC: Frame = (0x080, b"", 0.0)
+LAST_ZEROS = 5
+
+
+class Ticking(Wire):
+    """A bus on which a SYNC waits whenever somebody listens; at those numbered in ``fulls`` nothing leaves."""
+
+    def __init__(self, made: Settings, fulls: Sequence[int] = ()) -> None:
+        super().__init__(made.sent_ids)
+        self.syncs, self._fulls = 0, fulls
+        self.feed([SYNC])
+
+    def receive(self) -> list[Frame]:
+        frames = super().receive()
+        self.syncs += 1
+        self.full = self.syncs in self._fulls
+        self.feed([SYNC])
+        return frames
+
+    def offsets(self, node: int) -> list[int]:
+        return [struct.unpack("<i", data)[0] for cob_id, data in self.sent if cob_id == 0x300 + node]
+
+
+def sending(made: Settings, *offsets: int, rate: int = 0, mode: Mode = Mode.ACTIVE) -> State:
+    state = initial(made)
+    axes = [axis._replace(offset=offset, rate=rate) for axis, offset in zip(state.axes, offsets, strict=True)]
+    return state._replace(mode=mode, axes=tuple(axes))
+
+
+def ramp(offset: int, rate: int, fulls: Sequence[int] = ()) -> Iterator[int]:
+    """What the limits alone make of it; where nothing leaves it stands."""
+    syncs = 0
+    while True:
+        syncs += 1
+        after = follow(machine.LIMITS, offset, rate, 0, 0)
+        if syncs in fulls:
+            rate = 0
+        else:
+            offset, rate = after, after - offset
+            yield after
+
+
+@pytest.mark.parametrize(("rate", "fulls"), [(0, ()), (40, ()), (-40, (3, 4)), (0, (1, 20))])
+def test_each_axis_goes_to_zero_by_its_limits_and_five_zeros_end_it(rate: int, fulls: Sequence[int]) -> None:
+    """From what was sent last and its rate; what does not leave stands for a cycle."""
+    made = machine.settings()
+    wire = Ticking(made, fulls)
+    try:
+        assert land(sending(made, 600, -200, rate=rate), made, wire) == (0, 0)
+    finally:
+        wire.close()
+    for node, offset in ((1, 600), (2, -200)):
+        sent = wire.offsets(node)
+        assert sent == [value for value, _ in zip(ramp(offset, rate, fulls), sent, strict=False)]
+    last = [k for k, pair in enumerate(zip(wire.offsets(1), wire.offsets(2), strict=True)) if any(pair)][-1]
+    assert len(wire.offsets(1)) - 1 - last == LAST_ZEROS
+
+
+def test_it_waits_a_moment_for_each_sync_in_the_time_of_the_wall_too() -> None:
+    made = replace(machine.settings(), clock="monotonic", sync_period_s=0.2)
+    assert 0.5 < made.silence_s < 1
+    wire = Ticking(made)
+    try:
+        assert land(sending(made, 0, 0), made, wire) == (0, 0)
+    finally:
+        wire.close()
+    assert wire.offsets(1) == [0] * LAST_ZEROS
+
+
+def test_where_nothing_was_sent_nothing_is_and_no_sync_is_awaited() -> None:
+    made = fed_settings()
+    wire = Ticking(made)
+    try:
+        assert land(sending(made, 0, 0, mode=Mode.OFF), made, wire) == (0, 0)
+    finally:
+        wire.close()
+    assert (wire.syncs, wire.sent) == (0, [])
+
+
+@pytest.mark.parametrize(("mode", "fed"), [(Mode.ACTIVE, False), (Mode.OFF, True), (Mode.ACTIVE, True)])
+def test_only_what_was_sent_gets_zeros(mode: Mode, fed: bool) -> None:
+    """Offsets of the place, or speed and torque, each by its own frame."""
+    made = fed_settings()
+    state = sending(made, 0, 0, mode=mode)
+    wire = Ticking(made)
+    try:
+        land(state._replace(feed=armed((LAW, LAW))) if fed else state, made, wire)
+    finally:
+        wire.close()
+    wanted = [*([0x301, 0x302] if mode is Mode.ACTIVE else []), *([0x401, 0x402] if fed else [])]
+    assert [cob_id for cob_id, _ in wire.sent] == wanted * LAST_ZEROS
+    assert not any(byte for _, data in wire.sent for byte in data)

@@ -1,0 +1,37 @@
+"""What clients send, as bytes: a request, or nothing that harms."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fdhil.guard.requests import parse_line, parse_request
+from fdhil.guard.state import Request
+from tests.guard.machine import settings
+
+DEEP = b"[" * 100_000
+
+
+@pytest.mark.parametrize(
+    "line", [b"", b"\xff", b"{", b"[]", b"1", b'"status"', b"null", b'{"request": NaN}', b'{"a": Infinity}', DEEP]
+)
+def test_a_line_that_is_no_request_is_none(line: bytes) -> None:
+    assert parse_line(line) is None
+
+
+@pytest.mark.parametrize(
+    ("mark", "kept"), [(1, True), ("a", True), (True, False), (1 << 60, False), ("a" * 999, False)]
+)
+def test_an_id_is_given_back_only_where_it_is_short(mark: object, kept: bool) -> None:
+    document = parse_line(json.dumps({"request": "status", "id": mark}).encode())
+    assert document == {"request": "status", **({"id": mark} if kept else {})}
+
+
+@given(st.binary(max_size=200) | st.from_type(dict).map(lambda found: json.dumps(found, default=str).encode()))
+def test_any_bytes_become_a_request_or_none(line: bytes) -> None:
+    document = parse_line(line)
+    assert document is None or isinstance(parse_request("arm", document, settings()), Request)
+    assert document is None or not parse_request("arm", document, settings()).token_valid

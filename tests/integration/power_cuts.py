@@ -1,0 +1,244 @@
+"""Cuts the power of a machine while it keeps records of every kind, boots it again, and looks what is left.
+
+The machine is a Linux of its own (user mode) with an ext4 on a disk image. A cut is SIGKILL for all of it: what its
+kernel had not written is gone, as with a real machine. ``python -m tests.integration.power_cuts CUTS PICTURES`` prints
+a table.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tests.crash.injected import looked_at
+from tests.crash.keepers import KEEPERS, MUCH_LATER, place_of
+
+ROOT = Path(__file__).parents[2]
+CACHE = Path(os.environ.get("VCAN_VM_CACHE") or Path.home() / ".cache" / "vcan-vm")
+DISK_BYTES = 64 << 20
+MEMORY_MIB = 512
+COPIED_BYTES = 64 << 10
+INIT = """#!{cache}/busybox sh
+B={cache}/busybox
+$B mount -t proc proc /proc
+$B mount -t devtmpfs dev /dev
+$B mount -t tmpfs tmp /mnt
+$B mkdir /mnt/disk
+$B mount -t ext4 /dev/ubda /mnt/disk || {{ echo "told no disk"; $B poweroff -f; }}
+cd {root}
+export PYTHONPATH={root} PYTHONDONTWRITEBYTECODE=1 HOME=/mnt OPENBLAS_NUM_THREADS=1
+{python} -m tests.integration.power_cut_work /mnt/disk/store {how} 2>&1
+echo "told ended"
+$B poweroff -f
+"""
+
+
+Numbers = dict[str, set[int]]
+"""Records, by their kind."""
+
+
+@dataclass
+class Findings:
+    """What was found after the cuts: ``lost`` and ``damage`` name what must not be.
+
+    A machine that is cut is booted again on its disk. The disk of one that is stopped for a moment is that of a machine
+    that is cut there: of such ``pictures`` the journal is played, and the product starts upon what is there.
+    """
+
+    cuts: int = 0
+    pictures: int = 0
+    acknowledged: Counter[str] = field(default_factory=Counter)
+    checked: int = 0
+    lost: list[str] = field(default_factory=list)
+    damage: list[str] = field(default_factory=list)
+
+
+def prepare() -> None:
+    """Fetch what the machine needs; CalledProcessError when that fails."""
+    subprocess.run(["bash", ROOT / "tests/integration/vcan-vm.sh", "-q", "-m", "uml", "-p"], check=True)
+
+
+def make_disk(folder: Path) -> Path:
+    """Make an empty ext4 in a file."""
+    disk = folder / "disk"
+    with disk.open("wb") as file:
+        file.truncate(DISK_BYTES)
+    subprocess.run(["mkfs.ext4", "-q", "-F", disk], check=True)
+    return disk
+
+
+@contextmanager
+def booted(folder: Path, disk: Path, how: str) -> Iterator[subprocess.Popen[str]]:
+    """Boot; yield the machine, whose console is its standard output. Left, its power is cut."""
+    init = folder / "init"
+    init.write_text(INIT.format(cache=CACHE, root=ROOT, python=sys.executable, how=how))
+    init.chmod(0o755)
+    padded = CACHE / "uml" / "xstate.so"
+    environment = {"TMPDIR": str(folder), "PATH": os.environ["PATH"]}
+    if padded.exists():
+        environment["LD_PRELOAD"] = str(padded)
+    arguments = [f"mem={MEMORY_MIB}M", f"ubd0={disk}", "root=/dev/root", "rootfstype=hostfs", "rootflags=/", "ro"]
+    arguments += [f"init={init}", f"uml_dir={folder}", "con=null", "con0=null,fd:1", "ssl=null", "quiet", "panic=-1"]
+    machine = subprocess.Popen(
+        [CACHE / "uml" / "bin" / "linux.uml", *arguments],
+        env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        text=True, errors="replace", start_new_session=True,
+    )  # fmt: skip
+    assert machine.stdout is not None
+    try:
+        yield machine
+    finally:
+        cut(machine)
+        machine.wait()
+        machine.stdout.close()
+
+
+def cut(machine: subprocess.Popen[str]) -> None:
+    """Cut the power: what the machine's kernel had not written is gone."""
+    os.killpg(machine.pid, signal.SIGKILL)
+
+
+def cut_power(cuts: int, folder: Path, how: str = "careful", seed: int = 1, pictures: int = 0) -> Findings:
+    """Cut the power ``cuts`` times, each time after a random number of acknowledged records, and look each time.
+
+    Before each cut so many ``pictures`` are taken and looked at. ``how`` "careless" waits for no disk, to show that
+    such a machine loses what it acknowledged.
+    """
+    found, chance = Findings(), random.Random(seed)
+    disk, kept = make_disk(folder), {name: set[int]() for name in KEEPERS}
+    for number in range(cuts + 1):
+        with booted(folder, disk, how) as machine:
+            assert machine.stdout is not None
+            found.cuts = number
+            if not _looked(machine.stdout, kept, found) or number == cuts:
+                break
+            for _ in range(pictures):
+                _heard(machine.stdout, chance.randint(1, 25), kept, found)
+                _pictured(machine, disk, folder / "picture", kept, found)
+            _heard(machine.stdout, chance.randint(1, 25), kept, found)
+            cut(machine)
+            _heard(machine.stdout, sys.maxsize, kept, found)  # what it had acknowledged by then
+    found.acknowledged = Counter({name: len(numbers) for name, numbers in kept.items()})
+    return found
+
+
+def _looked(console: Iterable[str], kept: Numbers, found: Findings) -> bool:
+    """Compare what a boot finds with what was acknowledged before the cut; whether it told."""
+    for line in console:
+        what, _, rest = line.strip().partition(" ")
+        if what == "found":
+            _compare({name: set(numbers) for name, numbers in json.loads(rest).items()}, kept, found)
+            return True
+        if what in ("told", "Traceback"):
+            found.damage.append(f"cut {found.cuts}: {_said(line, console)}")
+            break
+    return False
+
+
+def _compare(there: Mapping[str, set[int]], kept: Numbers, found: Findings) -> None:
+    """Compare what is there with what was acknowledged."""
+    where = f"cut {found.cuts}, picture {found.pictures}"
+    for name, numbers in kept.items():
+        found.checked += len(numbers)
+        found.lost += [f"{where}: {name} {number}" for number in sorted(numbers - there[name])]
+
+
+def _heard(console: Iterable[str], records: int, kept: Numbers, found: Findings) -> None:
+    """Note what the machine acknowledges, until it is so many ``records``, or to its end."""
+    for line in console:
+        what, _, rest = line.rstrip("\n").partition(" ")
+        if what == "kept" and line.endswith("\n"):
+            name, _, number = rest.rpartition(" ")
+            kept[name].add(int(number))
+            records -= 1
+        elif what in ("told", "Traceback"):
+            found.damage.append(f"after cut {found.cuts}: {_said(line, console)}")
+        if records <= 0:
+            return
+
+
+def _said(line: str, console: Iterable[str]) -> str:
+    """Return what a line of trouble says; of a traceback its last line."""
+    if line.startswith("Traceback"):
+        line = next((end for end in console if end.strip() and not end.startswith((" ", "\t"))), line)
+    return line.strip()[:300]
+
+
+def _pictured(machine: subprocess.Popen[str], disk: Path, folder: Path, kept: Numbers, found: Findings) -> None:
+    """Take a picture of the disk, and look what a machine that was cut there would find."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    picture = folder / "disk"
+    _take(machine, disk, picture)
+    found.pictures += 1
+    check = subprocess.run(["e2fsck", "-fy", picture], capture_output=True, text=True, check=False)
+    if check.returncode > 1:  # more than a journal that was played
+        found.damage.append(f"picture {found.pictures}: {check.stdout[-300:]}")
+    subprocess.run(["debugfs", "-R", f"rdump /store {folder}", picture], check=True, capture_output=True)
+    there = {}
+    for name, make in KEEPERS.items():
+        told = looked_at(make, folder / "store" / place_of(name), MUCH_LATER)
+        there[name] = set(told.found)
+        found.damage += [f"picture {found.pictures}: {name}: {text}" for text in (*told.wrong, *told.said)]
+    _compare(there, kept, found)
+
+
+def _take(machine: subprocess.Popen[str], disk: Path, picture: Path) -> None:
+    """Copy the disk of a machine that is stopped for a moment, with the processes that write for its kernel."""
+    processes = [machine.pid, *_writers(machine.pid)]
+    for pid in processes:
+        os.kill(pid, signal.SIGSTOP)
+    while not all(_state(pid) == "T" for pid in processes):
+        time.sleep(0.001)
+    _copy(disk, picture)
+    for pid in reversed(processes):
+        os.kill(pid, signal.SIGCONT)
+
+
+def _copy(disk: Path, picture: Path) -> None:
+    """Copy what is read of a disk, with holes where it is zero."""
+    with disk.open("rb") as source, picture.open("wb") as copy:
+        while chunk := source.read(COPIED_BYTES):
+            if chunk.strip(b"\0"):
+                copy.seek(source.tell() - len(chunk))
+                copy.write(chunk)
+        copy.truncate(DISK_BYTES)
+
+
+def _writers(pid: int) -> list[int]:
+    """Return the machine's processes that are none of its users': those it does not trace."""
+    tasks = Path(f"/proc/{pid}/task").glob("*/children")
+    children = [int(child) for task in tasks for child in task.read_text("ascii").split()]
+    return [child for child in children if "TracerPid:\t0\n" in Path(f"/proc/{child}/status").read_text("ascii")]
+
+
+def _state(pid: int) -> str:
+    """Return what a process does: T is stopped."""
+    return Path(f"/proc/{pid}/stat").read_text("ascii").rpartition(")")[2].split()[0]
+
+
+def main() -> int:
+    """Cut, and print what was found; 1 when anything that was acknowledged is gone or damaged."""
+    cuts, pictures = (int(number) for number in sys.argv[1:])
+    prepare()
+    with tempfile.TemporaryDirectory(prefix="power-cuts-") as name:
+        found = cut_power(cuts, Path(name), pictures=pictures)
+    for key, value in vars(found).items():
+        sys.stdout.write(f"{key:12} {value}\n")
+    return 1 if found.lost or found.damage or found.cuts < cuts else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

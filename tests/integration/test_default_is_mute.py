@@ -1,0 +1,49 @@
+"""A default installation on a bus that is alive: the daemon's real process, heard by the bus and by the kernel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from fdhil import config as machine_config
+from fdhil.cli.demo.processes import Process
+from fdhil.daemon.control import SOCKET_NAME, ask
+from fdhil.errors import DeviceError
+from tests.guard.peer import Peer, at_rest, write_config
+from tests.listening import tcp_ports
+
+CYCLES = 500
+
+
+@pytest.fixture
+def peer() -> Iterator[Peer]:
+    with at_rest() as made:
+        yield made
+
+
+@pytest.mark.goal("R15")
+def test_the_daemon_of_a_default_configuration_sends_no_frame_and_listens_at_no_port(
+    peer: Peer, tmp_path: Path, record_property: Callable[[str, object], None]
+) -> None:
+    config = write_config(tmp_path, peer.port, corrected=False)
+    socket = machine_config.load(config).run_directory / SOCKET_NAME
+
+    def listening() -> bool:
+        try:
+            return bool(ask(socket, {"request": "status"})["source"]["state"] == "listening")
+        except DeviceError:
+            return False
+
+    daemon = Process("daemon", ["fdhil", "run", str(config)], tmp_path / "daemon.log")
+    try:
+        peer.wait(listening, "the daemon")
+        first = peer.tick
+        peer.wait(lambda: peer.tick > first + CYCLES, "the cycles")
+        assert ask(socket, {"request": "arm", "token": "any"})["ok"] is False
+        ports = tcp_ports(daemon.pid)
+    finally:
+        daemon.stop()
+    assert (peer.sent, ports) == ([], set())
+    record_property("goal", f"{len(peer.sent)} frames sent, {len(ports)} TCP ports listened at, in {peer.tick:,} SYNC")

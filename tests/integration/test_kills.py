@@ -1,0 +1,75 @@
+"""A sample of the study of kills, hangs, restarts and faults at random times, and that its judges see what is wrong."""
+
+from __future__ import annotations
+
+import pytest
+
+from fdhil.guard import core
+from fdhil.guard.limits import OffsetLimits
+from studies import kills
+from studies.fault_rows import RAMPED, Descent, descent
+from tests.fault_matrix import ROWS
+
+LIMITS = OffsetLimits(offset=819, rate=65, acceleration=6, variation=9830, window=1000)
+
+
+@pytest.mark.parametrize("row", RAMPED)
+def test_a_fault_at_any_time_ends_at_zero_in_time(row: str) -> None:
+    assert RAMPED[row].code in ROWS[row].classes or not ROWS[row].classes or row == "F3"
+    found = kills.frame_part(row, 3, 7)
+    assert found.wrong == []
+    assert len(found.descents[row]) == 3
+
+
+@pytest.mark.fault("F15", "F16", "F14", "E13")
+@pytest.mark.parametrize(
+    ("part", "times", "seed"),
+    [
+        pytest.param("kills", 2, 3, id="F15"),
+        pytest.param("restarts", 4, 3, id="F16"),
+        pytest.param("hangs", 1, 3, id="F14"),
+    ],
+)
+def test_killed_hung_and_restarted_processes_end_at_zero(part: str, times: int, seed: int) -> None:
+    found = kills.live_part(part, times, seed)
+    assert found.wrong == []
+    assert found.counts["frames while hung"] == 0
+    assert found.frames > 100
+
+
+def test_faults_of_the_bus_end_at_zero_between_processes() -> None:
+    found = kills.live_part("faults", 3, 5)
+    assert found.wrong == []
+    assert sum(map(len, found.descents.values())) == 3
+
+
+@pytest.mark.socketcan
+@pytest.mark.fault("A10", "A15", "F14", "F15", "F16")
+@pytest.mark.parametrize(
+    ("part", "times"),
+    [("kills", 3), ("restarts", 6), ("hangs", 1), ("faults", 8)],
+)
+def test_the_same_on_socketcan(part: str, times: int) -> None:
+    found = kills.live_part(part, times, 1, "socketcan")
+    assert found.wrong == []
+    assert found.counts["frames while hung"] == 0
+
+
+def test_a_descent_is_judged_by_its_bounds() -> None:
+    down = [(300, 0), *[(300 - 6 * k, 0) for k in range(51)]]
+    assert descent(down, 0, LIMITS, 2) == Descent(1, 51, within=False)
+    assert descent(down, 0, LIMITS, 20) == Descent(1, 51, within=True)
+    assert descent([(300, 0), (301, 0), (0, 0)], 0, LIMITS, 2) == Descent(2, 2, within=True)
+    assert descent([(0, 9)] * 60 + [(0, 10), (0, 0)], 0, LIMITS, 2) == Descent(61, 61, within=False)
+    assert descent(down[:-1], 0, LIMITS, 20) is None
+
+
+def test_a_guard_that_does_not_see_a_fault_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(core, "failing", lambda _bus, _views: ())
+    assert kills.frame_part("E11", 1, 7).wrong
+
+
+def test_a_guard_that_ramps_by_a_step_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(core, "follow", lambda _limits, _offset, _rate, wanted, _rate_wanted: wanted)
+    monkeypatch.setattr(core, "violation", lambda _limits, _before, _rate, _offset: None)
+    assert any("a step" in each for each in kills.frame_part("F15", 20, 7).wrong)

@@ -1,0 +1,28 @@
+"""What was acknowledged is there after the power was cut, and a store that waits for no disk would be found out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.integration.power_cuts import cut_power, prepare
+
+pytestmark = [pytest.mark.debian, pytest.mark.fault("F2")]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _machine() -> None:
+    prepare()
+
+
+def test_nothing_that_was_acknowledged_is_lost_when_the_power_is_cut(tmp_path: Path) -> None:
+    found = cut_power(3, tmp_path, pictures=2)
+    assert (found.cuts, found.pictures, found.lost, found.damage) == (3, 6, [], [])
+    assert all(found.acknowledged.values())
+    assert found.checked > 0
+
+
+def test_a_store_that_waits_for_no_disk_loses_what_it_acknowledged(tmp_path: Path) -> None:
+    found = cut_power(2, tmp_path, "careless")
+    assert found.lost or found.damage

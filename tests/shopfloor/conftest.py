@@ -1,0 +1,17 @@
+"""The nodes that every OPC UA server has are made once for all tests."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from fdhil.shopfloor.opcua_security import ReadServer
+from tests.drivers.nc.opcua_peer import load_once
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _nodes_made_once() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ReadServer, "load_standard_address_space", load_once)
+        yield

@@ -1,0 +1,17 @@
+"""A publisher is a small process: it stands beside an NC, and there may be four of them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+HEAVY = ("numba", "scipy", "pyarrow", "can", "canopen", "pymodbus")
+
+
+@pytest.mark.parametrize("module", ["mqtt", "mtconnect", "prometheus"])
+def test_a_publisher_loads_nothing_that_computes_or_opens_a_bus(module: str) -> None:
+    asked = f"import sys, fdhil.shopfloor.{module}; print(*[name for name in {HEAVY} if name in sys.modules])"
+    loaded = subprocess.run([sys.executable, "-c", asked], check=True, capture_output=True, text=True, timeout=120)
+    assert loaded.stdout.split() == []

@@ -1,0 +1,184 @@
+"""``fdhil publish mqtt`` as a process, a real daemon behind it and a real broker before it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import ssl
+import sys
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import aiomqtt
+import pytest
+
+from fdhil import config as machine_config
+from tests.daemon.machine import Machine, rapids
+from tests.daemon.shop import BENCH
+from tests.daemon.test_service import serving, status_when
+from tests.shopfloor.mosquitto import broker, certify, free_port, guarded, open_to_all
+from tests.shopfloor.sparkplug_host import Host, command
+
+pytestmark = pytest.mark.debian
+SECRET = "canary-7f3a9"
+
+
+@pytest.fixture(autouse=True)
+def _quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fdhil.daemon.service.warm", lambda config, method: None)
+
+
+def written(folder: Path, port: int, more: str = "") -> Path:
+    """Return a machine's configuration that is told to the broker at ``port`` ten times a second."""
+    file = folder / "machine.toml"
+    file.write_text(f"{BENCH}[publish.mqtt]\nport = {port}\nperiod_s = 0.1\n{more}")
+    return file
+
+
+@asynccontextmanager
+async def publisher(file: Path) -> AsyncIterator[asyncio.subprocess.Process]:
+    """Run ``fdhil publish mqtt`` until the block is left; what it says goes to publish.log."""
+    with (file.parent / "publish.log").open("ab") as log:
+        arguments = ("-m", "fdhil", "publish", "mqtt", file)
+        process = await asyncio.create_subprocess_exec(sys.executable, *arguments, stdout=log, stderr=log)
+    try:
+        yield process
+    finally:
+        if process.returncode is None:
+            process.terminate()
+            assert await process.wait() == 0
+
+
+class Listening:
+    """A host application on a real broker."""
+
+    def __init__(self, client: aiomqtt.Client) -> None:
+        self.client, self.host = client, Host()
+
+    async def until(self, so: Callable[[Host], object]) -> None:
+        """Take what the edge node says until it is ``so``."""
+        async with asyncio.timeout(120):
+            while not so(self.host):
+                message = await anext(aiter(self.client.messages))
+                if "/STATE/" not in message.topic.value and "/NCMD/" not in message.topic.value:
+                    assert not message.retain
+                    assert isinstance(message.payload, bytes)
+                    self.host.take(message.topic.value, message.payload)
+
+    async def command(self, name: str) -> None:
+        """Send the edge node a command."""
+        await self.client.publish("spBv1.0/fdhil/NCMD/bench", command(name, True))
+
+
+@asynccontextmanager
+async def host_application(port: int, **more: object) -> AsyncIterator[Listening]:
+    """Listen to everything that is Sparkplug's until the block is left."""
+    async with aiomqtt.Client("127.0.0.1", port, **more) as client:  # type: ignore[arg-type]
+        await client.subscribe("spBv1.0/#", qos=1)
+        yield Listening(client)
+
+
+async def test_from_birth_to_death_with_a_real_broker(tmp_path: Path) -> None:
+    port = free_port()
+    file = written(tmp_path, port)
+    config = machine_config.load(file)
+    machine = Machine()
+    async with broker(tmp_path, open_to_all(port), port), host_application(port) as listening:
+        async with publisher(file) as first:
+            await listening.until(lambda host: host.verbs == ["NBIRTH"])
+            assert listening.host.values[""]["up"] is False
+            async with serving(config, machine) as path:
+                await listening.until(lambda host: {"X", "Y"} <= set(host.values))
+                assert listening.host.values[""]["config_digest"] == config.digest
+                machine.give(*rapids(config, count=2))
+                await listening.until(lambda host: host.values["X"]["revision"] == 2.0)
+                x = listening.host.values["X"]
+                status = await status_when(path, lambda status: status["ok"])
+                told = status["axes"]["X"]["parameters"]["K"]
+                assert (x["K"], x["K_low"], x["K_high"]) == (told["value"], told["low"], told["high"])
+                await listening.command("arm")
+                await listening.command("Node Control/Rebirth")
+                await listening.until(lambda host: host.verbs.count("NBIRTH") == 2)
+                await listening.until(lambda host: {"X", "Y"} <= set(host.values))
+                assert listening.host.values["X"]["K"] == told["value"]
+                assert (await status_when(path, lambda status: status["ok"]))["armed"] is None
+            await listening.until(lambda host: set(host.values) == {""})
+            assert listening.host.values[""]["up"] is False
+            first.kill()
+            assert await first.wait() == -signal.SIGKILL
+            await listening.until(lambda host: not host.alive)  # the broker tells of it, by the will
+        async with publisher(file):
+            await listening.until(lambda host: host.alive)
+        await listening.until(lambda host: not host.alive)  # it tells of it itself
+        assert listening.host.verbs[-1] == "NDEATH"
+
+
+async def test_a_broker_that_goes_away_and_comes_back(tmp_path: Path) -> None:
+    port = free_port()
+    async with publisher(written(tmp_path, port)):
+        await _said(tmp_path, "check host and port, and whether it runs")
+        for _ in range(2):
+            async with broker(tmp_path, open_to_all(port), port), host_application(port) as listening:
+                await listening.until(lambda host: host.alive)
+    assert (tmp_path / "publish.log").read_text().count("Traceback") == 0
+
+
+async def test_over_tls_with_a_password_that_nobody_else_sees(tmp_path: Path) -> None:
+    port = free_port()
+    own = f'tls_certificate_file = "{tmp_path}/client.pem"\ntls_key_file = "{tmp_path}/client.key"\n'
+    user = f'user = "mill"\npassword_file = "{tmp_path}/secret"\n'
+    file, secret = written(tmp_path, port, f'tls_ca_file = "{tmp_path}/ca.pem"\n{own}{user}'), tmp_path / "secret"
+    secret.write_text("wrong\n")
+    async with broker(tmp_path, guarded(tmp_path, port, "mill", SECRET), port):
+        async with publisher(file):
+            await _said(tmp_path, "it refuses ([code:135] Not authorized); check user")
+        secret.write_text(f"{SECRET}\n")
+        context = ssl.create_default_context(cafile=str(tmp_path / "ca.pem"))
+        context.load_cert_chain(tmp_path / "client.pem", tmp_path / "client.key")
+        as_host = {"tls_context": context, "username": "mill", "password": SECRET}
+        async with host_application(port, **as_host) as listening, publisher(file) as process:
+            await listening.until(lambda host: host.alive)
+            seen = Path(f"/proc/{process.pid}/cmdline").read_bytes() + Path(f"/proc/{process.pid}/environ").read_bytes()
+            assert SECRET.encode() not in seen
+    assert SECRET not in (tmp_path / "publish.log").read_text()
+
+
+async def test_a_broker_with_anothers_certificate_is_told_nothing(tmp_path: Path) -> None:
+    port = free_port()
+    (another := tmp_path / "another").mkdir()
+    certify(another)
+    tls = f'tls_ca_file = "{another}/ca.pem"\nuser = "mill"\npassword_file = "{tmp_path}/secret"\n'
+    (tmp_path / "secret").write_text(SECRET)
+    async with broker(tmp_path, guarded(tmp_path, port, "mill", SECRET), port), publisher(written(tmp_path, port, tls)):
+        await _said(tmp_path, "CERTIFICATE_VERIFY_FAILED")
+
+
+async def test_a_primary_host_application_is_waited_for(tmp_path: Path) -> None:
+    port = free_port()
+    file = written(tmp_path, port, 'primary_host = "scada"\n')
+    async with broker(tmp_path, open_to_all(port), port), host_application(port) as listening, publisher(file):
+        await _said(tmp_path, "is there")
+        await _state(listening.client, True, 1)
+        await listening.until(lambda host: host.alive)
+        await _state(listening.client, False, 2)
+        await listening.until(lambda host: not host.alive)
+        await _state(listening.client, True, 3)
+        await listening.until(lambda host: host.alive)
+        assert listening.host.verbs == ["NBIRTH", "NDEATH", "NBIRTH"]
+
+
+async def _state(client: aiomqtt.Client, online: bool, stamp_ms: int) -> None:
+    told = json.dumps({"online": online, "timestamp": stamp_ms})
+    await client.publish("spBv1.0/STATE/scada", told, qos=1, retain=True)
+
+
+async def _said(folder: Path, words: str) -> None:
+    """Wait until the publisher has said ``words``."""
+    log = folder / "publish.log"
+    for _ in range(2400):
+        if log.exists() and words in log.read_text():
+            return
+        await asyncio.sleep(0.05)
+    raise TimeoutError(log.read_text())

@@ -1,0 +1,283 @@
+"""A session with a broker: births, changes, silence, commands, a primary host; the broker is a list here."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import aiomqtt
+import pytest
+
+from fdhil.config.publish import MqttBroker
+from fdhil.errors import ConnectError
+from fdhil.shopfloor import mqtt
+from fdhil.shopfloor.broker_security import password_of, tls_of
+from fdhil.shopfloor.mqtt import HostGone, Session
+from tests.daemon.machine import config_of
+from tests.shopfloor.asked_daemon import NOW, Daemon, identified, load_changed
+from tests.shopfloor.made import publishing, trouble
+from tests.shopfloor.mosquitto import certify
+from tests.shopfloor.sparkplug_host import Host, command
+
+NCMD = "spBv1.0/fdhil/NCMD/mill"
+
+
+@pytest.fixture(autouse=True)
+def _no_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mqtt, "REBIRTH_S", 0.0)
+
+
+class Broker:
+    """Stands in for the client of a broker: keeps what is published for a host application to hear."""
+
+    def __init__(self) -> None:
+        self.host = Host()
+        self.subscribed: list[str] = []
+        self._commands: asyncio.Queue[Any] = asyncio.Queue()
+        self._heard = asyncio.Event()
+
+    async def subscribe(self, topic: str, qos: int) -> None:
+        assert qos == 1
+        self.subscribed.append(topic)
+
+    async def publish(self, topic: str, payload: bytes, qos: int, *, retain: bool, timeout: float | None) -> None:
+        assert not retain
+        self.host.take(topic, payload)
+        self._heard.set()
+
+    @property
+    async def messages(self) -> AsyncIterator[Any]:
+        while True:
+            yield await self._commands.get()
+
+    def send(self, topic: str, payload: bytes) -> None:
+        """Send a message to the edge node."""
+        self._commands.put_nowait(SimpleNamespace(topic=aiomqtt.Topic(topic), payload=payload))
+
+    async def until(self, so: Callable[[Host], bool]) -> None:
+        """Wait until it is ``so``."""
+        async with asyncio.timeout(60):
+            while not so(self.host):
+                await self._heard.wait()
+                self._heard.clear()
+
+
+def session_of(**settings: Any) -> Session:
+    return Session(MqttBroker(**settings), "mill")
+
+
+@asynccontextmanager
+async def connected(session: Session) -> AsyncIterator[Broker]:
+    """Serve one connection until the block is left."""
+    broker = Broker()
+    task = asyncio.create_task(session.run(cast(aiomqtt.Client, broker)))
+    try:
+        yield broker
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+def is_born(host: Host) -> bool:
+    return host.verbs[-1:] == ["DBIRTH/Y"]
+
+
+async def test_births_then_changes_then_silence_then_life_then_a_death_certificate(tmp_path: Path) -> None:
+    daemon, session = Daemon(tmp_path), session_of()
+    session.node.will(NOW)
+    async with connected(session) as broker:
+        await asyncio.sleep(0)
+        assert broker.host.verbs == []  # the daemon was not asked yet
+        session.hear(daemon.news())
+        await broker.until(is_born)
+        assert broker.host.verbs == ["NBIRTH", "DBIRTH/X", "DBIRTH/Y"]
+        assert (broker.host.values[""]["up"], broker.host.values["X"]["K"]) == (True, None)
+        session.hear(daemon.news(*identified(), load_changed()))
+        await broker.until(lambda host: host.values["X"]["K"] == 0.8)
+        x = broker.host.values["X"]
+        assert x["K_low"] < 0.8 < x["K_high"]
+        assert x["windows_accepted"] == 1
+        assert broker.host.units["X"]["K"] == "N.m/A"
+        await broker.until(lambda host: host.values["X"]["notice"] == "LoadChanged: Jt rose")
+        session.hear(daemon.silence())
+        await broker.until(lambda host: set(host.values) == {""})
+        assert broker.host.verbs[-2:] == ["DDEATH/X", "DDEATH/Y"]
+        assert broker.host.values[""]["up"] is False
+        assert broker.host.values[""]["state"] is None
+        session.hear(daemon.news())
+        await broker.until(is_born)
+        assert broker.host.values["X"]["K"] == 0.8
+    assert broker.host.verbs[-1] == "NDEATH"
+    assert not broker.host.alive
+
+
+async def test_every_notice_is_told_also_the_same_one_again(tmp_path: Path) -> None:
+    daemon, session = Daemon(tmp_path), session_of()
+    session.node.will(NOW)
+    async with connected(session) as broker:
+        session.hear(daemon.news())
+        await broker.until(is_born)
+        before = broker.host.verbs.count("DDATA/X")
+        session.hear(daemon.news(load_changed("one"), load_changed("two")))
+        await broker.until(lambda host: host.values["X"]["notice"] == "LoadChanged: two")
+        session.hear(daemon.news(load_changed("two")))
+        await broker.until(lambda host: host.verbs.count("DDATA/X") >= before + 3)
+
+
+async def test_a_trouble_is_an_alarm_until_it_is_over(tmp_path: Path) -> None:
+    daemon, session = Daemon(tmp_path), session_of()
+    session.node.will(NOW)
+    async with connected(session) as broker:
+        daemon.changes = {"troubles": [trouble("NoSamples", "X", text="sends no samples")]}
+        session.hear(daemon.news())
+        await broker.until(is_born)
+        assert broker.host.values["X"]["alarms"] == "NoSamples: sends no samples"
+        daemon.changes = {}
+        session.hear(daemon.news())
+        await broker.until(lambda host: host.values["X"]["alarms"] == "")
+
+
+async def test_births_are_sent_again_on_demand_and_nothing_else_is_obeyed(tmp_path: Path) -> None:
+    daemon, session = Daemon(tmp_path), session_of()
+    session.node.will(NOW)
+    async with connected(session) as broker:
+        session.hear(daemon.news())
+        await broker.until(is_born)
+        for name in ("arm", "Node Control/Reboot", "Node Control/Next Server"):
+            broker.send(NCMD, command(name, True))
+        broker.send(NCMD, b"\xff\x00 no protobuf")
+        broker.send(NCMD, command("Node Control/Rebirth", True))
+        await broker.until(lambda host: host.verbs.count("DBIRTH/Y") == 2)
+        assert broker.host.verbs == ["NBIRTH", "DBIRTH/X", "DBIRTH/Y"] * 2
+        assert broker.subscribed == [NCMD]  # no device takes commands
+
+
+async def test_a_daemon_that_is_silent_from_the_start_has_no_axes(tmp_path: Path) -> None:
+    daemon, session = Daemon(tmp_path), session_of()
+    session.node.will(NOW)
+    async with connected(session) as broker:
+        session.hear(daemon.silence())
+        await broker.until(lambda host: host.verbs == ["NBIRTH"])
+        assert broker.host.values[""]["up"] is False
+        session.hear(daemon.news())
+        await broker.until(is_born)
+
+
+def host_says(online: bool, stamp_ms: int) -> bytes:
+    return json.dumps({"online": online, "timestamp": stamp_ms}).encode()
+
+
+async def test_a_primary_host_is_waited_for_and_left_when_it_goes(tmp_path: Path) -> None:
+    daemon, session = Daemon(tmp_path), session_of(primary_host="scada")
+    session.node.will(NOW)
+    broker, state = Broker(), "spBv1.0/STATE/scada"
+    serving = asyncio.create_task(session.run(cast(aiomqtt.Client, broker)))
+    session.hear(daemon.news())
+    broker.send(state, host_says(False, NOW))
+    broker.send("spBv1.0/STATE/another", host_says(True, NOW + 1))
+    for _ in range(20):
+        await asyncio.sleep(0)
+    assert broker.host.verbs == []
+    assert broker.subscribed == [NCMD, state]
+    broker.send(state, host_says(True, NOW + 2))
+    await broker.until(is_born)
+    broker.send(state, host_says(False, NOW + 1))  # the death of a connection before
+    broker.send(NCMD, command("Node Control/Rebirth", True))
+    await broker.until(lambda host: host.verbs.count("DBIRTH/Y") == 2)
+    broker.send(state, host_says(False, NOW + 3))
+    with pytest.raises(ExceptionGroup) as gone:
+        await serving
+    assert gone.group_contains(HostGone)
+    assert broker.host.verbs[-1] == "NDEATH"
+
+
+async def test_a_broker_that_is_not_there_is_told_of_once_and_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(mqtt, "FIRST_RETRY_S", 0.001)
+    tried = asyncio.Queue[None]()
+    monkeypatch.setattr(mqtt, "_client", _counted(tried, mqtt._client))
+    async with publishing("mqtt", config_of(tmp_path, publish={"mqtt": {"port": 1}})):
+        for _ in range(4):
+            await tried.get()
+    said = capsys.readouterr().err
+    assert said.count("Connection refused; check host and port, and whether it runs; it is tried again") == 1
+
+
+async def test_it_does_not_go_on_with_old_values_when_the_daemon_cannot_be_heard_any_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def broken(config: Any, period_s: float) -> AsyncIterator[Any]:
+        for fault in (RuntimeError("a fault of fdhil itself"),):
+            raise fault
+        yield
+
+    monkeypatch.setattr(mqtt, "listen", broken)
+    with pytest.raises(RuntimeError, match="a fault of fdhil itself"):
+        await mqtt.publish(config_of(tmp_path, publish={"mqtt": {"port": 1}}))
+
+
+def _counted(tried: asyncio.Queue[None], client: Callable[..., Any]) -> Callable[..., Any]:
+    def counted(*arguments: Any) -> Any:
+        tried.put_nowait(None)
+        return client(*arguments)
+
+    return counted
+
+
+def test_credentials_that_cannot_be_used_are_named(tmp_path: Path) -> None:
+    missing = tmp_path / "missing"
+    with pytest.raises(ConnectError, match=r"password_file .*missing cannot be used: No such file"):
+        password_of(MqttBroker(user="fdhil", password_file=missing))
+    with pytest.raises(ConnectError, match=r"tls_ca_file .*missing cannot be used: No such file"):
+        tls_of(MqttBroker(tls_ca_file=missing))
+    certify(tmp_path)
+    ca, empty = tmp_path / "ca.pem", tmp_path / "empty"
+    empty.touch()
+    with pytest.raises(ConnectError, match=r"tls_certificate_file .*empty cannot be used"):
+        tls_of(MqttBroker(tls_ca_file=ca, tls_certificate_file=empty, tls_key_file=empty))
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"host": "broker", "user": "u", "password_file": "p"}, "it needs a tls_ca_file"),
+        ({"user": "u"}, "a user comes with the password_file"),
+        ({"tls_certificate_file": "c", "tls_key_file": "k"}, "it needs a tls_ca_file"),
+        ({"tls_ca_file": "ca", "tls_key_file": "k"}, "comes with its tls_key_file"),
+        ({"group": "a/b"}, "pattern"),
+        ({"node": "mill+"}, "pattern"),
+    ],
+)
+def test_settings_that_would_not_do_are_refused(settings: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        MqttBroker(**settings)
+
+
+def test_the_machines_name_is_the_node_without_what_a_topic_cannot_have() -> None:
+    assert MqttBroker().node_name("mill #3 / hall +1") == "mill _3 _ hall _1"
+    assert MqttBroker(node="m3").node_name("mill") == "m3"
+
+
+async def test_a_task_that_loses_a_cancellation_is_cancelled_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mqtt, "DEATH_S", -0.99)
+    lost = []
+
+    async def deaf_once() -> None:
+        try:
+            await asyncio.Event().wait()
+        except asyncio.CancelledError:
+            lost.append(True)
+        await asyncio.Event().wait()
+
+    task = asyncio.create_task(deaf_once())
+    await asyncio.sleep(0)
+    await mqtt._end([task])
+    assert (task.cancelled(), lost) == (True, [True])

@@ -1,0 +1,339 @@
+"""The OPC UA server, read by asyncua's own client: values with quality, unit and time, alarms, and who may do what."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import pytest_asyncio
+from asyncua import Client, Node, ua
+from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
+from asyncua.ua.uaerrors import (
+    BadIdentityTokenRejected,
+    BadUserAccessDenied,
+    UaError,
+)
+
+from fdhil.config import MachineConfig
+from fdhil.config.users import hashed, write_users
+from fdhil.errors import ConnectError
+from fdhil.shopfloor.news import Listener
+from fdhil.shopfloor.opcua import Served, publish, serving
+from fdhil.shopfloor.opcua_nodes import OWN
+from fdhil.shopfloor.published import AXIS, BUS, MACHINE
+from tests.daemon.machine import Machine, config_of
+from tests.daemon.test_service import serving as daemon_serving
+from tests.drivers.nc.test_opcua import certificates
+from tests.shopfloor.made import NOW_MS, VALUES, notice, publishing, said, status, trouble
+
+pytestmark = pytest.mark.asyncio(loop_scope="module")
+PASSWORD = "canary-of-the-shop-floor"
+MACHINE_TOOL = "http://opcfoundation.org/UA/MachineTool/"
+
+
+class Stage:
+    """A server of the bench without a daemon: the tests say what the daemon would."""
+
+    def __init__(self, config: MachineConfig, served: Served) -> None:
+        self.served, self.listener = served, Listener(config)
+        self.url = f"opc.tcp://127.0.0.1:{served.port}"
+
+    async def say(self, answer: dict[str, Any] | None, now_ms: int = NOW_MS) -> None:
+        """Let the daemon answer, or be silent."""
+        await self.served.tell(self.listener.news(answer, now_ms, "" if answer else "the daemon is not running"))
+
+
+@pytest_asyncio.fixture(loop_scope="module", scope="module")
+async def stage(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Stage]:
+    opcua = {"port": 0, "manufacturer": "Example Maker", "serial_number": "4711"}
+    config = config_of(tmp_path_factory.mktemp("opcua"), "XY", publish={"opcua": opcua})
+    async with serving(config) as served:
+        yield Stage(config, served)
+
+
+@pytest_asyncio.fixture(loop_scope="module")
+async def client(stage: Stage) -> AsyncIterator[Client]:
+    await stage.say(status())
+    async with Client(stage.url) as connected:
+        yield connected
+
+
+async def own(client: Client, name: str) -> Node:
+    return client.get_node(f"ns={await client.get_namespace_index(OWN)};s={name}")
+
+
+async def told_of(node: Node) -> Any:
+    """Read a value with its quality and time."""
+    return await node.read_data_value(raise_on_bad_status=False)
+
+
+class Heard:
+    """What a subscription was told."""
+
+    def __init__(self) -> None:
+        self.events: list[Any] = []
+        self.values: list[Any] = []
+
+    def event_notification(self, event: Any) -> None:
+        self.events.append(event)
+
+    def datachange_notification(self, node: Node, value: Any, data: Any) -> None:
+        self.values.append(value)
+
+
+async def until(done: Callable[[], bool]) -> None:
+    async with asyncio.timeout(120.0):
+        while True:
+            if done():
+                return
+            await asyncio.sleep(0.01)
+
+
+async def test_a_machine_tool_stands_where_clients_look_for_it(client: Client) -> None:
+    machinery = await client.get_namespace_index("http://opcfoundation.org/UA/Machinery/")
+    tool, di = (
+        await client.get_namespace_index(MACHINE_TOOL),
+        await client.get_namespace_index("http://opcfoundation.org/UA/DI/"),
+    )
+    machine = (await (await client.nodes.objects.get_child(f"{machinery}:Machines")).get_children())[0]
+    assert (await machine.read_browse_name()).Name == "bench"
+    kind: Any = await machine.read_type_definition()
+    assert kind.Identifier == 13  # MachineToolType
+    place = await machine.get_child(f"{di}:Identification")
+    assert (await (await place.get_child(f"{di}:Manufacturer")).read_value()).Text == "Example Maker"
+    assert await (await place.get_child(f"{di}:SerialNumber")).read_value() == "4711"
+    program = await machine.get_child([f"{tool}:Production", f"{tool}:ActiveProgram"])
+    assert await (await program.get_child(f"{tool}:Name")).read_value() == "part.ngc"
+
+
+async def test_the_program_runs_or_is_interrupted_as_the_nc_says_and_no_mode_is_made_up(
+    stage: Stage, client: Client
+) -> None:
+    tool, machine = await client.get_namespace_index(MACHINE_TOOL), await own(client, "machine")
+    state = await machine.get_child([f"{tool}:Production", f"{tool}:ActiveProgram", f"{tool}:State", "0:CurrentState"])
+    seen = []
+    for motion in ("rapid", "hold", "rest"):
+        answer = status()
+        answer["nc"]["motion"] = motion
+        await stage.say(answer)
+        told = await told_of(state)
+        seen.append(told.Value.Value.Text if told.Value.Value else told.StatusCode.name)
+    assert seen == ["Running", "Interrupted", "BadNoDataAvailable"]
+    mode = await machine.get_child([f"{tool}:Monitoring", f"{tool}:MachineTool", f"{tool}:OperationMode"])
+    assert (await told_of(mode)).StatusCode.name == "BadNoDataAvailable"
+
+
+async def test_parameters_have_intervals_units_and_times(client: Client) -> None:
+    for name, value in VALUES.items():
+        read = [await (await own(client, f"Y.{name}{end}")).read_value() for end in ("_low", "", "_high")]
+        assert read == pytest.approx([0.9 * value, value, 1.1 * value])
+    unit = await (await own(client, "Y.Cd.unit")).read_value()
+    assert (unit.UnitId, unit.DisplayName.Text) == (20053, "N·m")  # "NU"
+    told = await told_of(await own(client, "nc_line"))
+    assert told.Value.Value == 17.0
+    assert round(told.SourceTimestamp.timestamp() * 1000) == NOW_MS - 250
+    described: Any = await (await own(client, "Y.Cd_low")).read_description()
+    assert "Coulomb friction" in described.Text
+
+
+async def test_all_that_is_published_is_a_node_of_its_kind(client: Client) -> None:
+    python = {"measure": float, "count": int, "flag": bool, "state": str, "text": str}
+    for where, items in (("", MACHINE), ("X.", AXIS), ("can0.", BUS)):
+        nodes = [await own(client, where + item.name) for item in items]
+        for item, value in zip(items, await client.read_values(nodes), strict=True):
+            assert type(value) is python[item.kind], item.name
+
+
+async def test_what_is_not_known_has_a_bad_quality_and_so_has_all_while_the_daemon_is_silent(
+    stage: Stage, client: Client
+) -> None:
+    node, heard = await own(client, "X.R"), Heard()
+    unheard = status()
+    unheard["guard"]["heard_s_ago"] = 60.0
+    await stage.say(unheard)
+    offset = await told_of(await own(client, "X.offset"))
+    assert offset.StatusCode.name == "BadNoDataAvailable"
+    subscription = await client.create_subscription(20, heard)
+    await subscription.subscribe_data_change(node)
+    await until(lambda: heard.values == [0.5])
+    await stage.say(None)
+    await until(lambda: heard.values == [0.5, None])
+    read = await told_of(node)
+    assert (read.StatusCode.name, read.Value.Value) == ("BadNoCommunication", None)
+    await stage.say(status())
+    await until(lambda: heard.values == [0.5, None, 0.5])
+    await subscription.delete()
+
+
+async def subscribed(client: Client, heard: Heard, at: str = "messages") -> Any:
+    """Subscribe to the machine's messages: alarms of AlertType, notices of NotificationEventType."""
+    tool = await client.get_namespace_index(MACHINE_TOOL)
+    subscription = await client.create_subscription(20, heard)
+    types = [client.get_node(f"ns={tool};i=39"), client.get_node(f"ns={tool};i=35")]
+    node = client.nodes.server if at == "server" else await own(client, at)
+    await subscription.subscribe_events(node, types)
+    return subscription
+
+
+@pytest.mark.parametrize("at", ["messages", "server"])
+async def test_an_alarm_is_a_condition_that_begins_and_ends_and_a_notice_is_an_event(
+    at: str, stage: Stage, client: Client
+) -> None:
+    heard = Heard()
+    subscription = await subscribed(client, heard, at)
+    await stage.say(status(troubles=[trouble("NoSamples", "X", text="the drive sends no samples; check it")]))
+    await until(lambda: len(heard.events) == 1)
+    began = heard.events[0]
+    assert (began.ErrorCode, began.SourceName, began.Severity) == ("NoSamples", "X", 800)
+    assert began.Message.Text == "the drive sends no samples; check it"
+    assert getattr(began, "ActiveState/Id") is True
+    assert began.Retain is True
+    await stage.say(status(troubles=[trouble("NoSamples", "X")]))  # still so: told once
+    await stage.say(status(uptime_s=2000.0, notices=[notice("Armed", 1005.0), notice("OverrideChanged", 0.5, "minor")]))
+    await until(lambda: len(heard.events) == 3)
+    by_code = {getattr(e, "ErrorCode", None) or e.Identifier: e for e in heard.events[1:]}
+    assert getattr(by_code["NoSamples"], "ActiveState/Id") is False
+    assert by_code["NoSamples"].Retain is False
+    assert by_code["OverrideChanged"].Severity == 400
+    await subscription.delete()
+
+
+async def test_a_client_that_comes_later_asks_for_what_is_on(stage: Stage, client: Client) -> None:
+    await stage.say(status(troubles=[trouble("BusSilent")]))
+    heard = Heard()
+    subscription = await subscribed(client, heard, "server")
+    refresh = client.get_node(ua.ObjectIds.ConditionType_ConditionRefresh)
+    kind = client.get_node(ua.ObjectIds.ConditionType)
+    await kind.call_method(refresh.nodeid, ua.Variant(subscription.subscription_id, ua.VariantType.UInt32))
+    await until(lambda: any(getattr(event, "ErrorCode", None) == "BusSilent" for event in heard.events))
+    await subscription.delete()
+    await stage.say(status())
+
+
+async def test_a_silent_daemon_is_an_alarm_and_ends_none(stage: Stage, client: Client) -> None:
+    await stage.say(status(troubles=[trouble("BusSilent")]))
+    heard = Heard()
+    subscription = await subscribed(client, heard)
+    await stage.say(None)
+    await until(lambda: len(heard.events) == 1)
+    assert heard.events[0].ErrorCode == "DaemonSilent"
+    await stage.say(status())
+    await until(lambda: len(heard.events) == 3)
+    assert {getattr(event, "ActiveState/Id") for event in heard.events[1:]} == {False}
+    await subscription.delete()
+
+
+async def test_nobody_can_change_anything(client: Client) -> None:
+    node = await own(client, "X.R")
+    with pytest.raises(BadUserAccessDenied):
+        await node.write_value(1.0)
+    with pytest.raises(BadUserAccessDenied):
+        await client.nodes.objects.add_object(2, "intruder")
+    with pytest.raises(BadUserAccessDenied):
+        await client.delete_nodes([node])
+    with pytest.raises(UaError):
+        await client.nodes.server.call_method("0:ResendData", ua.Variant(1, ua.VariantType.UInt32))
+    assert await node.read_value() == 0.5
+
+
+async def test_nonsense_on_the_wire_ends_its_own_connection_alone(stage: Stage, client: Client) -> None:
+    for nonsense in (b"GET / HTTP/1.1\r\n\r\n", b"HELF" + b"\xff" * 60, b"OPNF\x10\x00\x00\x00" + b"\x00" * 8):
+        reader, writer = await asyncio.open_connection("127.0.0.1", stage.served.port)
+        writer.write(nonsense)
+        writer.write_eof()
+        async with asyncio.timeout(120.0):
+            await reader.read()
+        writer.close()
+    assert await (await own(client, "state")).read_value() == "ACTIVE"
+
+
+@asynccontextmanager
+async def guarded(folder: Path, **keys: Any) -> AsyncIterator[str]:
+    """Serve with a certificate and a user; yield the address."""
+    theirs = await certificates(folder, "server", "urn:fdhil:bench")
+    users = folder / "users.json"
+    write_users(users, {"scada": hashed(PASSWORD, "watch")})
+    files = {"certificate_file": str(theirs[0]), "private_key_file": str(theirs[1]), "users_file": str(users)}
+    config = config_of(folder, publish={"opcua": {"port": 0, **files, **keys}})
+    async with serving(config) as served:
+        yield f"opc.tcp://127.0.0.1:{served.port}"
+
+
+async def entered(url: str, folder: Path, name: str, user: str | None, password: str = "") -> Any:
+    """Enter by a certificate of this name, read the state, and return its quality."""
+    ours = await certificates(folder, name, f"urn:{name}") if not (folder / f"{name}.der").exists() else None
+    certificate, key = ours or (folder / f"{name}.der", folder / f"{name}.pem")
+    client = Client(url)
+    client.application_uri = f"urn:{name}"
+    await client.set_security(SecurityPolicyBasic256Sha256, str(certificate), str(key))
+    if user is not None:
+        client.set_user(user)
+        client.set_password(password)
+    async with client:
+        return (await told_of(await own(client, "state"))).StatusCode.name
+
+
+async def refused(entering: Awaitable[Any]) -> str:
+    try:
+        await entering
+    except (UaError, OSError, TimeoutError) as error:
+        return type(error).__name__
+    return "let in"
+
+
+async def test_who_enters_is_known_by_certificate_and_password(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    trusted = tmp_path / "trusted"
+    trusted.mkdir()
+    ours = await certificates(tmp_path, "scada", "urn:scada")
+    (trusted / "scada.der").write_bytes(ours[0].read_bytes())
+    async with guarded(tmp_path, trusted_clients=str(trusted)) as url:
+        assert await entered(url, tmp_path, "scada", "scada", PASSWORD) == "Good"
+        assert await refused(entered(url, tmp_path, "scada", "scada", "wrong")) == BadUserAccessDenied.__name__
+        assert await refused(entered(url, tmp_path, "scada", "nobody", PASSWORD)) == BadUserAccessDenied.__name__
+        assert await refused(entered(url, tmp_path, "scada", None)) == BadIdentityTokenRejected.__name__
+        assert await refused(entered(url, tmp_path, "stranger", "scada", PASSWORD)) != "let in"
+        plain = Client(url)
+        plain.set_user("scada")
+        plain.set_password(PASSWORD)
+        assert await refused(plain.connect()) != "let in"
+    said = capfd.readouterr()
+    assert PASSWORD not in said.out + said.err
+
+
+@pytest.mark.parametrize(
+    ("content", "words"), [(None, "cannot be read"), (b"nonsense", "cannot be used")], ids=["none", "nonsense"]
+)
+async def test_a_certificate_that_cannot_be_used_is_named(content: bytes | None, words: str, tmp_path: Path) -> None:
+    if content is not None:
+        (tmp_path / "a.der").write_bytes(content)
+    files = {"certificate_file": "a.der", "private_key_file": "a.pem"}
+    with pytest.raises(ConnectError, match=words):
+        await publish(config_of(tmp_path, publish={"opcua": files}))
+
+
+async def test_a_real_daemon_is_read_and_its_end_is_seen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = config_of(tmp_path, publish={"opcua": {"port": 0, "period_s": 0.1}})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fdhil.daemon.service.warm", lambda config, method: None)
+        async with publishing("opcua", config) as task:
+            address = (await said(task, capsys, "opc.tcp://")).rsplit(" ", 1)[1]
+            async with Client(address) as client:
+                state = await own(client, "state")
+                async with daemon_serving(config, Machine()):
+                    await read_when(state, "OFF(SHADOW)")
+                await read_when(state, None)
+
+
+async def read_when(node: Node, value: Any) -> None:
+    """Read until it is so."""
+    async with asyncio.timeout(120.0):
+        while True:
+            if (await told_of(node)).Value.Value == value:
+                return
+            await asyncio.sleep(0.02)

@@ -1,0 +1,47 @@
+"""Units of the OPC UA server, and whom its settings let in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fdhil.config.users import hashed
+from fdhil.errors import ConfigError
+from fdhil.shopfloor.opcua_security import MOST_FAILURES, Doorkeeper
+from fdhil.shopfloor.opcua_shown import UNITS, unit_of
+from fdhil.shopfloor.published import AXIS, BUS, MACHINE
+from tests.daemon.machine import config_of
+
+PASSWORD = "canary-of-the-shop-floor"
+
+
+def test_every_unit_has_a_common_code() -> None:
+    assert {item.unit for item in (*MACHINE, *AXIS, *BUS)} - {""} <= set(UNITS)
+    assert unit_of("N.m/A").UnitId == 4602160  # as OPC Foundation's table of UNECE codes has F90
+
+
+def test_guessing_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fdhil.shopfloor.opcua_security.matches", lambda user, password: password == PASSWORD)
+    door = Doorkeeper({"scada": hashed(PASSWORD, "watch")})
+    assert door.get_user(None, "scada", PASSWORD) is not None
+    for _ in range(MOST_FAILURES):
+        assert door.get_user(None, "scada", "wrong") is None
+    assert door.get_user(None, "scada", PASSWORD) is None  # not even the right one, for a while
+
+
+@pytest.mark.parametrize(
+    ("keys", "word"),
+    [
+        ({"host": "0.0.0.0"}, "users_file and a certificate_file"),
+        ({"certificate_file": "a.der"}, "private_key_file"),
+        ({"users_file": "u.json"}, "certificate_file"),
+        ({"trusted_clients": "folder"}, "certificate_file"),
+    ],
+)
+def test_no_other_computer_is_served_without_users_and_encryption(
+    keys: dict[str, Any], word: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigError, match=word):
+        config_of(tmp_path, publish={"opcua": keys})

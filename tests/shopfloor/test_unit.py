@@ -1,0 +1,19 @@
+"""The unit of the publishers: a user of its own, little to reach, and a stop that waits for the daemon's answer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fdhil.shopfloor.news import ANSWER_S
+
+UNIT = Path(__file__).parents[2] / "systemd" / "fdhil-publish@.service"
+
+
+def test_the_unit_says_what_the_publishers_rely_on() -> None:
+    lines = UNIT.read_text().splitlines()
+    settings = dict(line.split("=", 1) for line in lines if "=" in line and not line.startswith("#"))
+    assert settings["ExecStart"] == "/opt/fdhil/bin/fdhil publish %i /etc/fdhil/machine.toml"
+    assert (settings["Type"], settings["User"], settings["IPAddressAllow"]) == ("notify", "fdhil-publish", "localhost")
+    assert not {"BindsTo", "Requires", "PartOf"} & settings.keys()
+    assert settings["RestartPreventExitStatus"] == "2"
+    assert float(settings["TimeoutStopSec"]) > ANSWER_S  # a question that waits for its answer is not cut off

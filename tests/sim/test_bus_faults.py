@@ -1,0 +1,149 @@
+"""Faults of the simulated machine's bus, by script or panel: every party on the hub meets the same spoilt frames."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import can
+import pytest
+
+from fdhil.config import CanBus, parse
+from fdhil.drivers.can import bus
+from fdhil.errors import ConnectError
+from fdhil.pytest_plugin import FeedDriveBench
+from fdhil.sim import fault_script
+from fdhil.sim.frame_faults import FrameFault
+from tests.bench import bench_document
+from tests.drivers.test_ports import wait_for
+from tests.sim.bench_twin import TwinInHand
+
+STRANGER = 0x123
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[FeedDriveBench]:
+    with FeedDriveBench(tmp_path, axes="X", bus="hub", pace="lockstep") as running:
+        yield running
+
+
+def message(can_id: int, data: bytes = b"") -> can.Message:
+    return can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+
+
+def until(party: can.BusABC, can_id: int, data: bytes | None = None) -> list[can.Message]:
+    """Return what is heard up to a frame."""
+    heard: list[can.Message] = []
+    for each in party:
+        heard.append(each)
+        if each.arbitration_id == can_id and data in (None, bytes(each.data)):
+            return heard
+    raise AssertionError
+
+
+def cycles(bench: FeedDriveBench, party: can.BusABC, count: int) -> list[list[int]]:
+    """Let the NC run so many cycles; return the identifiers that were heard in each."""
+    bench.command("nc", on=True)
+    bench.wait_for("nc")
+    until(party, 0x80)
+    found = [[each.arbitration_id for each in until(party, 0x80)[:-1]] for _ in range(count)]
+    return [[can_id for can_id in cycle if can_id < 0x700] for cycle in found]
+
+
+def test_what_the_machine_sends_is_lost_delayed_and_made_up_for_everybody(bench: FeedDriveBench) -> None:
+    buses = [bench.join(), bench.join()]
+    bench.fault("bus_drop", None, can_id=0x181)
+    bench.fault("bus_inject", None, can_id=0x81, data="1032", value=3)
+    bench.fault("bus_delay", None, can_id=0x201, value=1, way="sent")
+    for party in buses:
+        heard = cycles(bench, party, 8)
+        for cycle in heard[2:]:
+            assert 0x181 not in cycle
+            assert 0x281 in cycle
+            assert cycle.count(0x81) == 3
+            assert cycle.index(0x201) < cycle.index(0x281)  # the set-point of the cycle before comes with this one
+    bench.command("nc", on=False)
+
+
+def test_what_another_sends_is_spoilt_for_the_drives_and_for_all_others_but_not_heard_by_himself(
+    bench: FeedDriveBench,
+) -> None:
+    sender, other = bench.join(), bench.join()
+    bench.fault("bus_truncate", None, can_id=STRANGER, value=1, way="received")
+    bench.fault("bus_late", None, can_id=STRANGER + 1, value=0.05)
+    for _ in range(2):
+        bench.wait_for("fault")
+    for can_id in (STRANGER, STRANGER + 1, STRANGER + 2):
+        sender.send(message(can_id, b"\1\2"))
+    heard = until(other, STRANGER + 1)
+    told = [(each.arbitration_id, bytes(each.data)) for each in heard if each.arbitration_id < 0x700]
+    assert told == [(STRANGER, b"\1"), (STRANGER + 2, b"\1\2"), (STRANGER + 1, b"\1\2")]
+    sender.send(message(0x601, bytes.fromhex("40 00 10 00 00 00 00 00")))
+    assert not [each for each in until(sender, 0x581) if STRANGER <= each.arbitration_id <= STRANGER + 2]
+
+
+def test_an_axis_means_all_frames_of_its_drive(bench: FeedDriveBench) -> None:
+    party = bench.join()
+    bench.fault("bus_drop", "X", way="received", duration_s=0.02)
+    for _ in range(3):
+        party.send(message(0x601, bytes.fromhex("40 00 10 00 00 00 00 00")))
+    assert {can_id for cycle in cycles(bench, party, 40) for can_id in cycle} >= {0x181, 0x201}
+    party.send(message(0x601, bytes.fromhex("40 18 10 01 00 00 00 00")))
+    assert bytes(until(party, 0x581)[-1].data[1:4]) == b"\x18\x10\x01"
+
+
+def test_a_bus_that_goes_down_hangs_up_and_takes_everybody_again(bench: FeedDriveBench) -> None:
+    place = CanBus(**bench.bus_arguments)
+    bench.command("nc", on=True)
+    bench.wait_for("nc")
+    with bus.CanBus("can0", place) as listening:
+        wait_for(lambda: listening.counters()["frames"] > 20)
+        bench.fault("bus_down", None, duration_s=0.1)
+        wait_for(lambda: listening.ended is not None)
+    assert "the CAN hub ended the connection" in str(listening.ended)
+    wait_for(lambda: _joins(place))
+
+
+def _joins(place: CanBus) -> bool:
+    """Whether frames are heard over a new connection."""
+    with contextlib.suppress(ConnectError), bus.CanBus("can0", place) as listening:
+        wait_for(lambda: listening.counters()["frames"] > 20 or listening.ended is not None)
+        return listening.ended is None
+    return False
+
+
+@pytest.mark.parametrize("listed", [[], ["X:2"]])
+def test_lockstep_does_not_wait_for_what_a_fault_took(listed: list[str]) -> None:
+    document = bench_document("X")
+    document["sim"] = {"pace": "lockstep", "lockstep_rpdo": listed}
+    twin = TwinInHand(parse(document))
+    twin.switch_on()
+    for _ in range(3):
+        twin.send(0x301, bytes(4))
+        twin.run(1)
+    assert twin.machine.waits()
+    twin.machine.lost("can0", 0x301)
+    assert not twin.machine.waits()
+    twin.run(1)
+    assert twin.machine.waits()  # the next one may come
+
+
+def test_what_the_page_shows_is_a_script_and_a_plan(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "rehearse-a-fault.md").read_text("utf-8")
+    (script,) = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    (tmp_path / "faults.toml").write_text(script, "utf-8")
+    entries = fault_script.load(tmp_path / "faults.toml", ("X", "Y"))
+    assert [entry.fault for entry in entries] == ["bus_drop", "bus_delay", "sensor_flipped"]
+    (program,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    told: list[str] = []
+    exec(program, {"print": lambda *words: told.append(" ".join(map(str, words)))})
+    assert told == ["0 frames were lost by plan"]
+
+
+def test_one_party_alone_meets_the_faults_of_its_own_connection(bench: FeedDriveBench) -> None:
+    party = bench.join([FrameFault("drop", can_ids={0x181}, way="received")])
+    other = bench.join()
+    assert all(0x181 not in cycle and 0x281 in cycle for cycle in cycles(bench, party, 4)[1:])
+    assert all(0x181 in cycle for cycle in cycles(bench, other, 4)[1:])

@@ -1,0 +1,160 @@
+"""Spoilt answers of the simulated Modbus units, over TCP and on a line: no wrong value is taken for the right one."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fdhil.config.sensors import ModbusPlace
+from fdhil.drivers.modbus.link import ModbusLink
+from fdhil.errors import DeviceError
+from fdhil.sim.wire.modbus_answers import ANSWER_FAULTS, answer, spoilt
+from fdhil.sim.wire.modbus_tcp import SensorServers
+from fdhil.sim.wire.sensor_faults import SensorFaults
+from fdhil.sim.wire.serial_lines import RtuUnits, SerialLines
+from tests.drivers.serial_peer import framed
+from tests.sim.test_modbus_sensor import a_sensor
+
+READ = struct.pack(">BHH", 4, 0, 2)
+
+
+class Counted:
+    """Two registers, a number of 32 bits that grows with each reading; 10 may be written."""
+
+    trigger: int | None = 10
+
+    def __init__(self) -> None:
+        self.read = 0x0001_FFF0
+
+    def words(self) -> dict[int, int]:
+        self.read += 7
+        return {0: self.read >> 16, 1: self.read & 0xFFFF, 10: 0}
+
+    def latch(self) -> None:
+        self.read = 0
+
+
+def body(registers: Counted, faults: SensorFaults) -> bytes:
+    return answer(registers, faults, READ)
+
+
+@pytest.mark.parametrize(
+    ("request_body", "code"),
+    [
+        (b"\x07", 1),
+        (b"\x04\x00", 3),
+        (struct.pack(">BHH", 3, 0, 0), 3),
+        (struct.pack(">BHH", 3, 0, 126), 3),
+        (struct.pack(">BHH", 3, 1, 2), 2),
+        (struct.pack(">BHH", 6, 11, 1), 2),
+        (struct.pack(">BHH", 6, 10, 2), 3),
+        (struct.pack(">BHHBHH", 16, 10, 2, 4, 1, 1), 2),
+    ],
+)
+def test_what_a_unit_does_not_do_is_refused_by_its_code(request_body: bytes, code: int) -> None:
+    assert answer(Counted(), SensorFaults(), request_body) == bytes([request_body[0] | 0x80, code])
+
+
+@pytest.mark.parametrize("written", [struct.pack(">BHH", 6, 10, 1), struct.pack(">BHHBH", 16, 10, 1, 2, 1)])
+def test_the_trigger_is_written_either_way(written: bytes) -> None:
+    registers = Counted()
+    assert answer(registers, SensorFaults(), written) == written[:5]
+    assert registers.read == 0
+
+
+def test_a_share_of_the_answers_is_spoilt_by_the_same_seed() -> None:
+    def pieces() -> list[list[bytes]]:
+        registers, faults = Counted(), SensorFaults(answers={"flipped": 20.0})
+        return [spoilt(faults, framed, 1, body(registers, faults)) for _ in range(500)]
+
+    registers, faults = Counted(), SensorFaults()
+    clean = [[framed(1, body(registers, faults))] for _ in range(500)]
+    assert pieces() == pieces()
+    assert sum(a != b for a, b in zip(pieces(), clean, strict=True)) == pytest.approx(100, abs=40)
+
+
+def test_a_torn_number_has_words_of_two_moments() -> None:
+    registers, faults = Counted(), SensorFaults(answers={"torn": 100.0})
+    told = [spoilt(faults, lambda _unit, data: data, 1, body(registers, faults))[0] for _ in range(4)]
+    numbers = [int.from_bytes(data[2:], "big") for data in told]
+    assert numbers == [0x1FFF7, 0x1FFFE, 0x10005, 0x2000C]  # the high word of the answer before, the low one of now
+
+
+# -- through the driver
+
+
+@pytest.fixture
+def unit(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[ModbusPlace, SensorFaults]]:
+    """A unit that is served, where it is and its faults."""
+    registers = Counted()
+    if request.param == "tcp":
+        sensor = a_sensor()
+        servers = SensorServers({"X": sensor}, {"X": ("127.0.0.1", 0)}, {"X": registers})
+        servers.start()
+        yield ModbusPlace(port=servers.ports["X"], timeout_s=0.3), sensor.faults
+        servers.stop()
+        return
+    party, faults = RtuUnits(), SensorFaults()
+    party.units[1] = registers, faults
+    lines = SerialLines({str(tmp_path / "line"): party})
+    lines.start()
+    yield ModbusPlace(device=str(tmp_path / "line"), timeout_s=0.3, baud_rate=115200), faults
+    lines.stop()
+
+
+HARMLESS = {"tcp": {"split", "stale"}, "rtu": {"noisy", "split"}}
+# TCP has a checksum of its own; an answer on a line names no request, and comes late by the sensor's slowness alone
+NOT_MET = {("tcp", "flipped"), ("rtu", "stale"), ("tcp", "torn"), ("rtu", "torn")}
+
+
+@pytest.mark.parametrize(
+    ("unit", "kind"),
+    [(wire, kind) for wire in HARMLESS for kind in ANSWER_FAULTS if (wire, kind) not in NOT_MET],
+    indirect=["unit"],
+)
+async def test_an_answer_that_is_spoilt_is_got_over_or_told_and_the_next_one_is_right(
+    kind: str, unit: tuple[ModbusPlace, SensorFaults]
+) -> None:
+    place, faults = unit
+    wire = "rtu" if place.device else "tcp"
+    link = ModbusLink("sensor", place)
+    await link.connect()
+    before = await number(link)
+    faults.answers[kind] = 100.0
+    if kind in HARMLESS[wire]:
+        assert before < await number(link) < before + 100
+    else:
+        with pytest.raises(DeviceError, match="sensor"):
+            await number(link)
+    faults.answers.clear()
+    for _ in range(3):
+        with contextlib.suppress(DeviceError):
+            await link.connect()
+            assert before < await number(link) < before + 200
+            break
+    else:
+        raise AssertionError(kind)
+    link.close()
+
+
+async def number(link: ModbusLink) -> int:
+    high, low = await link.read_input(0, 2)
+    return high << 16 | low
+
+
+def test_whoever_speaks_no_modbus_is_let_go() -> None:
+    servers = SensorServers({"X": a_sensor()}, {"X": ("127.0.0.1", 0)})
+    servers.start()
+    try:
+        for nonsense in (b"GET / HTTP/1.1\r\n\r\n", bytes(7), b"\0\1\0\0\xff\xff\1"):
+            with socket.create_connection(("127.0.0.1", servers.ports["X"]), 60.0) as client:
+                client.sendall(nonsense)
+                with contextlib.suppress(ConnectionError):
+                    assert client.recv(100) == b""
+    finally:
+        servers.stop()

@@ -1,0 +1,127 @@
+"""The audit: each line is chained to the one before, and every change of the file is seen."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fdhil.errors import StoreError
+from fdhil.store import audit
+
+ENTRIES = [{"asked": "arm", "program": f"part{number}.ngc"} for number in range(4)]
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> Path:
+    for entry in ENTRIES:
+        audit.append(tmp_path, entry)
+    return tmp_path
+
+
+def wrong(folder: Path) -> list[int]:
+    """Return the numbers of the lines that are not as they were written."""
+    return [number for number, (_, fault) in enumerate(audit.entries(folder)) if fault]
+
+
+def test_what_is_written_is_read_and_the_file_is_not_for_everybody(written: Path) -> None:
+    read = list(audit.entries(written))
+    assert [entry["program"] for entry, fault in read if fault is None] == [entry["program"] for entry in ENTRIES]
+    assert (written / audit.FILE_NAME).stat().st_mode & 0o007 == 0
+
+
+def test_a_folder_without_an_audit_has_no_entries(tmp_path: Path) -> None:
+    assert list(audit.entries(tmp_path)) == []
+
+
+def _changed(lines: list[bytes]) -> list[bytes]:
+    return [lines[0], lines[1].replace(b"part1", b"part9"), *lines[2:]]
+
+
+CHANGES = {
+    "a line changed": (_changed, [1]),
+    "a line left out": (lambda lines: [lines[0], *lines[2:]], [1]),
+    "two lines exchanged": (lambda lines: [lines[0], lines[2], lines[1], lines[3]], [1, 2, 3]),
+    "the first left out": (lambda lines: lines[1:], [0]),
+    "a line twice": (lambda lines: [*lines[:2], lines[1], *lines[2:]], [2]),
+    "nonsense between": (lambda lines: [*lines[:2], b"\xff{[", *lines[2:]], [2, 3]),
+}
+
+
+@pytest.mark.parametrize("name", list(CHANGES))
+def test_every_change_of_the_file_is_seen(name: str, written: Path) -> None:
+    change, expected = CHANGES[name]
+    path = written / audit.FILE_NAME
+    path.write_bytes(b"\n".join(change(path.read_bytes().splitlines())) + b"\n")
+    assert wrong(written) == expected
+
+
+@pytest.mark.fault("F1")
+def test_a_line_cut_off_at_any_byte_is_told_and_the_next_one_stands(written: Path) -> None:
+    path = written / audit.FILE_NAME
+    whole = path.read_bytes()
+    begin = len(whole.rstrip(b"\n").rpartition(b"\n")[0]) + 1
+    for size in range(begin + 1, len(whole) - 1):
+        path.write_bytes(whole[:size])
+        audit.append(written, {"asked": "disarm"})
+        assert wrong(written) == [3], size
+        assert list(audit.entries(written))[4] == ({**list(audit.entries(written))[4][0], "asked": "disarm"}, None)
+
+
+def test_writers_of_two_processes_make_one_chain(tmp_path: Path) -> None:
+    code = "import sys; from pathlib import Path; from fdhil.store import audit\n"
+    code += "for k in range(50): audit.append(Path(sys.argv[1]), {'asked': 'arm', 'number': k})"
+    writers = [subprocess.Popen([sys.executable, "-c", code, str(tmp_path)]) for _ in range(2)]
+    assert [writer.wait(60) for writer in writers] == [0, 0]
+    assert len(list(audit.entries(tmp_path))) == 100
+    assert wrong(tmp_path) == []
+
+
+@pytest.mark.fault("F3", "F4")
+@pytest.mark.parametrize(
+    ("call", "number", "code"), [("write", errno.ENOSPC, "DiskFull"), ("fsync", errno.EIO, "StoreFault")]
+)
+def test_a_disk_that_refuses_is_told(
+    call: str, number: int, code: str, written: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuses(*_: object) -> int:
+        raise OSError(number, os.strerror(number))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, call, refuses)
+        with pytest.raises(StoreError) as refused:
+            audit.append(written, {"asked": "arm"})
+    assert refused.value.code == code
+    audit.append(written, {"asked": "arm"})
+    assert wrong(written) == []
+
+
+def test_a_link_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / audit.FILE_NAME).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(StoreError):
+        audit.append(tmp_path, {"asked": "arm"})
+    assert not (tmp_path / "elsewhere").exists()
+
+
+def test_a_long_line_does_not_hide_the_one_that_follows(tmp_path: Path) -> None:
+    for length in (10, 100_000, 20_000):
+        audit.append(tmp_path, {"asked": "x" * length})
+        audit.append(tmp_path, {"asked": "arm"})
+    assert wrong(tmp_path) == []
+
+
+def test_who_keeps_the_audit_locked_delays_it_and_then_it_is_told(
+    written: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(audit, "LOCKED_S", 0.05)
+    with (written / audit.FILE_NAME).open() as reader:  # whoever may read it may lock it, too
+        fcntl.flock(reader, fcntl.LOCK_EX)
+        with pytest.raises(StoreError, match="another process has kept it locked"):
+            audit.append(written, {"asked": "arm"})
+    audit.append(written, {"asked": "arm"})
+    assert len(list(audit.entries(written))) == len(ENTRIES) + 1

@@ -1,0 +1,80 @@
+"""A name from outside opens a regular file of the one folder, or nothing."""
+
+from __future__ import annotations
+
+import os
+import socket
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from fdhil.errors import StoreError
+from fdhil.store.named_file import open_named
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with one file, beside a secret, and with all that may stand in a file's place."""
+    top = tmp_path_factory.mktemp("store")
+    (top / "secret").write_bytes(b"the key")
+    inside = top / "windows"
+    (inside / "deeper").mkdir(parents=True)
+    (inside / "w00000001-X.parquet").write_bytes(b"a rapid")
+    (inside / "link").symlink_to(top / "secret")
+    (inside / "dangling").symlink_to(top / "nothing")
+    os.mkfifo(inside / "pipe")
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(os.path.relpath(inside / "socket"))
+    return inside
+
+
+def test_a_file_of_the_folder_is_opened(folder: Path) -> None:
+    with open_named(folder, "w00000001-X.parquet") as file:
+        assert file.read() == b"a rapid"
+
+
+@pytest.mark.fault("G4")
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../secret", "..", ".", "", "/etc/passwd", "deeper/../../secret", "..\\secret", "w1\0.parquet", "w1.parquet\n",
+        "a" * 65, "ä.parquet", "%2e%2e", "~", ".w1.parquet.part", "link", "dangling", "deeper", "pipe", "socket",
+    ],
+)  # fmt: skip
+def test_what_is_no_name_or_no_regular_file_is_not_opened(folder: Path, name: str) -> None:
+    with pytest.raises(StoreError) as refused:
+        open_named(folder, name)
+    assert refused.value.code == "BadName"
+    assert "nothing was read" in str(refused.value)
+    assert str(folder) not in str(refused.value)
+
+
+@pytest.mark.fault("G4")
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=200)
+@given(name=st.text(max_size=80) | st.text(alphabet="./\\%2eE0wX-\0", max_size=12))
+def test_no_name_reaches_another_file(folder: Path, name: str) -> None:
+    assert _content_or_code(folder, name) in {b"a rapid", "BadName", "NotKept"}
+
+
+def _content_or_code(folder: Path, name: str) -> bytes | str:
+    try:
+        with open_named(folder, name) as file:
+            return file.read()
+    except StoreError as error:
+        return error.code
+
+
+@pytest.mark.fault("G4")
+def test_the_folder_itself_may_be_missing_or_a_file(folder: Path) -> None:
+    for place in (folder / "nowhere", folder / "w00000001-X.parquet"):
+        with pytest.raises(StoreError) as refused:
+            open_named(place, "w00000001-X.parquet")
+        assert refused.value.code == "NotKept"
+
+
+def test_a_file_that_the_oldest_went_with_says_so(folder: Path) -> None:
+    with pytest.raises(StoreError, match="keep_windows") as refused:
+        open_named(folder, "w00000002-X.parquet")
+    assert refused.value.code == "NotKept"

@@ -1,0 +1,89 @@
+"""Every class that an operator may read has effect and next action in the documents, and its cause where it arises."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+import fdhil
+from fdhil.daemon.notice_words import WORDS
+from fdhil.guard.interlocks import CATALOGUE, EFFECT
+from tests.fault_matrix import ROWS, TOLD_OTHERWISE
+
+PRODUCT = Path(fdhil.__file__).parent
+DOCS = PRODUCT.parent / "docs"
+PAGES = ("reference/refusals.md", "reference/guard.md", "reference/notices.md", "reference/errors.md",
+         "explanation/verdicts.md")  # fmt: skip
+# what takes a class, a cause and a next action, in this order (a doctor's trouble: class, place, cause, effect, action)
+CALLS = {"refusal": 3, "Refused": 4, "NotAcknowledged": 3, "Reason": 3, "Trouble": 5}
+CLASS = re.compile(r"[A-Z][a-z]+[A-Za-z]*(\(\w+\))?")
+
+
+@cache
+def calls() -> tuple[tuple[str, str, int, bool], ...]:
+    """Return class, place and count of the words of each call, and whether its last word says something."""
+    return tuple(_calls())
+
+
+def _calls() -> Iterator[tuple[str, str, int, bool]]:
+    for path in sorted(PRODUCT.rglob("*.py")):
+        tree = ast.parse(path.read_text("utf-8"))
+        named = {
+            target.id: node.value.value
+            for node in ast.walk(tree)
+            if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant)
+            for target in node.targets
+            if isinstance(target, ast.Name)
+        }
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call) and _name(node) in CALLS:
+                words = [word for word in node.args if not isinstance(word, ast.Constant) or word.value is not False]
+                first = words[1 if _name(node) == "Refused" else 0] if len(words) > 1 else None
+                code = first.value if isinstance(first, ast.Constant) else named.get(getattr(first, "id", ""))
+                if isinstance(code, str) and CLASS.fullmatch(code):
+                    last = words[-1]
+                    says = not (isinstance(last, ast.Constant) and not last.value)
+                    yield code.partition("(")[0], f"{path.name}:{node.lineno}", len(words) - CALLS[_name(node)], says
+
+
+def _name(call: ast.Call) -> str:
+    return call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+
+
+def documented() -> set[str]:
+    """Return the classes that begin a row of a table, whose other cells are not empty."""
+    found: set[str] = set()
+    for page in PAGES:
+        for line in (DOCS / page).read_text("utf-8").splitlines():
+            cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line.strip("|"))] if line.startswith("| `") else []
+            if len(cells) > 1 and all(cells):
+                found |= {word.partition("(")[0] for word in re.findall(r"`([A-Z]\w+[^`]*)`", cells[0])}
+    return found
+
+
+def test_each_refusal_tells_class_cause_and_next_action() -> None:
+    short = [f"{place} {code}" for code, place, left, says in calls() if left < 0 or not says]
+    assert short == []
+
+
+@pytest.mark.goal("R19")
+def test_every_class_is_in_the_documents_with_effect_and_next_action(
+    record_property: Callable[[str, object], None],
+) -> None:
+    told = {code for code, *_ in calls()} | CATALOGUE.keys() | WORDS.keys()
+    told |= {name for row in ROWS.values() if row.id not in TOLD_OTHERWISE for name in row.classes}
+    assert sorted(told - documented()) == []
+    assert all(map(all, WORDS.values()))
+    assert all(cause and action and EFFECT[reaction] for reaction, cause, action in CATALOGUE.values())
+    record_property("goal", f"{len(told)} classes, each with cause, effect and next action, all in the documents")
+
+
+@pytest.mark.goal("R19")
+def test_no_class_is_documented_that_there_is_not() -> None:
+    product = "\n".join(path.read_text("utf-8") for path in PRODUCT.rglob("*.py"))
+    assert [name for name in sorted(documented()) if name not in product] == []

@@ -1,0 +1,57 @@
+"""The study of mistakes: it makes them, puts them where they are said to be, and is told by a test that fails."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+from studies import mutants
+from studies.mutation import Mutant, function_of, of_code, of_values, put
+from studies.trial import UNCALLED, UNNOTICED
+
+ROOT = Path(__file__).parent.parent
+LIMITS = "fdhil.guard.limits"
+
+
+def test_the_mistakes_of_a_module_are_those_of_its_functions_properties_tables_and_constants() -> None:
+    import_module("fdhil.guard.core")  # only what is loaded is searched for who reads a table
+    code = {mutant.name for mutant in of_code(LIMITS)}
+    assert "limits.clamp: return min(max(value, low), high) -> return min(max(value, low), None)" in code
+    assert "limits.Travel.total: return self.current + sum(self.past) -> return self.current - sum(self.past)" in code
+    assert "limits.CEILING_OFFSET_UM: 250 -> 251" in {mutant.name for mutant in of_values(LIMITS)}
+    assert not {mutant.place for mutant in of_values("fdhil.guard.transitions")} & {"SENT", "TRANSITIONS"}
+    rows = {mutant.name for mutant in of_values("fdhil.guard.interlocks")}
+    assert "interlocks.CATALOGUE: BusOff: FREEZE -> REFUSE" in rows
+    assert "interlocks.FACTS: model_fresh -> no such row" in rows
+    predicates = {mutant.place for mutant in of_code("fdhil.guard.conditions")}
+    assert "AXIS_INTERLOCKS[StaleData]" in predicates
+
+
+def test_a_mistake_replaces_what_others_have_imported() -> None:
+    from fdhil.guard.limits import clamp
+
+    turned = Mutant(LIMITS, "clamp", "", "", "def clamp(value, low, high):\n    return max(max(value, low), high)\n")
+    function, code = clamp, function_of(LIMITS, "clamp").__code__
+    try:
+        put(turned)
+        assert function(5, 1, 3) == 5
+    finally:
+        clamp.__code__ = code
+    assert function(5, 1, 3) == 3
+
+
+def test_mistakes_are_noticed_by_tests_that_call_the_place(tmp_path: Path) -> None:
+    """The study itself, on a small module: what a test calls and checks is noticed, what none calls is said so."""
+    options = ["--modules", "requests", "--every", "12", "--tests", "tests/guard/test_requests.py"]
+    command = [sys.executable, "-m", "studies.mutants", *options, "--out", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    figures = json.loads((tmp_path / "mutants.json").read_text("utf-8"))["figures"]
+    noticed, total = mutants.sums(figures["modules"], "code")
+    assert 0.3 * total < noticed < total
+    assert {row["result"] for row in figures["left"]} == {UNNOTICED, UNCALLED}
+    assert not figures["goals"]["R11"]["met"]
+    assert (tmp_path / "mutants.md").read_text("utf-8").startswith("# What the guard's tests notice")

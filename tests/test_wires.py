@@ -1,0 +1,74 @@
+"""The study of spoilt wires, short: no wrong value, every loss counted; and it would notice if it were otherwise."""
+
+from __future__ import annotations
+
+import pytest
+
+from fdhil.drivers.can import sdo
+from fdhil.drivers.cia402.pdo_queue import Dense
+from fdhil.drivers.modbus import rtu_line
+from studies import wires
+from studies.late_answers import modbus, sdo_reads
+
+
+@pytest.mark.fault("B3", "B4", "B6", "B7", "B8")
+def test_no_stale_or_spoilt_answer_of_a_serial_unit_is_taken() -> None:
+    seen = modbus(3000, 11, 2.0, wires.SPOILT, 0.3)
+    assert seen["wrong"] == 0
+    assert seen["late"] > 300
+    assert seen["answered"] > 1000
+    for kind in ("ModbusCrc", "ModbusShape", "ModbusUnit", "ModbusStale"):
+        assert seen[kind] > 30, kind
+
+
+def test_answers_that_are_asked_for_again_within_noise_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rtu_line, "is_damaged", lambda *_: True)
+    assert modbus(3000, 11, 2.0, wires.SPOILT, 0.3)["wrong"] > 0
+
+
+@pytest.mark.fault("A26")
+def test_no_late_answer_of_an_sdo_server_is_taken() -> None:
+    seen = sdo_reads(1500, 11, 1.45)
+    assert seen["wrong"] == 0
+    assert seen["late"] > 300
+    assert seen["answered"] > 1000
+
+
+def test_a_server_that_is_not_heard_out_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sdo, "QUIET_S", 0.0)
+    assert sdo_reads(1500, 11, 1.45)["wrong"] > 0
+
+
+@pytest.mark.parametrize("kind", ["stale", "too_many"])
+def test_over_tcp_an_answer_belongs_to_its_question(kind: str) -> None:
+    seen = wires.over_tcp(40, kind)
+    assert seen["wrong"] == 0
+    assert seen["answered"] > 10
+
+
+@pytest.mark.fault("A6", "A10")
+@pytest.mark.parametrize("name", wires.LOSSES)
+def test_every_lost_frame_is_counted_and_leaves_no_value_of_another_row(name: str) -> None:
+    seen = wires.losses(20_000, 5, wires.LOSSES[name], 5.0)
+    assert seen["reported"] == seen["lost"] > 150
+    assert (seen["misplaced"], seen["late"]) == (0, 0)
+    assert seen["rows"] > 1000
+
+
+def test_a_value_of_another_row_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Dense, "certain", lambda self, between: self.present)
+    assert wires.losses(60_000, 5, wires.LOSSES["any of the three"], 5.0)["misplaced"] > 0
+
+
+def test_the_goals_follow_from_the_counts() -> None:
+    counts = {"frames": 100, "lost": 2, "reported": 2}
+    good = [["SYNC", 1.0, counts]]
+    promised = {"a": {"late": 9, "spoilt": 3, "wrong": 0}, wires.SDO: {"late": 4, "wrong": 0}}
+    assert wires.goals(promised, good) == {
+        "R8": {"met": True, "figure": "0 of 9 stale and 3 wrong Modbus answers and 4 stale SDO answers taken"},
+        "R9": {"met": True, "figure": "2 reported of 2 lost among 100 frames"},
+    }
+    for bad in ({"reported": 1}, {"misplaced": 1}):
+        found = wires.goals({"a": {"wrong": 1}}, [["SYNC", 1.0, counts | bad]])
+        assert not found["R8"]["met"]
+        assert not found["R9"]["met"]

@@ -1,0 +1,85 @@
+"""Clients of the pages without a network: the real application, asked as a browser, a script or a stranger asks."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import httpx
+from fastapi import FastAPI
+
+from fdhil import config as machine_config
+from fdhil.config import MachineConfig
+from fdhil.config.users import Role, User, hashed, write_users
+from fdhil.daemon.control import SOCKET_NAME, ControlServer
+from fdhil.daemon.peers import Peer
+from fdhil.web.access import Access
+from fdhil.web.app import make_app
+from tests.daemon.machine import config_of
+
+PASSWORD = "canary-9b1f-password"
+OWN = {"X-Fdhil": "1"}
+
+
+@cache
+def user(role: Role) -> User:
+    """Return a user of a role; all have one password, hashed once."""
+    return hashed(PASSWORD, role)
+
+
+def machine_of(folder: Path, users: bool = True, **web: Any) -> MachineConfig:
+    """Return the bench's configuration with its pages; with ``users`` a "watcher" and an "operator" may log in."""
+    if users:
+        write_users(folder / "users.json", {"watcher": user("watch"), "operator": user("operate")})
+        web = {"users_file": "users.json", **web}
+    return config_of(folder, web=web)
+
+
+@asynccontextmanager
+async def client_of(app: FastAPI, name: str = "", **headers: str) -> AsyncIterator[httpx.AsyncClient]:
+    """Yield a client; with a ``name`` it has logged in."""
+    transport = httpx.ASGITransport(app, raise_app_exceptions=False)
+    async with httpx.AsyncClient(transport=transport, base_url="http://localhost", headers=headers) as client:
+        if name:
+            client.headers["Authorization"] = f"Bearer {token_for(app, name)}"
+        yield client
+
+
+def token_for(app: FastAPI, name: str) -> str:
+    """Return a token as a login gives it, without the tenth of a second that the password takes."""
+    access: Access = app.state.context.access
+    return access.begin(name, user("operate" if name == "operator" else "watch"))[0]
+
+
+async def log_in(client: httpx.AsyncClient, name: str, password: str = PASSWORD) -> str:
+    """Return a token."""
+    answer = await client.post("/api/session", json={"name": name, "password": password}, headers=OWN)
+    assert answer.status_code == 200, answer.text
+    return str(answer.json()["token"])
+
+
+@asynccontextmanager
+async def daemon_that(
+    config: MachineConfig, answer: Callable[[Mapping[str, Any]], Any], abandon: Callable[[], object] = lambda: None
+) -> AsyncIterator[list[Mapping[str, Any]]]:
+    """Serve the daemon's own socket with answers of the test's; yield the requests that came."""
+    asked: list[Mapping[str, Any]] = []
+
+    async def handle(request: Mapping[str, Any], peer: Peer) -> Mapping[str, Any]:
+        asked.append(request)
+        told = answer(request)
+        return await told if asyncio.iscoroutine(told) else told  # type: ignore[no-any-return]
+
+    config.run_directory.mkdir(parents=True, exist_ok=True)
+    server = ControlServer(handle, lambda: {"checked_s": 1.0}, abandon, machine_config.Access())
+    async with server.serving(config.run_directory / SOCKET_NAME):
+        yield asked
+
+
+def app_of(folder: Path, **web: Any) -> FastAPI:
+    """Return the application of a machine with users, none of whose daemons runs."""
+    return make_app(machine_of(folder, **web))

@@ -1,0 +1,48 @@
+"""What the browser's tests share: the stage with all its processes, chromium, and an empty tab."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import pytest
+
+RAPIDS = 24  # of each axis: a fortnight
+pytest.register_assert_rewrite("tests.web.tab")
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+    from tests.web.stage import Stage
+    from tests.web.tab import Tab
+
+
+@pytest.fixture(scope="package")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
+    """Twin, guard, daemon and ``fdhil web`` as processes; the NC is on, weeks of history are behind them."""
+    from tests.web.stage import opened
+
+    with opened(tmp_path_factory.mktemp("stage"), RAPIDS) as stage:
+        yield stage
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Browser]:
+    """Debian's chromium without a window."""
+    from playwright.sync_api import sync_playwright
+
+    from tests.web.tab import started
+
+    with sync_playwright() as playwright:
+        browser = started(playwright)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def tab(stage: Stage, chromium: Browser) -> Iterator[Tab]:
+    """An empty tab of a wide window; what it asked for and said is looked at when it closes."""
+    from tests.web.tab import opened
+
+    with opened(chromium, stage.url) as tab:
+        yield tab

@@ -1,0 +1,153 @@
+"""A page in a real browser, with all that it asked for and said; what it must never do is looked at when it closes."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from playwright.sync_api import Browser, ConsoleMessage, Page, Playwright
+
+CHROMIUM = "/usr/bin/chromium"
+AXE = Path(__file__).parents[1] / "foreign" / "node_modules" / "axe-core" / "axe.min.js"
+PATIENCE_MS = 120_000.0
+WIDE, NARROW = (1280, 800), (390, 844)
+LOADING = "Loading"
+READY = "main:not([aria-busy=true]):has(h1)"
+TAGS = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
+TOKEN_KEY = "fdhil-token"
+LABELS = """() => [...document.querySelectorAll("h1, h2, h3, caption, th, button, label, legend, summary, nav a")]
+  .filter((e) => e.checkVisibility({ opacityProperty: true, visibilityProperty: true }) && e.textContent.trim())
+  .map((e) => `${e.tagName} ${e.textContent.trim()}`)"""
+MOST_TABS = 80
+# what has the focus, and whether that is seen: at the body nothing has it, the main part is only where a link leads
+FOCUS = """() => {
+  const at = document.activeElement, style = getComputedStyle(at);
+  const label = at.getAttribute("aria-label") ?? at.labels?.[0]?.textContent ?? at.textContent;
+  const drawn = style.outlineStyle !== "none" && parseFloat(style.outlineWidth) >= 2;
+  const seen = drawn || at === document.body || at.id === "main";
+  return { name: label.trim(), seen, tag: at.outerHTML.slice(0, 200) };
+}"""
+# what stands beyond the right edge of a window that cannot be scrolled to both sides; a figure may scroll in itself
+WIDER = """() => {
+  const seen = document.documentElement.clientWidth;
+  const scrolls = (e) => e && e !== document.documentElement
+    && (/auto|scroll|hidden/.test(getComputedStyle(e).overflowX) || scrolls(e.parentElement));
+  const out = [...document.querySelectorAll("body *")].filter((e) => {
+    const box = e.getBoundingClientRect();
+    return box.width > 1 && box.height > 1 && box.right > seen + 1 && !scrolls(e.parentElement);
+  });
+  const told = out.slice(0, 5).map((e) => `${e.tagName}.${e.className} ${e.textContent.trim().slice(0, 40)}`);
+  return { page: document.documentElement.scrollWidth - seen, told };
+}"""
+
+
+def started(playwright: Playwright) -> Browser:
+    """Start Debian's chromium."""
+    return playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+
+
+@dataclass
+class Tab:
+    """A page at ``base``; ``expected`` are patterns of what it may write to the console as an error."""
+
+    page: Page
+    base: str
+    asked: list[str] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)
+    expected: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.page.set_default_timeout(PATIENCE_MS)
+        self.page.on("request", lambda request: self.asked.append(request.url))
+        self.page.on("websocket", lambda opened: self.asked.append(opened.url))
+        self.page.on("console", self._hear)
+        self.page.on("pageerror", lambda error: self.errors.append(f"exception: {error}"))
+
+    def _hear(self, message: ConsoleMessage) -> None:
+        if message.type in ("error", "warning"):
+            self.errors.append(f"{message.type}: {message.text} ({message.location.get('url', '')})")
+
+    def open(self, path: str) -> None:
+        """Go to a page and wait until its content is there."""
+        self.page.goto(self.base + path)
+        self.ready()
+
+    def ready(self) -> None:
+        """Wait until the content of the page is there."""
+        self.page.locator(READY).filter(has_not_text=LOADING).wait_for()
+
+    def log_in(self, token: str) -> None:
+        """Let every page that is opened from now on have this login."""
+        self.page.add_init_script(f"sessionStorage.setItem({TOKEN_KEY!r}, {token!r})")
+
+    def word(self, key: str, **values: str) -> str:
+        """Return what the page says for a key of its words."""
+        told = f"import('/static/text.js').then((m) => m.t({json.dumps(key)}, {json.dumps(values)}))"
+        return str(self.page.evaluate(told))
+
+    def says(self, where: str, text: str) -> None:
+        """Wait until the place ``where`` (a selector) says ``text``."""
+        self.page.locator(where).filter(has_text=text).first.wait_for()
+
+    def slow(self, bytes_per_s: int, latency_ms: int = 300) -> None:
+        """Let the page have a network of this kind from now on; 0 is one without bounds."""
+        session = self.page.context.new_cdp_session(self.page)
+        session.send("Network.enable")
+        bound = bytes_per_s or -1
+        conditions = {"offline": False, "latency": latency_ms if bytes_per_s else 0}
+        speeds = {"downloadThroughput": bound, "uploadThroughput": bound}
+        session.send("Network.emulateNetworkConditions", {**conditions, **speeds})
+
+    def tab_to(self, name: str) -> None:
+        """Press Tab until the button, link or field of that name has the focus, and can be seen to have it."""
+        for _ in range(MOST_TABS):
+            self.page.keyboard.press("Tab")
+            found = self.page.evaluate(FOCUS)
+            assert found["seen"], found
+            if found["name"] == name:
+                return
+        raise AssertionError(f"Tab does not come to {name!r}")
+
+    def labels(self) -> set[str]:
+        """Return the headings, heads of tables, buttons and labels that can be seen."""
+        return set(self.page.evaluate(LABELS))
+
+    def violations(self, *rules: str) -> list[str]:
+        """Return what axe finds against the page, or what these of its rules do, one line each with the places."""
+        self.page.evaluate(AXE.read_text("utf-8"))
+        only = {"type": "rule", "values": rules} if rules else {"type": "tag", "values": TAGS}
+        options = json.dumps({"runOnly": only, "resultTypes": ["violations"]})
+        found: list[dict[str, Any]] = self.page.evaluate(f"axe.run(document, {options}).then((r) => r.violations)")
+        return [f"{one['id']}: {one['help']}: {[node['html'][:160] for node in one['nodes']][:4]}" for one in found]
+
+    def wider(self) -> list[str]:
+        """Return what stands out to the right of the window; empty where nobody has to scroll to both sides."""
+        found = self.page.evaluate(WIDER)
+        return [*found["told"], *([f"the page by {found['page']} px"] if found["page"] > 1 else [])]
+
+    def foreign(self) -> list[str]:
+        """Return the requests that left the server's own address."""
+        home = urlsplit(self.base).netloc
+        local = ("data:", "blob:", "about:")
+        return [url for url in self.asked if not url.startswith(local) and urlsplit(url).netloc != home]
+
+    def unexpected(self) -> list[str]:
+        """Return what was written to the console as error or warning, but for what is ``expected``."""
+        return [error for error in self.errors if not any(re.search(known, error) for known in self.expected)]
+
+
+@contextmanager
+def opened(browser: Browser, base: str, size: tuple[int, int] = WIDE, **options: Any) -> Iterator[Tab]:
+    """Open an empty page with a storage of its own; closing it asserts what no page may do."""
+    with browser.new_context(viewport={"width": size[0], "height": size[1]}, **options) as context:
+        tab = Tab(context.new_page(), base)
+        yield tab
+        tab.page.close()
+    assert tab.foreign() == []
+    assert tab.unexpected() == []

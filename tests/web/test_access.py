@@ -1,0 +1,182 @@
+"""Who may ask for what: the parts, without HTTP."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fdhil.config.users import User, matches, read_users, write_users
+from fdhil.errors import ConfigError
+from fdhil.web.access import FREE_GUESSES, IDLE_S, LIFE_S, LONGEST_WAIT_S, MOST_TOKENS, Access, Asker, place_of
+from fdhil.web.answers import Refused
+from tests.web.clients import PASSWORD, user
+
+
+class Clock:
+    """A clock that stands until it is moved."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def access(tmp_path: Path, clock: Clock) -> Access:
+    write_users(tmp_path / "users", {"ann": user("watch"), "op": user("operate")})
+    return Access(tmp_path / "users", clock)
+
+
+def test_a_password_fits_its_user_and_nobody_else() -> None:
+    assert matches(user("operate"), PASSWORD)
+    assert not matches(user("operate"), PASSWORD + "x")
+    assert not matches(None, PASSWORD)
+
+
+def test_the_users_file_holds_no_password_and_is_closed_to_others(tmp_path: Path) -> None:
+    path = tmp_path / "users"
+    write_users(path, {"op": user("operate")})
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert PASSWORD.encode() not in path.read_bytes()
+    path.chmod(0o640)
+    write_users(path, {"op": user("operate"), "ann": user("watch")})
+    assert path.stat().st_mode & 0o777 == 0o640  # the group of fdhil web may read it
+    assert sorted(read_users(path)) == ["ann", "op"]
+    assert [p.name for p in tmp_path.iterdir()] == ["users"]
+    path.chmod(0o644)
+    with pytest.raises(ConfigError, match=r"open to every user of this computer \(chmod 0640"):
+        read_users(path)
+
+
+@pytest.mark.parametrize("text", ["", "{", '{"users": {"op": {"role": "root", "salt": "c2VjcmV0", "scrypt": "x"}}}'])
+def test_a_faulty_users_file_is_told_without_its_content(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "users"
+    path.write_text(text)
+    path.chmod(0o600)
+    with pytest.raises(ConfigError, match="is no users file") as told:
+        Access(path)
+    assert "c2VjcmV0" not in str(told.value)
+
+
+async def test_a_login_ends_by_its_time_by_idleness_and_by_logging_out(access: Access, clock: Clock) -> None:
+    token, session = await access.log_in("op", PASSWORD, "127.0.0.1")
+    assert session.asker == access.asker(token) == Asker("op", "operate")
+    for _ in range(int(LIFE_S / IDLE_S) + 1):
+        clock.now_s += IDLE_S - 1
+        if clock.now_s - 1000.0 < LIFE_S:
+            assert access.asker(token) is not None
+    assert access.asker(token) is None  # used all the time, and over all the same
+    token, _ = access.begin("op", user("operate"))
+    clock.now_s += IDLE_S
+    assert access.asker(token) is None
+    token, _ = access.begin("op", user("operate"))
+    access.log_out(token)
+    assert access.asker(token) is None
+
+
+def test_a_user_who_is_taken_out_or_given_another_role_has_no_old_rights(access: Access, tmp_path: Path) -> None:
+    tokens = [access.begin("op", user("operate"))[0], access.begin("ann", user("watch"))[0]]
+    write_users(tmp_path / "users", {"op": user("watch")})
+    assert [access.asker(token) for token in tokens] == [None, None]
+    assert access.asker(access.begin("op", user("watch"))[0]) == Asker("op", "watch")
+    (tmp_path / "users").unlink()
+    assert access.asker(access.begin("op", user("watch"))[0]) is None
+
+
+@pytest.mark.parametrize("token", [None, "", "x", "é", "a" * 100_000])
+def test_what_is_no_token_is_nobody(access: Access, token: str | None) -> None:
+    assert access.asker(token) is None
+
+
+def test_tokens_are_kept_as_digests_and_only_so_many(access: Access) -> None:
+    tokens = [access.begin("ann", user("watch"))[0] for _ in range(MOST_TOKENS + 1)]
+    assert access.asker(tokens[0]) is None
+    assert access.asker(tokens[-1]) is not None
+    kept = repr(vars(access))
+    assert tokens[-1] not in kept
+    assert hashlib.sha256(tokens[-1].encode()).hexdigest() in kept
+
+
+async def test_guesses_are_slowed_down_by_user_and_by_address(
+    access: Access, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked: list[str] = []
+
+    def fits(_: User | None, password: str) -> bool:
+        looked.append(password)
+        return password == PASSWORD
+
+    monkeypatch.setattr("fdhil.web.access.matches", fits)
+    for k in range(FREE_GUESSES):
+        with pytest.raises(Refused, match="name or password is wrong"):
+            await access.log_in("op", f"guess {k}", "192.0.2.1")
+    with pytest.raises(Refused, match="too many logins failed") as told:
+        await access.log_in("op", PASSWORD, "192.0.2.2")  # elsewhere, the same user
+    assert told.value.status == 429
+    with pytest.raises(Refused, match="too many"):
+        await access.log_in("ann", PASSWORD, "192.0.2.1")  # the same place, another user
+    assert len(looked) == FREE_GUESSES  # a refused one costs nothing
+    clock.now_s += LONGEST_WAIT_S
+    await access.log_in("op", PASSWORD, "192.0.2.2")
+    await access.log_in("op", PASSWORD, "192.0.2.2")  # and all is forgotten
+
+
+async def test_a_name_that_there_is_not_costs_as_much_as_a_wrong_password(
+    access: Access, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hashes: list[int] = []
+    real = hashlib.scrypt
+
+    def counted(password: bytes, **settings: Any) -> bytes:
+        hashes.append(settings["n"])
+        return real(password, **settings)
+
+    monkeypatch.setattr("hashlib.scrypt", counted)
+    told = []
+    for name in ("op", "nobody"):
+        with pytest.raises(Refused) as refused:
+            await access.log_in(name, "a wrong one", "127.0.0.1")
+        told.append(refused.value.document)
+    assert told[0] == told[1]
+    assert hashes[0] == hashes[1] == 2**15
+
+
+async def test_a_stranger_does_not_lock_out_who_has_logged_in_where_he_is(
+    access: Access, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fdhil.web.access.matches", lambda _, password: password == PASSWORD)
+    await access.log_in("op", PASSWORD, "192.0.2.1")
+    for k in range(FREE_GUESSES):
+        with pytest.raises(Refused, match="name or password is wrong"):
+            await access.log_in("op", "a guess", f"198.51.100.{k}")
+    with pytest.raises(Refused, match="too many"):
+        await access.log_in("op", PASSWORD, "198.51.100.77")  # where he never was
+    await access.log_in("op", PASSWORD, "192.0.2.1")
+    for _ in range(FREE_GUESSES):
+        with pytest.raises(Refused, match="name or password is wrong"):
+            await access.log_in("op", "a guess", "192.0.2.1")
+    with pytest.raises(Refused, match="too many"):
+        await access.log_in("op", PASSWORD, "192.0.2.1")  # but where he is it is guessed no faster than elsewhere
+
+
+async def test_one_computer_is_one_place_however_many_addresses_it_has(
+    access: Access, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fdhil.web.access.matches", lambda *_: False)
+    for k in range(FREE_GUESSES):
+        with pytest.raises(Refused, match="name or password is wrong"):
+            await access.log_in(f"name{k}", "a guess", f"2001:db8::{k}")
+    with pytest.raises(Refused, match="too many"):
+        await access.log_in("another", "a guess", "2001:db8::ffff")
+    with pytest.raises(Refused, match="name or password is wrong"):
+        await access.log_in("another", "a guess", "2001:db8:0:1::1")
+    assert place_of("::ffff:192.0.2.1") == "192.0.2.1"

@@ -1,0 +1,97 @@
+"""The API against what nobody meant to send: every answer is one that the schema tells, and none a fault of fdhil."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import schemathesis
+from fastapi import FastAPI
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from schemathesis import Case
+from schemathesis.checks import CHECKS, load_all_checks
+from schemathesis.python import asgi
+
+from fdhil.store.history import History
+from fdhil.web.app import make_app
+from tests.store.made import STAMP, outcome, published
+from tests.web.clients import OWN, app_of, machine_of, token_for
+
+load_all_checks()
+EXAMPLES = 6
+CONFORMANCE: Any = CHECKS.get_by_names(
+    ["status_code_conformance", "content_type_conformance", "response_schema_conformance"]
+)
+
+
+def _described() -> Any:
+    with tempfile.TemporaryDirectory() as folder:
+        return schemathesis.openapi.from_dict(app_of(Path(folder)).openapi())
+
+
+SCHEMA = _described()
+OPERATIONS = {found.ok().label: found.ok() for found in SCHEMA.get_all_operations()}
+
+
+@pytest.fixture(scope="module")
+def app(tmp_path_factory: pytest.TempPathFactory) -> FastAPI:
+    """A machine with something stored, where an operator may act; no daemon runs."""
+    config = machine_of(tmp_path_factory.mktemp("machine"), acting=True)
+    with History.open(config.store.directory) as history:
+        history.add_window(outcome(), "", STAMP)
+        history.add_revision(published(1), (1,), STAMP)
+    return make_app(config)
+
+
+@pytest.fixture(scope="module")
+def session(app: FastAPI) -> Iterator[Any]:
+    """A client whose threads run before the first test, and after the last."""
+    application: Any = app
+    with asgi.get_client(application) as client:
+        client.get("http://localhost/api/machine/programs", headers=own(app, "operator"))
+        yield client
+
+
+def own(app: FastAPI, name: str) -> dict[str, str]:
+    """Return the headers of a page of ours, and of a login."""
+    return {**OWN, **({"Authorization": f"Bearer {token_for(app, name)}"} if name else {})}
+
+
+def test_every_kind_of_page_is_described() -> None:
+    assert {"GET /api/machine", "POST /api/machine/arm", "POST /api/session", "GET /api/machine/plan"} <= set(
+        OPERATIONS
+    )
+
+
+@pytest.mark.parametrize("label", OPERATIONS)
+def test_whatever_is_sent_is_answered_as_described(label: str, app: FastAPI, session: Any) -> None:
+    name = "" if label.startswith("POST /api/session") else "operator"  # a login that is guessed costs its scrypt
+    headers = own(app, name)
+
+    @settings(max_examples=EXAMPLES, deadline=None, suppress_health_check=list(HealthCheck))
+    @given(data=st.data())
+    def sent(data: st.DataObject) -> None:
+        case: Case[Any] = data.draw(OPERATIONS[label].as_strategy())
+        answer = case.call(base_url="http://localhost", session=session, headers=headers)
+        assert answer.status_code != 500, answer.text
+        assert answer.status_code != 401 or not name
+        case.validate_response(answer, checks=CONFORMANCE)
+
+    sent()
+
+
+@pytest.mark.parametrize("label", [label for label in OPERATIONS if "/api/session" not in label])
+def test_a_stranger_is_told_nothing_whatever_he_sends(label: str, session: Any) -> None:
+    @settings(max_examples=2, deadline=None, suppress_health_check=list(HealthCheck))
+    @given(data=st.data())
+    def sent(data: st.DataObject) -> None:
+        case: Case[Any] = data.draw(OPERATIONS[label].as_strategy())
+        answer = case.call(base_url="http://localhost", session=session, headers=OWN)
+        assert answer.status_code in (401, 404, 405, 413), answer.text  # a path that it leads to may be none of ours
+        assert answer.status_code != 401 or answer.json()["code"] == "AuthRequired"
+
+    sent()

@@ -1,0 +1,145 @@
+"""What the page of the machine asks for: from a real daemon, from a store, and while the daemon is silent."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fdhil.records import Parameters
+from fdhil.store.history import History
+from fdhil.web.app import make_app
+from fdhil.web.pages.machine_lights import axis_light, change_light, steps
+from tests.daemon.machine import Machine, rapids
+from tests.daemon.test_service import serving, status_when
+from tests.store.made import BENCH, STAMP, published
+from tests.web.clients import client_of, daemon_that, machine_of
+
+CALM: dict[str, Any] = {
+    "samples_s_ago": 0.1, "drive_state": "Operation enabled", "parameters": {}, "last_window": None, "warnings": [],
+    "refused_by": {},
+}  # fmt: skip
+STATUS: dict[str, Any] = {
+    "ok": True, "machine": "bench", "state": "OFF", "guard": {"state": "OFF", "cause": None}, "armed": None,
+    "may_stand": {"nothing": True, "text": "offset 0"}, "source": {"state": "listening"}, "store": {"fault": None},
+    "troubles": [], "axes": {"X": CALM},
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fdhil.daemon.service.warm", lambda config, method: None)
+
+
+async def test_a_real_daemon_is_shown_with_its_axes_and_what_to_do_next(tmp_path: Path) -> None:
+    config = machine_of(tmp_path)
+    async with (
+        serving(config, Machine(rapids(config, count=1))) as path,
+        client_of(make_app(config), "watcher") as client,
+    ):
+        await status_when(path, lambda s: s["axes"]["X"]["accepted"] == 1)
+        told = (await client.get("/api/machine")).json()
+        stored = (await client.get("/api/machine/parameters")).json()["axes"]["X"]
+        text = (await client.get("/api/machine")).text
+    assert told["status"]["axes"]["X"]["revision"] == stored["revision"] == 1
+    assert told["status"]["axes"]["X"]["drive_state"] == "Not ready to switch on"  # its statusword is 0
+    assert told["next"]
+    assert told["axes"]["X"]["light"] in ("good", "warn", "none")  # nothing comes behind the only rapid
+    shown = stored["parameters"]["R"]
+    assert shown["low"] < shown["value"] < shown["high"]
+    assert (shown["unit"], shown["change"], shown["limit"], shown["light"]) == ("ohm", 0.0, 0.3, "good")
+    assert (config.run_directory / "token").read_text() not in text
+
+
+async def test_a_silent_daemon_is_told_and_what_is_stored_is_shown_all_the_same(tmp_path: Path) -> None:
+    config = machine_of(tmp_path, users=False)
+    with History.open(config.store.directory) as history:
+        history.add_revision(published(1), (), STAMP)
+        history.add_revision(published(2, parameters=Parameters(0.5, 0.005, 0.8, 0.5, 0.05, 5.0)), (), STAMP)
+    async with client_of(make_app(config)) as client:
+        answer = await client.get("/api/machine")
+        stored = (await client.get("/api/machine/parameters")).json()
+    told = answer.json()
+    assert (answer.status_code, told["status"], told["axes"]["X"]["light"]) == (200, None, "none")
+    assert told["fault"]["code"] == "ConnectError"
+    assert "start it with fdhil run CONFIG" in told["fault"]["advice"]
+    assert told["next"][0]["text"] == "The daemon does not answer."
+    moved = stored["axes"]["X"]["parameters"]["Jt"]
+    assert (moved["first"], moved["light"]) == (BENCH.Jt, "bad")
+
+
+async def test_without_a_store_there_is_nothing_to_show_and_it_says_why(tmp_path: Path) -> None:
+    async with client_of(make_app(machine_of(tmp_path, users=False))) as client:
+        told = (await client.get("/api/machine/parameters")).json()
+    assert told["axes"] == {}
+    assert told["fault"]["code"] == "NoHistory"
+    assert told["fault"]["advice"] == "run the daemon first"
+
+
+async def test_many_browsers_ask_the_daemon_no_more_than_one_does(tmp_path: Path) -> None:
+    config = machine_of(tmp_path, users=False)
+    async with daemon_that(config, lambda _: STATUS) as asked, client_of(make_app(config)) as client:
+        for _ in range(20):
+            assert (await client.get("/api/machine")).json()["machine"] == "bench"
+    assert len(asked) < 20
+
+
+@pytest.mark.parametrize(
+    ("changes", "troubles", "light", "words"),
+    [
+        ({}, [], "good", "in order"),
+        ({"drive_state": "Fault"}, [], "bad", "the drive is in Fault"),
+        ({}, ["NodeNeverHeard: it is silent"], "bad", "NodeNeverHeard"),
+        ({"samples_s_ago": None}, [], "none", "no samples came yet"),
+        ({"samples_s_ago": 9.0}, [], "none", "no samples for 9 s"),
+        ({"parameters": None}, [], "none", "let the NC make a few rapids"),
+        ({"parameters": None, "refused_by": {"A": 1, "B": 2}}, [], "none", "2 rapids were not believed because of B"),
+        ({"last_window": {"accepted": False, "reasons": ["Low: no"]}}, [], "warn", "was not believed: Low: no"),
+        ({"warnings": ["W: w"]}, [], "warn", "W: w"),
+    ],
+)
+def test_an_axis_has_a_colour_and_the_words_for_it(
+    changes: dict[str, Any], troubles: list[str], light: str, words: str
+) -> None:
+    found = axis_light(CALM | changes, troubles)
+    assert found.light == light
+    assert words in found.text
+
+
+def test_a_parameter_is_beyond_its_limit_only_surely() -> None:
+    assert change_light(1.0, 0.01, 1.0, 0.3) == (0.0, "good")
+    assert change_light(1.2, 0.01, 1.0, 0.3)[1] == "warn"
+    assert change_light(1.31, 0.1, 1.0, 0.3)[1] == "warn"
+    assert change_light(0.6, 0.05, 1.0, 0.3)[1] == "bad"
+    assert change_light(1.0, None, 1.0, 0.3) == (None, "none")
+    assert change_light(1.0, 0.1, None, 0.3) == (None, "none")
+
+
+def _lost() -> Iterator[tuple[dict[str, Any], str, bool]]:
+    stands = {"may_stand": {"nothing": False, "text": "3 um on X may still be applied"}}
+    yield {"state": "lost", **stands}, "start fdhil-guard, then run fdhil adopt", True
+    yield {"state": "FROZEN", **stands}, "then run fdhil adopt", True
+    yield {"guard": {"cause": {"code": "SyncLost", "text": "t", "advice": "a"}}}, "a", False
+    yield {"source": {"state": "silent"}}, "switch the machine on", False
+    yield {"source": {"state": "reconnecting"}}, "it is opened again by itself", False
+    yield {"store": {"fault": "full"}}, "nothing is armed meanwhile", False
+    yield {"troubles": [{"axis": "X", "code": "C", "text": "what; then do"}]}, "then do", False
+    yield {"axes": {"X": CALM | {"parameters": None}}}, "a few rapids (G0)", False
+    yield {"unacknowledged": {"count": 2, "MAJOR": 1}}, "see the page Events", False
+    yield {"armed": {"program": "p"}}, "start the program at the NC", False
+    yield {"state": "OFF(SHADOW)"}, "start fdhil-guard to correct", False
+    yield {}, "fdhil arm CONFIG PROGRAM", False
+
+
+@pytest.mark.parametrize(("changes", "advice", "urgent"), list(_lost()))
+def test_what_to_do_next_is_always_said(changes: dict[str, Any], advice: str, urgent: bool) -> None:
+    first, *_ = steps(STATUS | changes, acting=False)
+    assert advice in first.advice
+    assert first.urgent is urgent
+
+
+def test_what_was_ordered_is_no_fault_to_mend() -> None:
+    ordered = {"guard": {"cause": {"code": "Disarmed", "text": "disarmed", "advice": "arm again"}}}
+    assert [step.text for step in steps(STATUS | ordered, acting=True)] == ["All is in order."]

@@ -1,0 +1,72 @@
+"""The page of all machines in Debian's chromium, with a real database behind it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from typing import TYPE_CHECKING
+
+import pytest
+
+from fdhil.cli.demo.processes import Process
+from tests.fleet.machine import Machine, written
+from tests.fleet.servers import postgres
+from tests.fleet.works import at_days, fleet_of, keep
+from tests.web.tab import WIDE, opened
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, ViewportSize
+
+pytestmark = [pytest.mark.debian, pytest.mark.timeout(900)]
+AT_400_PERCENT: ViewportSize = {"width": WIDE[0] // 4, "height": 256}
+DAYS = 20
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """``fdhil fleet web`` of nine machines, the third of which wears, and the fifth of which is unlike the others."""
+    folder = tmp_path_factory.mktemp("works")
+    begin = datetime.now(UTC) - timedelta(days=DAYS + 1)
+    with postgres() as database:
+        for k in range(9):
+            machine = Machine(written(folder / str(k), f"mill-{k}", labels={"type": "V-800", "lubricant": "ISO 68"}))
+            for day in range(DAYS):
+                worn = 0.05 * day if k == 2 else 0.8 if k == 4 else 0.001 * ((day * k) % 5)
+                machine.record(1, parameters={"ft": 0.05 * (1 + worn)})
+            machine.close()
+            asyncio.run(keep(fleet_of(database, folder), at_days(machine, begin)))
+        file = folder / "fleet.toml"
+        file.write_text(f'[database]\nconnection = "{database.connection}"\n')
+        web = Process("web", ["fdhil", "fleet", "web", "--port", "0", "--json", str(file)], folder / "web.log")
+        yield str(web.event("ready")["url"]).rstrip("/")
+        assert web.stop() == 0
+
+
+@pytest.mark.parametrize("path", ["/fleet", "/fleet/mill-2/X"])
+def test_the_page_is_for_everyone(path: str, url: str, chromium: Browser) -> None:
+    with opened(chromium, url) as tab:
+        tab.page.emulate_media(reduced_motion="reduce")
+        tab.open(path)
+        assert tab.page.locator("h1").count() == 1
+        assert (tab.wider(), tab.violations()) == ([], [])
+        wide = tab.labels()
+        tab.page.emulate_media(color_scheme="dark")
+        assert tab.violations("color-contrast") == []
+        tab.page.set_viewport_size(AT_400_PERCENT)
+        assert wide - tab.labels() == set()
+        assert tab.wider() == []
+
+
+def test_what_is_due_and_who_is_unlike_its_sisters_leads_to_its_axis(url: str, chromium: Browser) -> None:
+    with opened(chromium, url) as tab:
+        tab.open("/")
+        tab.says("section:has(h2:text-is('Due')) tr", "mill-2, axis X")
+        tab.says("section:has(h2:text-is('Unlike their sisters')) tr", "+8")
+        tab.page.get_by_label("Sisters have the same").select_option("lubricant")
+        tab.says("section:has(h2:text-is('Unlike their sisters')) tr", "mill-4, axis X")
+        tab.page.locator("section:has(h2:text-is('Due')) a", has_text="mill-2, axis X").first.click()
+        tab.says("h1", "mill-2, axis X")
+        tab.page.locator(".chart .plot canvas").nth(5).wait_for()
+        assert tab.page.locator(".chart").count() == 6
+        assert [url for url in tab.asked if "/api/machine" in url] == []

@@ -1,0 +1,64 @@
+"""Each page in Debian's chromium, with the real daemon and twin behind it: everyone can read it, on any screen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import pytest
+
+from fdhil.web.app import SHELL
+from tests.web.stage import Stage
+from tests.web.tab import WIDE, Tab, opened
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, ViewportSize
+
+pytestmark = [pytest.mark.debian, pytest.mark.timeout(900)]
+PAGES = (
+    "machine", "axis", "live", "rapids", "rapid", "refused", "history", "program", "forecast", "events", "panel",
+)  # fmt: skip
+AT_400_PERCENT: ViewportSize = {"width": WIDE[0] // 4, "height": 256}  # WCAG 2.1, 1.4.10: of a window of 1280 x 1024
+
+
+@pytest.fixture(scope="module")
+def token(stage: Stage) -> str:
+    """The login of someone who may look."""
+    return stage.token("watcher")
+
+
+@pytest.fixture(scope="module")
+def paths(stage: Stage, token: str) -> dict[str, str]:
+    """The path of every page."""
+    return stage.paths(token)
+
+
+@pytest.fixture
+def reader(stage: Stage, chromium: Browser, token: str) -> Iterator[Tab]:
+    """A tab of someone who may look."""
+    with opened(chromium, stage.url) as tab:
+        tab.log_in(token)
+        yield tab
+
+
+def test_every_page_is_looked_at(paths: dict[str, str]) -> None:
+    assert set(paths) == set(PAGES)
+    assert {path.split("/")[1] for path in paths.values()} == set(SHELL)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_a_page_is_for_everyone(page: str, paths: dict[str, str], reader: Tab) -> None:
+    """axe finds nothing in light and in dark, nothing is lost at 400 %, no scrolling to both sides, no motion."""
+    reader.page.emulate_media(reduced_motion="reduce")
+    reader.open(paths[page])
+    assert reader.page.title().endswith("fdhil")
+    assert reader.page.locator("h1").count() == 1
+    assert reader.wider() == []
+    assert reader.violations() == []
+    wide = reader.labels()
+    reader.page.emulate_media(color_scheme="dark")
+    assert reader.violations("color-contrast") == []
+    reader.page.set_viewport_size(AT_400_PERCENT)
+    assert wide - reader.labels() == set()
+    assert reader.wider() == []
+    assert reader.page.evaluate("document.getAnimations().length") == 0

@@ -1,0 +1,114 @@
+"""Strangers who hold connections: they keep nobody from being heard, least of all who disarms."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+
+from fdhil.web import connections, gate, serving
+from fdhil.web.app import make_app
+from tests.web.clients import machine_of
+
+WAIT_S = 60.0
+HEAD = b"Host: localhost\r\nX-Fdhil: 1\r\nContent-Type: application/json\r\n"
+Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
+
+
+@asynccontextmanager
+async def served(folder: Path, users: bool = True) -> AsyncIterator[int]:
+    """Serve the pages as the command does, and yield the port."""
+    began = asyncio.Event()
+    server = serving.server_of(make_app(machine_of(folder, users)), None, began.set)
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        task = asyncio.create_task(server.serve([listener]))
+        await began.wait()
+        try:
+            yield listener.getsockname()[1]
+        finally:
+            server.should_exit = True
+            await task
+
+
+@asynccontextmanager
+async def held(port: int, number: int, sent: bytes = b"") -> AsyncIterator[list[Stream]]:
+    """Open connections that send no more than that."""
+    streams = [await asyncio.open_connection("127.0.0.1", port) for _ in range(number)]
+    try:
+        for _, writer in streams:
+            writer.write(sent)
+        yield streams
+    finally:
+        for _, writer in streams:
+            writer.close()
+
+
+async def status_line(port: int) -> bytes:
+    """Return what a browser that comes now is answered."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    writer.write(b"GET /api/session HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    line = await asyncio.wait_for(reader.readline(), WAIT_S)
+    writer.close()
+    return line
+
+
+@pytest.mark.parametrize(
+    "sent", [b"", b"GET / HTT", b"POST /api/session HTTP/1.1\r\nContent-Length: 90\r\n" + HEAD + b"\r\n{"]
+)
+async def test_who_takes_every_connection_keeps_nobody_out(sent: bytes, tmp_path: Path) -> None:
+    async with served(tmp_path) as port, held(port, connections.MOST_CONNECTIONS + 8, sent):
+        for _ in range(3):
+            assert await status_line(port) == b"HTTP/1.1 200 OK\r\n"
+
+
+async def test_sockets_that_never_end_keep_nobody_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fdhil.web.pages.live.MAX_BROWSERS", 0)
+    async with served(tmp_path, users=False) as port:
+        socket_head = b"Connection: upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
+        socket_head += b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nHost: localhost\r\n\r\n"
+        async with held(
+            port, connections.MOST_CONNECTIONS, b"GET /api/live/stream HTTP/1.1\r\n" + socket_head
+        ) as streams:
+            for reader, _ in streams[8:]:
+                assert (await asyncio.wait_for(reader.readline(), WAIT_S)).startswith(b"HTTP/1.1 101 ")
+            for _ in range(3):
+                assert await status_line(port) == b"HTTP/1.1 200 OK\r\n"
+
+
+async def closed(reader: asyncio.StreamReader) -> bytes:
+    """Return what came until the connection ended."""
+    with contextlib.suppress(ConnectionError):
+        return await asyncio.wait_for(reader.read(), WAIT_S)
+    return b""
+
+
+@pytest.mark.parametrize("sent", [b"", b"GET / HTT"])
+async def test_a_request_that_never_comes_is_not_waited_for(
+    sent: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections, "QUIET_S", 0.05)
+    async with served(tmp_path) as port, held(port, 1, sent) as streams:
+        assert await closed(streams[0][0]) == b""
+
+
+async def test_a_body_that_never_ends_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gate, "BODY_S", 0.05)
+    sent = b"POST /api/session HTTP/1.1\r\nContent-Length: 90\r\n" + HEAD + b"\r\n{"
+    async with served(tmp_path) as port, held(port, 1, sent) as streams:
+        assert (await asyncio.wait_for(streams[0][0].readline(), WAIT_S)).startswith(b"HTTP/1.1 408 ")
+
+
+async def test_nonsense_is_answered_and_not_written_into_the_log(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    upgrade = b"GET / HTTP/1.1\r\nConnection: upgrade\r\nUpgrade: h2c\r\n" + HEAD + b"\r\n"
+    async with served(tmp_path) as port:
+        for sent, answer in ((b"\x16\x03\x01\r\n\r\n", b"HTTP/1.1 400 "), (upgrade, b"HTTP/1.1 200 ")):
+            async with held(port, 1, sent) as streams:
+                assert (await asyncio.wait_for(streams[0][0].readline(), WAIT_S)).startswith(answer)
+    assert caplog.records == []

@@ -1,0 +1,282 @@
+"""A program that is dropped in a browser: forecast in a process of its own, and told in parts that lose nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Iterator
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from fastapi import FastAPI
+from numpy.testing import assert_allclose
+
+from fdhil import correction
+from fdhil.config import MachineConfig
+from fdhil.correction.learning import Lesson
+from fdhil.errors import ProgramError
+from fdhil.prediction.models import nominal_models
+from fdhil.program import load_trajectory
+from fdhil.store.lessons import lesson_path, write_lesson
+from fdhil.web.app import make_app
+from fdhil.web.forecast import desk, process
+from fdhil.web.forecast.view import knots
+from tests.bench import bench_config
+
+PROGRAM = Path(__file__).parents[2] / "configs" / "programs" / "bench_10m.ngc"
+LONG_ENOUGH_S = 120.0
+WRITES = {"X-Fdhil": "1"}
+
+
+@pytest.fixture(scope="module")
+def machine(tmp_path_factory: pytest.TempPathFactory) -> MachineConfig:
+    return bench_config(folder=tmp_path_factory.mktemp("machine"))
+
+
+class Client:
+    """Asks the application in a loop that lives as long as a module's tests do; forecasts go on while one asks."""
+
+    def __init__(self, app: FastAPI) -> None:
+        self._runner = asyncio.Runner()
+        self._open = AsyncExitStack()
+        self._app = app
+        transport = httpx.ASGITransport(app)
+        self._http = httpx.AsyncClient(transport=transport, base_url="http://localhost")
+        self._runner.run(self._enter())
+
+    async def _enter(self) -> None:
+        await self._open.enter_async_context(self._http)
+        await self._open.enter_async_context(self._app.router.lifespan_context(self._app))
+
+    def get(self, path: str, **options: Any) -> httpx.Response:
+        return self._runner.run(self._http.get(path, **options))
+
+    def post(self, path: str, **options: Any) -> httpx.Response:
+        return self._runner.run(self._http.post(path, **options))
+
+    def wait(self) -> None:
+        self._runner.run(asyncio.sleep(0.05))
+
+    def close(self) -> None:
+        self._runner.run(self._open.aclose())
+        self._runner.close()
+
+
+@pytest.fixture(scope="module")
+def client(machine: MachineConfig) -> Iterator[Client]:
+    client = Client(make_app(machine))
+    yield client
+    client.close()
+
+
+def drop(client: Client, name: str, content: bytes) -> str:
+    answer = client.post("/api/program", params={"name": name}, content=content, headers=WRITES)
+    assert answer.status_code == 202, answer.text
+    return str(answer.json()["digest"])
+
+
+def over(client: Client, digest: str, part: str = "") -> dict[str, Any]:
+    """Ask as the page does, until the forecast, or a part that is asked for later, is over."""
+    end = time.monotonic() + LONG_ENOUGH_S
+    while time.monotonic() < end:
+        told: dict[str, Any] = client.get(f"/api/program/{digest}").json()
+        told = told[part] if part else told
+        if told["state"] in ("done", "failed", "cancelled"):
+            return told
+        client.wait()
+    raise AssertionError("the forecast did not end")
+
+
+@pytest.fixture(scope="module")
+def judged(client: Client) -> dict[str, Any]:
+    told = over(client, drop(client, "../shop\\bench.ngc", PROGRAM.read_bytes()))
+    assert told["state"] == "done", told
+    return told
+
+
+def get(client: Client, judged: dict[str, Any], path: str, **query: Any) -> Any:
+    answer = client.get(f"/api/program/{judged['digest']}/{path}", params=query)
+    assert answer.status_code == 200, answer.text
+    return answer.json()
+
+
+@pytest.fixture(scope="module")
+def planned(machine: MachineConfig) -> Any:
+    return correction.plan(load_trajectory(PROGRAM, machine), nominal_models(machine), machine)
+
+
+def test_a_dropped_program_says_what_the_command_says(judged: dict[str, Any], planned: Any) -> None:
+    told = judged["forecast"]
+    assert judged["name"] == "bench.ngc"
+    assert_allclose(told["before"]["rms_um"], planned.before.rms_um)
+    assert_allclose(told["after"]["rms_um"], planned.after.rms_um)
+    assert told["parameters"]["X"]["revision"] == 0
+    assert [zone["before_um"] for zone in told["zones"]] == sorted(
+        (zone.max_um for zone in planned.before.zones), reverse=True
+    )
+    assert {zone["place"] for zone in told["zones"]} >= {1, 2, 3, 4}
+
+
+def test_few_points_keep_the_largest_error_and_stay_on_the_path(
+    client: Client, judged: dict[str, Any], planned: Any
+) -> None:
+    (run,) = get(client, judged, "view", across="X", along="Y")["runs"]
+    path = planned.before.reference.path_mm
+    assert len(run["row"]) < len(path) / 2
+    assert_allclose(max(run["before_um"]), planned.before.contour_um.max(), atol=1e-3)
+    assert_allclose(max(run["after_um"]), planned.after.contour_um.max(), atol=1e-3)
+    # between two points that are told the path is straight, as far as anyone sees
+    rows = np.array(run["row"])
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    size_mm = np.ptp(path, axis=0).max()
+    for k, name in enumerate(("x_mm", "y_mm")):
+        drawn = np.interp(way, way[rows], run[name])
+        assert np.abs(drawn - path[:, k]).max() < size_mm / 1000
+
+
+def test_a_corner_is_told_row_by_row_with_the_way_of_the_table(
+    client: Client, judged: dict[str, Any], planned: Any
+) -> None:
+    x, y = judged["forecast"]["zones"][0]["at_mm"]
+    box = {"left": x - 1, "right": x + 1, "bottom": y - 1, "top": y + 1}
+    (run,) = (view := get(client, judged, "view", across="X", along="Y", factor=1, **box))["runs"]
+    assert view["whole"]
+    assert run["row"] == list(range(run["row"][0], run["row"][-1] + 1))
+    inside = slice(run["row"][0], run["row"][-1] + 1)
+    for case, found in enumerate((planned.before, planned.after)):
+        drawn = np.column_stack([run["table"][case]["x_mm"], run["table"][case]["y_mm"]])
+        actual = np.column_stack([found.predicted_mm["X"], found.predicted_mm["Y"]])[inside]
+        assert_allclose(drawn, actual, atol=2e-6)
+    enlarged = get(client, judged, "view", across="X", along="Y", factor=10, **box)["runs"][0]["table"]
+    plain = np.array(run["table"][0]["x_mm"])
+    assert np.abs(np.array(enlarged[0]["x_mm"]) - plain).max() > 5 * planned.before.contour_um[inside].max() * 1e-3 / 2
+    fitting = get(client, judged, "view", across="X", along="Y", **box)
+    assert fitting["factor"] in (1, 2, 5)
+    assert get(client, judged, "view", across="X", along="Y", left=500, right=501, bottom=0, top=1)["runs"] == []
+
+
+def test_the_course_keeps_what_is_largest(client: Client, judged: dict[str, Any], planned: Any) -> None:
+    course = get(client, judged, "course")
+    assert_allclose(max(course["before_um"]), planned.before.contour_um.max(), atol=1e-3)
+    assert_allclose(max(course["feed_mm_min"]), 10000.0, rtol=0.01)
+    assert len(get(client, judged, "course", start_s=1.0, end_s=1.1)["time_s"]) == 100
+    assert get(client, judged, "course", start_s=1e300)["time_s"]
+
+
+def test_a_line_leads_to_its_worst_place_and_to_its_text(client: Client, judged: dict[str, Any], planned: Any) -> None:
+    found = get(client, judged, "line/6")
+    rows = np.flatnonzero(planned.before.reference.line == 6)
+    assert_allclose(found["before_um"], planned.before.contour_um[rows].max(), atol=1e-3)
+    text = get(client, judged, "text", first=5, count=2)
+    assert [each["line"] for each in text["lines"]] == [5, 6]
+    assert text["lines"][1]["text"] == PROGRAM.read_text().splitlines()[5]
+    still = client.get(f"/api/program/{judged['digest']}/line/1")
+    assert still.status_code == 404
+    assert "orders no motion" in still.json()["text"]
+
+
+def test_feeds_that_keep_a_tolerance_are_found(client: Client, judged: dict[str, Any]) -> None:
+    path = f"/api/program/{judged['digest']}"
+    asked = client.post(f"{path}/advise", params={"tolerance_um": 60}, headers=WRITES)
+    assert (asked.status_code, asked.json()["advice"]["state"]) == (202, "waiting")
+    advice = over(client, judged["digest"], "advice")
+    assert advice["state"] == "done"
+    assert {each["line"] for each in advice["lines"]} >= {4, 6, 7}
+    for each in advice["lines"]:
+        assert each["run_feed_mm_min"] < each["feed_mm_min"] == 10000.0
+    assert client.post(f"{path}/advise", params={"tolerance_um": 0}, headers=WRITES).status_code == 422
+
+
+def test_what_is_asked_wrongly_is_told(client: Client, judged: dict[str, Any]) -> None:
+    view = f"/api/program/{judged['digest']}/view"
+    for query in (
+        {"across": "X", "along": "Q"},
+        {"across": "X"},
+        {"across": "X", "along": "Y", "left": 1, "right": 0, "bottom": 0, "top": 1},
+        {"across": "X", "along": "Y", "factor": "nan"},
+    ):
+        answer = client.get(view, params=query)
+        assert (answer.status_code, answer.json()["code"]) == (422, "BadRequest")
+    assert client.get(f"/api/program/{'0' * 64}").status_code == 404
+    assert client.get("/api/program/..%2f..%2fetc").status_code in (404, 422)
+    assert client.post("/api/program", params={"name": "a"}, content=b"", headers=WRITES).status_code == 422
+
+
+def test_a_faulty_program_is_refused_with_its_line(client: Client) -> None:
+    told = over(client, drop(client, "bad.ngc", b"G21 G90\nG1 X10 Y10 F1000\nG1 X1..5\nM2\n"))
+    assert told["state"] == "failed"
+    assert told["fault"]["code"] == "ProgramError"
+    assert told["fault"]["line"] == 3
+    assert "drop it again" in told["fault"]["advice"]
+    early = client.get(f"/api/program/{told['digest']}/view", params={"across": "X", "along": "Y"})
+    assert (early.status_code, early.json()["code"]) == (409, "NotReady")
+
+
+def test_a_forecast_is_cancelled_and_its_process_ends(client: Client) -> None:
+    squares = "\n".join(["G21 G90 F300", *(f"G1 X{100 * (k % 2)} Y{k}" for k in range(40)), "M2"])
+    digest = drop(client, "slow.ngc", squares.encode())
+    told = client.post(f"/api/program/{digest}/cancel", headers=WRITES).json()
+    assert told["state"] == "cancelled"
+    assert over(client, digest)["state"] == "cancelled"
+    assert client.post(f"/api/program/{digest}/cancel", headers=WRITES).json()["state"] == "cancelled"
+
+
+def test_a_program_opens_no_other_file(tmp_path: Path, machine: MachineConfig) -> None:
+    (tmp_path / "secret.ngc").write_text("o<secret> sub\nG1 X1 F100\no<secret> endsub\n")
+    program = tmp_path / "program.ngc"
+    for name in ("secret", "../secret", str(tmp_path / "secret")):
+        program.write_text(f"G21 G90\no<{name}> call\nM2\n")
+        with pytest.raises(ProgramError):
+            process.load(program, "program.ngc", machine)
+
+
+def test_a_program_that_never_ends_is_bounded(
+    tmp_path: Path, machine: MachineConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(process, "MOST_ROWS", 5000)
+    program = tmp_path / "program.ngc"
+    program.write_text("G21 G90 F100\no1 while [1]\nG1 X10\nG1 X0\no1 endwhile\nM2\n")
+    with pytest.raises(ProgramError, match="last"):
+        process.load(program, "program.ngc", machine)
+    demand = tmp_path / "demand.csv"
+    rows = "\n".join(f"{k * 1e-3:.3f},{k * 1e-3:.4f},0" for k in range(5001))
+    demand.write_text(f"time_s,X_mm,Y_mm\n{rows}\n")
+    with pytest.raises(ProgramError, match="fdhil correct"):
+        process.load(demand, "demand.csv", machine)
+
+
+def test_a_name_is_shown_without_what_no_screen_shows() -> None:
+    assert desk.shown("/tmp/a\x1b[31m/part\x07.ngc") == "part.ngc"
+    assert desk.shown("C:\\jobs\\part.ngc") == "part.ngc"
+    assert desk.shown("../..") == ".."
+    assert desk.shown("\n") == "program"
+    assert len(desk.shown("a" * 255)) == desk.LONGEST_NAME
+
+
+def test_what_passes_taught_is_told_of_this_machine_alone(client: Client, machine: MachineConfig) -> None:
+    folder = machine.store.directory / "lessons"
+    lesson = Lesson({"X": np.zeros(3)}, without_um=9.0, curve_um=(9.0, 3.0, 1.0))
+    write_lesson(lesson_path(folder, "ab" * 32, machine.digest), lesson)
+    write_lesson(lesson_path(folder, "cd" * 32, "ef" * 32), lesson)
+    told = client.get("/api/program/learning").json()
+    assert told["daemon"] is False
+    (learned,) = told["lessons"]
+    assert learned["program"] == "ab" * 16
+    assert learned["curve_um"] == [9.0, 3.0, 1.0]
+
+
+def test_knots_are_the_best_that_few_points_can_tell() -> None:
+    corner = np.zeros((2001, 4))
+    corner[:, 0] = np.minimum(np.arange(2001), 1000) * 0.1
+    corner[:, 1] = np.maximum(np.arange(2001) - 1000, 0) * 0.1
+    assert knots(corner, 100).tolist() == [0, 1000, 2000]
+    corner[1500, 2] = 50.0  # a peak of error in one row
+    found = knots(corner, 100).tolist()
+    assert {0, 1000, 1499, 1500, 1501, 2000} <= set(found)
+    assert len(knots(np.random.default_rng(1).normal(size=(5000, 4)) * 100, 200)) == 200
+    still = np.zeros((10, 4))
+    assert knots(still, 5).tolist() == [0, 9]

@@ -1,0 +1,59 @@
+"""What is served to browsers as it stands: complete, of one piece, and from here alone."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from fdhil.report import typography
+from fdhil.web.app import SHELL, STATIC
+
+SCRIPTS = sorted(STATIC.rglob("*.js"))
+WORDS = re.compile(r'^\s*"([\w.()]+)": ', re.MULTILINE)
+
+
+def keys(name: str) -> set[str]:
+    """Return the keys of a file of words, or of all of them."""
+    return {key for path in (STATIC / "text").rglob(name) for key in WORDS.findall(path.read_text("utf-8"))}
+
+
+def test_each_page_of_the_shell_has_its_script() -> None:
+    assert [name for name in SHELL if not (STATIC / "pages" / f"{name}.js").is_file()] == []
+
+
+def test_each_module_that_is_imported_is_there() -> None:
+    for path in SCRIPTS:
+        for found in re.findall(r'(?:from|import) "/static/([\w./]+)"', path.read_text("utf-8")):
+            assert (STATIC / found).is_file(), (path.name, found)
+
+
+def test_each_word_that_is_used_is_written_down_once() -> None:
+    known = keys("*.js")
+    for path in SCRIPTS:
+        code = "\n".join(line for line in path.read_text("utf-8").splitlines() if not line.startswith("//"))
+        used = set(re.findall(r'\bt\("([\w.]+)"', code))
+        assert used <= known, (path.name, used - known)
+    parts = [key for path in (STATIC / "text").rglob("*.js") for key in WORDS.findall(path.read_text("utf-8"))]
+    assert [key for key in known if parts.count(key) > 1] == []
+
+
+@pytest.mark.parametrize(
+    "path", sorted([*SCRIPTS, *STATIC.rglob("*.css"), *STATIC.glob("*.html")]), ids=lambda p: p.name
+)
+def test_nothing_is_fetched_from_elsewhere_and_no_style_or_script_is_inline(path: Path) -> None:
+    text = path.read_text("utf-8")
+    elsewhere = [found for found in re.findall(r"https?://[\w.-]+", text) if "www.w3.org" not in found]
+    assert elsewhere == []
+    assert not re.search(
+        r"\.innerHTML|insertAdjacentHTML|\beval\(|new Function|document\.write|<script>|\bstyle=\"", text
+    )
+
+
+def test_units_are_set_by_the_rule_of_the_reports() -> None:
+    text = (STATIC / "typeset.js").read_text("utf-8")
+    table = re.search(r"const PRINTED = \{(.*?)\};", text, re.DOTALL)
+    assert table is not None
+    assert json.loads("{" + table[1].strip().rstrip(",") + "}") == typography._PRINTED

@@ -1,0 +1,163 @@
+"""``fdhil web`` and ``fdhil web-user``: where they listen, what they refuse, and that no secret leaves."""
+
+from __future__ import annotations
+
+import io
+import json
+import ssl
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from fdhil.cli.demo.processes import Process
+from fdhil.cli.demo.toml import to_toml
+from fdhil.config.users import matches, read_users
+from fdhil.config.web import Web, is_loopback
+from fdhil.errors import ConfigError, FdhilError
+from fdhil.web import serving
+from tests.bench import bench_axis
+from tests.daemon.machine import config_of
+from tests.daemon.shop import fdhil
+from tests.web.certificate import write_certificate
+from tests.web.clients import OWN
+
+Capture = pytest.CaptureFixture[str]
+TLS = {"tls_certificate_file": Path("c"), "tls_key_file": Path("k")}
+USERS = {"users_file": Path("u")}
+CANARY = "canary-5e7a"
+
+
+def test_by_default_nothing_but_this_computer_is_reached() -> None:
+    web = Web()
+    assert (web.host, web.on_loopback, web.acting, web.unprotected) == ("127.0.0.1", True, False, False)
+    serving.check_reach(web)
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.7", "mill.example", "127.0.0.1.example"])
+def test_beyond_this_computer_it_takes_tls_and_users_or_a_word(host: str) -> None:
+    assert not is_loopback(host)
+    for given, missing in (({}, 2), (TLS, 1), (USERS, 1)):
+        with pytest.raises(ConfigError) as told:
+            serving.check_reach(Web(host=host, **given))
+        assert len(told.value.faults) == missing
+        assert "can be reached from other computers" in str(told.value) or "users_file" in str(told.value)
+    serving.check_reach(Web(host=host, **TLS, **USERS))
+    serving.check_reach(Web(host=host, unprotected=True))
+    with pytest.raises(ConfigError, match="who acts sends a password"):  # no word helps against that
+        serving.check_reach(Web(host=host, unprotected=True, acting=True, users_file=Path("u")))
+
+
+def test_what_belongs_together_is_refused_alone(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="belong together"):
+        config_of(tmp_path, web={"tls_key_file": "k"})
+    with pytest.raises(ConfigError, match="acting needs a users_file"):
+        config_of(tmp_path, web={"acting": True})
+
+
+def test_who_may_look_changes_nothing_that_was_learnt_of_the_machine(tmp_path: Path) -> None:
+    changed = config_of(tmp_path, web={"port": 0, "users_file": "u", "acting": True})
+    assert changed.digest == config_of(tmp_path).digest
+    assert changed.web.users_file == tmp_path / "u"
+
+
+def test_a_missing_extra_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fdhil.web.serving.find_spec", lambda name: None)
+    with pytest.raises(FdhilError, match=r"needs the extra 'web': pip install 'fdhil\[web\]'"):
+        serving.require()
+
+
+def written(folder: Path, **web: Any) -> Path:
+    path = folder / "machine.toml"
+    path.write_text(to_toml({"machine": {"name": "bench"}, "axis": {"X": bench_axis()}, "web": web}))
+    return path
+
+
+def given(password: str, *arguments: str | Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> tuple[int, str]:
+    """Run a command with a password on standard input; return its exit code and what it said."""
+    monkeypatch.setattr("sys.stdin", io.StringIO(password + "\n"))
+    code, out, err = fdhil(*arguments, capsys=capsys)
+    return code, out + err
+
+
+def test_users_come_and_go(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, users = written(tmp_path, users_file="u.json"), tmp_path / "u.json"
+
+    def run(password: str, *more: str) -> tuple[int, str]:
+        return given(password, "web-user", path, *more, capsys=capsys, monkeypatch=monkeypatch)
+
+    code, said = run(f"{CANARY} long enough", "op", "--role", "operate")
+    assert (code, CANARY in said) == (0, False)
+    assert matches(read_users(users)["op"], f"{CANARY} long enough")
+    assert read_users(users)["op"].role == "operate"
+    assert run("short", "ann")[0] == 2
+    assert run(f"{CANARY} of ann", "a/b")[0] == 2
+    assert run(f"{CANARY} of ann", "ann")[0] == 0
+    assert read_users(users)["ann"].role == "watch"
+    assert run("", "op", "--remove")[0] == 0
+    code, said = run("", "op", "--remove")
+    assert (code, "there is no user op" in said) == (2, True)
+    assert list(read_users(users)) == ["ann"]
+    code, said = given("x", "web-user", written(tmp_path), "op", capsys=capsys, monkeypatch=monkeypatch)
+    assert (code, "add users_file" in said) == (2, True)
+
+
+def test_what_cannot_be_listened_at_is_told(tmp_path: Path, capsys: Capture) -> None:
+    path = written(tmp_path)
+    for arguments, code, words in (
+        (("--host", "0.0.0.0"), 2, "web.users_file"),
+        (("--host", "127.0.0.1", "--port", "99999"), 2, "99999"),
+    ):
+        found, _, err = fdhil("web", path, *arguments, capsys=capsys)
+        assert (found, words in err, "Traceback" in err) == (code, True, False)
+
+
+@pytest.mark.fault("G10")
+@pytest.mark.goal("R16")
+def test_served_by_tls_it_tells_no_secret_and_ends_in_order(
+    tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process as systemd starts it; the canaries are a password, a token, the operator's token and the key."""
+    write_certificate(tmp_path / "web.crt", tmp_path / "web.key")
+    files = {"users_file": "u.json", "tls_certificate_file": "web.crt", "tls_key_file": "web.key"}
+    path = written(tmp_path, port=0, acting=True, **files)
+    password = f"{CANARY} of the operator"
+    for name, role in (("op", "operate"), ("ann", "watch")):
+        given(password, "web-user", path, name, "--role", role, capsys=capsys, monkeypatch=monkeypatch)
+    run_directory = tmp_path / "fdhil-data" / "run"
+    run_directory.mkdir(parents=True)
+    (run_directory / "token").write_text(f"{CANARY}-token")
+    (run_directory / "token").chmod(0o600)
+    log = tmp_path / "web.log"
+    trusting = ssl.create_default_context(cafile=str(tmp_path / "web.crt"))
+    with Process("web", ["fdhil", "web", str(path), "--json"], log) as web:
+        url = web.event("ready")["url"]
+        assert url.startswith("https://127.0.0.1:")
+        with httpx.Client(base_url=url, verify=trusting, headers=OWN) as client:
+            said = [client.get(page) for page in ("/", "/api/session", "/api/machine", "/static/app.js")]
+            login = client.post("/api/session", json={"name": "op", "password": password})
+            client.headers["Authorization"] = f"Bearer {login.json()['token']}"
+            said += [
+                client.post("/api/session", json={"name": CANARY, "password": "wrong"}),
+                client.post("/api/session", json={"name": "op", "password": [password]}),
+                client.get(f"/api/machine?token={CANARY}"),
+                client.get("/api/openapi.json"),
+                client.post("/api/machine/disarm"),
+            ]
+        process = Path(f"/proc/{web.pid}")
+        seen = (process / "cmdline").read_bytes() + (process / "environ").read_bytes()
+        assert web.stop() == 0
+    told = "".join(answer.text for answer in said)
+    for place, text in (("answers", told), ("log", log.read_text()), ("process list", seen.decode())):
+        for secret in (CANARY, login.json()["token"], "PRIVATE KEY", read_users(tmp_path / "u.json")["op"].scrypt):
+            assert secret not in text, (place, secret)
+    assert json.loads(said[2].text)["code"] == "AuthRequired"
+    assert "Traceback" not in log.read_text()
+
+
+def test_a_certificate_that_is_none_is_told(tmp_path: Path, capsys: Capture) -> None:
+    (tmp_path / "c").write_text("no certificate")
+    path = written(tmp_path, tls_certificate_file="c", tls_key_file="c")
+    code, _, err = fdhil("web", path, capsys=capsys)
+    assert (code, "web.tls_certificate_file" in err or "cannot be used" in err) == (2, True)

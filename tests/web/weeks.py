@@ -1,0 +1,139 @@
+"""A made-up store of weeks: rapids of drives that wear and warm, through the daemon's own pipeline into its own store.
+
+Nothing is timed by a clock: the last rapid is as old as the caller says, each other half a day older than the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil.config import Axis, MachineConfig
+from fdhil.correction.learning import Lesson
+from fdhil.daemon import blackbox
+from fdhil.daemon.kernel_warmup import nominal_rapid
+from fdhil.daemon.outcome_store import OutcomeStore
+from fdhil.pipeline import AxisPipeline
+from fdhil.records import Notice, Window, frozen
+from fdhil.store.lessons import lesson_path, write_lesson
+from fdhil.store.rows import Stamp
+
+DAY_S = 86_400.0
+APART_S = DAY_S / 2
+TICKS_APART = 10_000
+LOADED_AT = 0.7  # of the weeks: since then a heavier table
+LIGHTER = 0.075 / 0.085
+WEAR = 0.35  # of ft over the weeks
+AMBIENT_C = 20.0
+REFUSED_EVERY = 9
+
+NOTICES = (
+    Notice("Armed", "info", "armed corner.ngc: contour error 41.2 um RMS is predicted to become 0.6 um"),
+    Notice("PassMeasured", "info", "pass 3 of corner.ngc: contour error measured 0.9 um RMS"),
+    Notice("ArmRefused", "minor", "ModelNotFresh: axis X was identified 11 h ago"),
+    Notice("GuardState", "MAJOR", "ACTIVE -> OFF: DriveEmergency", "X"),
+    Notice("GuardTripped", "MAJOR", "DriveEmergency: drive X sent emergency 0x4310", "X"),
+)
+FRAMES = "".join(f"({k * 1e-3:.6f}) can0 {can_id}#{k % 256:02X}00\n" for k in range(400) for can_id in ("080", "181"))
+
+
+def fill(config: MachineConfig, rapids: int = 84, last: Stamp | None = None) -> None:
+    """Write ``rapids`` of each axis, what followed from them, notices and a black box; the newest is ``last`` (now).
+
+    At the end every drive is what its configuration calls nominal, so that a twin without changes is that machine.
+    """
+    last = last or Stamp.now()
+    rng = np.random.default_rng(16)
+    with daemons_store(config) as (store, clock):
+        pipelines = {name: AxisPipeline(name, config) for name in config.axis}
+        for k in range(rapids):
+            clock["at"] = earlier(last, (rapids - 1 - k) * APART_S)
+            celsius = AMBIENT_C + 1.5 * float(np.sin(1.3 * k)) * (k < rapids - 4)
+            for name, pipeline in pipelines.items():
+                window = rapid(name, config, k, rapids, celsius, int(rng.integers(1 << 30)))
+                assert store.keep(pipeline.feed(window)) == []
+        clock["at"] = earlier(last, APART_S)
+        store.keep([*NOTICES, black_box(config, clock["at"])])
+
+
+@contextmanager
+def daemons_store(config: MachineConfig) -> Iterator[tuple[OutcomeStore, dict[str, Stamp]]]:
+    """Open the daemon's store with a clock that is set by hand."""
+    clock: dict[str, Stamp] = {}
+
+    class Clock(Stamp):
+        @staticmethod
+        def now() -> Stamp:
+            return clock["at"]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fdhil.daemon.outcome_store.Stamp", Clock)
+        store = OutcomeStore(config)
+        assert store.open() == []
+        try:
+            yield store, clock
+        finally:
+            store.close()
+
+
+def earlier(stamp: Stamp, seconds: float) -> Stamp:
+    """Return the stamp of so long before; before the boot of ``stamp`` it is that of another."""
+    monotonic_ns = stamp.monotonic_ns - round(seconds * 1e9)
+    return Stamp(stamp.wall_s - seconds, stamp.boot if monotonic_ns >= 0 else "earlier", abs(monotonic_ns))
+
+
+def black_box(config: MachineConfig, at: Stamp) -> Notice:
+    """Leave the frames before the trip, in a file of that time, and return what is told of it."""
+    folder = config.store.directory / blackbox.FOLDER
+    folder.mkdir()
+    stamp = datetime.fromtimestamp(at.wall_s, UTC).strftime("%Y%m%dT%H%M%S.%fZ")
+    file = folder / f"{stamp}-DriveEmergency.log"
+    file.write_text(FRAMES, "ascii")
+    return Notice("BlackBox", "info", f"the last {FRAMES.count(chr(10))} frames are in {file}")
+
+
+def rapid(name: str, config: MachineConfig, k: int, rapids: int, celsius: float, seed: int) -> Window:
+    """Return the k-th of ``rapids`` to and fro; some are as no rapid should be, and are refused."""
+    worn = worn_axis(config.axis[name], (k + 1) / rapids, celsius)
+    window = nominal_rapid(name, worn, config.machine.sync_period_s, 1 if k % 2 == 0 else -1, seed)
+    window = replace(window, start_tick=k * TICKS_APART, temperature_c=round(celsius, 2), source="inferred")
+    if k % REFUSED_EVERY == REFUSED_EVERY - 3:
+        return spoiled(window, k // REFUSED_EVERY)
+    return window
+
+
+def worn_axis(axis: Axis, share: float, celsius: float) -> Axis:
+    """Return an axis as it was at this ``share`` of the weeks: ft grows, Cd falls with warmth, a table joined."""
+    nominal = axis.nominal
+    was: Mapping[str, Any] = {
+        "ft": nominal.ft * (1 - WEAR * (1 - share)),
+        "Cd": nominal.Cd * (1 - 0.02 * (celsius - AMBIENT_C)),
+        "Jt": nominal.Jt * (1.0 if share > LOADED_AT else LIGHTER),
+    }
+    return axis.model_copy(update={"nominal": nominal.model_copy(update=was)})
+
+
+def spoiled(window: Window, kind: int) -> Window:
+    """Return a rapid with a cutting load, or with a voltage that hangs at one value."""
+    assert window.stages.cruise is not None
+    assert window.voltage_v is not None
+    begin, end = window.stages.cruise
+    current, voltage = window.current_a.copy(), window.voltage_v.copy()
+    if kind % 2 == 0:
+        current[begin + 60 : end - 60] += 9.0 * window.direction
+        return replace(window, current_a=frozen(current))
+    voltage[begin + 50 : begin + 250] = voltage[begin + 50]
+    return replace(window, voltage_v=frozen(voltage))
+
+
+def teach(config: MachineConfig, program_digest: str, rows: int) -> None:
+    """Leave what three passes of a program of ``rows`` taught."""
+    offset = frozen(0.05 * np.sin(np.arange(rows) / 300.0))
+    lesson = Lesson(dict.fromkeys(config.axis, offset), 10.3, 0.7, (3.4, 1.6, 0.9))
+    write_lesson(lesson_path(config.store.directory / "lessons", program_digest, config.digest), lesson)
