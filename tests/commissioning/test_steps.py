@@ -281,6 +281,7 @@ class SlowReader(Master):
     """A master on a busy computer: the first ``slow`` readings of the speed demand come too late to tell anything."""
 
     slow = 0
+    late_cycles = 2 * steps.EARLY_CYCLES + steps.RAMP_CYCLES
     readings = 0
 
     def __init__(self, config: MachineConfig, axis: str) -> None:
@@ -294,21 +295,18 @@ class SlowReader(Master):
         if index == Object.VELOCITY_DEMAND:
             self.readings += 1
             if self.readings <= self.slow:
-                self.wait_cycles(2 * steps.EARLY_CYCLES + steps.RAMP_CYCLES)
+                self.wait_cycles(self.late_cycles)
         return value
 
 
-READINGS = 1 + steps.RAMPS  # of a try in which each is late: whether the object is there, and one a ramp
-
-
-def test_a_ramp_whose_begin_was_missed_is_asked_again(peer: tuple[DrivePeer, MachineConfig]) -> None:
+def test_a_ramp_whose_begin_was_missed_is_made_again(peer: tuple[DrivePeer, MachineConfig]) -> None:
     _, settings = peer
     with SlowReader(settings, "X") as master, rolled_back(master):
         prepare(master)
         enable(master)
-        master.slow = READINGS
-        assert steps.tell_feedforward(master) is True
-        assert master.readings > 2 * READINGS
+        master.slow = 2 * steps.RAMPS
+        assert feedforward_test(master) is True
+        assert master.readings > 3 * steps.RAMPS
 
 
 def test_a_feedforward_that_is_never_seen_stays_untold(peer: tuple[DrivePeer, MachineConfig]) -> None:
@@ -317,8 +315,18 @@ def test_a_feedforward_that_is_never_seen_stays_untold(peer: tuple[DrivePeer, Ma
         prepare(master)
         enable(master)
         master.slow = 1_000_000
-        assert steps.tell_feedforward(master) is None
-        assert master.readings == steps.FEEDFORWARD_TRIES * READINGS
+        assert feedforward_test(master) is None
+        assert master.readings == 1 + steps.MOST_RAMPS  # whether the object is there, and one a ramp
+
+
+def test_what_was_read_before_the_ramp_is_no_missing_feedforward(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    _, settings = peer
+    with SlowReader(settings, "X") as master, rolled_back(master):
+        prepare(master)
+        enable(master)
+        master.slow = 1_000_000
+        master.late_cycles = steps.EARLY_CYCLES + 4  # read before the ramp, heard in its midst
+        assert feedforward_test(master) is None
 
 
 def test_full_heartbeat_consumers_are_refused(peer: tuple[DrivePeer, MachineConfig]) -> None:
