@@ -8,11 +8,12 @@ from collections.abc import Iterable, Iterator
 from importlib import import_module
 from importlib.resources import as_file, files
 from pathlib import Path
+from string import Template
 from typing import Any
 
 from fastapi import APIRouter, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import FileResponse, JSONResponse, Response
+from fastapi.responses import HTMLResponse, JSONResponse, Response
 from fastapi.staticfiles import StaticFiles
 from starlette.exceptions import HTTPException
 from starlette.middleware.gzip import GZipMiddleware
@@ -29,7 +30,8 @@ from fdhil.web.context import Context, Entry
 from fdhil.web.daemon import Daemon
 from fdhil.web.gate import Gate
 
-SHELL = ("machine", "live", "rapids", "history", "program", "events", "panel")
+MENU = ("machine", "live", "rapids", "history", "program", "events")
+SHELL = (*MENU, "panel")
 """The first parts of the paths that the browser's router knows."""
 PACKED_FROM, PACKING = 4096, 4  # bytes, and how hard: a slow network gains, no token is in what is that long
 STATIC = Path(__file__).parent / "static"
@@ -47,20 +49,27 @@ FAULTS: dict[int | str, dict[str, Any]] = {
 
 def make_app(config: MachineConfig) -> FastAPI:
     """Return the application of one machine. ConfigError where its users file is faulty."""
-    app = application(config.web, page_routers(), "index.html", SHELL)
+    app = application(config.web, page_routers(), MENU, SHELL, "fdhil status CONFIG")
     app.state.context = Context(config, Daemon(config.run_directory / SOCKET_NAME), app.state.entry.access)
     return app
 
 
-def application(web: Web, routers: Iterable[APIRouter], document: str, paths: Iterable[str]) -> FastAPI:
-    """Return an application behind the gate; ``document`` is what its ``paths`` show. ConfigError as above."""
+def application(
+    web: Web, routers: Iterable[APIRouter], menu: Iterable[str], paths: Iterable[str], command: str
+) -> FastAPI:
+    """Return an application behind the gate. ConfigError as above.
+
+    ``paths`` are the first parts of those that the browser's router knows, ``menu`` the pages that it offers;
+    ``command`` tells the same where a browser runs no scripts.
+    """
     access = Access(web.users_file)
     app = FastAPI(title="fdhil", docs_url=None, redoc_url=None, openapi_url=None, redirect_slashes=False)
     app.state.entry = Entry(web, access)
     for router in routers:
         app.include_router(router, responses=FAULTS)
     app.add_api_route("/api/openapi.json", lambda: app.openapi(), include_in_schema=False)
-    _serve_shell(app, document, paths)
+    document = Template((STATIC / "shell.html").read_text("utf-8"))
+    _serve_shell(app, document.substitute(menu=" ".join(menu), command=command), paths)
     _answer_faults(app)
     app.add_middleware(GZipMiddleware, minimum_size=PACKED_FROM, compresslevel=PACKING)
     app.add_middleware(Gate, settings=web, access=access)
@@ -79,7 +88,7 @@ def _serve_shell(app: FastAPI, document: str, paths: Iterable[str]) -> None:
     """Serve the one document of all pages, its scripts, and the carried uPlot."""
 
     def shell() -> Response:
-        return FileResponse(STATIC / document, media_type="text/html")
+        return HTMLResponse(document)
 
     app.add_api_route("/", shell, include_in_schema=False, response_class=Response)
     for name in paths:

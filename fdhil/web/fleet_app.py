@@ -61,7 +61,7 @@ Asked = Annotated[Answers, Depends(_answers)]
 
 def make_fleet_app(web: Web, ask: Ask) -> FastAPI:
     """Return the application; ``ask(question, **given)`` answers. ConfigError where the users file is faulty."""
-    app = application(web, (session.router, router), "fleet.html", ("fleet",))
+    app = application(web, (session.router, router), ("fleet",), ("fleet",), "fdhil fleet status FLEET")
     app.state.answers = Answers(ask)
     return app
 
