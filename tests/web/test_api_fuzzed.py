@@ -23,6 +23,7 @@ from tests.web.clients import OWN, app_of, machine_of, token_for
 
 load_all_checks()
 EXAMPLES = 6
+PATIENCE_S = 300.0  # on a busy computer
 CONFORMANCE: Any = CHECKS.get_by_names(
     ["status_code_conformance", "content_type_conformance", "response_schema_conformance"]
 )
@@ -76,7 +77,7 @@ def test_whatever_is_sent_is_answered_as_described(label: str, app: FastAPI, ses
     @given(data=st.data())
     def sent(data: st.DataObject) -> None:
         case: Case[Any] = data.draw(OPERATIONS[label].as_strategy())
-        answer = case.call(base_url="http://localhost", session=session, headers=headers)
+        answer = case.call(base_url="http://localhost", session=session, headers=headers, timeout=PATIENCE_S)
         assert answer.status_code != 500, answer.text
         assert answer.status_code != 401 or not name
         case.validate_response(answer, checks=CONFORMANCE)
@@ -90,7 +91,7 @@ def test_a_stranger_is_told_nothing_whatever_he_sends(label: str, session: Any) 
     @given(data=st.data())
     def sent(data: st.DataObject) -> None:
         case: Case[Any] = data.draw(OPERATIONS[label].as_strategy())
-        answer = case.call(base_url="http://localhost", session=session, headers=OWN)
+        answer = case.call(base_url="http://localhost", session=session, headers=OWN, timeout=PATIENCE_S)
         assert answer.status_code in (401, 404, 405, 413), answer.text  # a path that it leads to may be none of ours
         assert answer.status_code != 401 or answer.json()["code"] == "AuthRequired"
 
