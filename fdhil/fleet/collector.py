@@ -28,6 +28,7 @@ from fdhil.daemon import journal
 from fdhil.errors import StoreError
 from fdhil.fleet import migrations, objects
 from fdhil.fleet.message import Record, Unread, decode
+from fdhil.fleet.migrations import NOTE_INCOMING, NOTE_SHIFTS
 from fdhil.fleet.transport import (
     ERRORS,
     cause_of,
@@ -193,6 +194,7 @@ class Collector:
             async with db.transaction(), db.cursor() as cursor:
                 await _copy(cursor, "incoming", known)
                 await cursor.execute(_KEEP)
+                await cursor.execute(NOTE_INCOMING)
                 await _put_aside(cursor, aside)
         for subject, unread in aside:
             journal.write_line(f"a part of what {subject} told is put aside: {unread.reason}", "minor")
@@ -210,6 +212,7 @@ async def _written(known: Known, aside: Aside, db: psycopg.AsyncConnection) -> b
             await cursor.execute(_DROPPED, _columns(numbered, 4))
             if cursor.rowcount:
                 raise psycopg.Rollback
+            await cursor.execute(NOTE_SHIFTS, _columns(_newest(known), 3))
             await _put_aside(cursor, aside)
             return True
     return False
@@ -229,6 +232,18 @@ def _counted(known: Known) -> dict[tuple[str, str], Count]:
             count.last = max(count.last, record.sequence)
             count.records += 1
     return dict(sorted(counts.items()))
+
+
+def _newest(known: Known) -> list[tuple[str, str, datetime]]:
+    """Return what names the newest set of each axis and shift, in one order everywhere."""
+    newest: dict[tuple[str, str, int], tuple[datetime, int, Record]] = {}
+    for record, stored_at in known:
+        if record.kind == "parameters" and '"revision"' in record.text:
+            at = stored_at if record.recorded_at < migrations.FIRST else min(record.recorded_at, stored_at)
+            key = record.machine, record.axis, int(at.timestamp() // migrations.SHIFT_S)
+            if key not in newest or (stored_at, record.sequence) > newest[key][:2]:
+                newest[key] = stored_at, record.sequence, record
+    return [(of.machine, of.message, of.recorded_at) for _, (_, _, of) in sorted(newest.items())]
 
 
 def _columns(rows: Sequence[tuple[object, ...]], count: int) -> list[list[object]]:
