@@ -31,7 +31,8 @@ LATERAL (SELECT max(o.serviced_at) AS serviced_at FROM fleet.services o WHERE o.
 """
 OF_AXES: LiteralString = "FROM unnest(%(machines)s::text[], %(axes)s::text[]) a (machine, axis)"
 _THINNED: LiteralString = f"""
-SELECT n.*, coalesce(v.serviced_at, f.at) AS since {OF_AXES}, {SERVICED},
+SELECT n.machine, n.axis, n.sequence, n.at, n."R", n."L", n."K", n."Jt", n."ft", n."Cd", n.stds, n.temperature_c,
+  coalesce(v.serviced_at, f.at) AS since {OF_AXES}, {SERVICED},
   LATERAL (SELECT at FROM fleet.shifts s WHERE s.machine = a.machine AND s.axis = a.axis ORDER BY shift LIMIT 1) f,
   LATERAL (SELECT DISTINCT ON (bin) s.*, date_bin(%(apart)s::interval, s.shift, 'epoch'::timestamptz) AS bin
     FROM fleet.shifts s WHERE s.machine = a.machine AND s.axis = a.axis AND s.at >= coalesce(v.serviced_at, '-infinity')
