@@ -33,6 +33,7 @@ BENCHMARKS = {
     "web_pages": "The pages of `fdhil web` in chromium: from the wish to see one to its content",
     "whole_machine": "The daemon beside the twin in real time: 60 s of two drives at 1 kHz",
     "fleet": "Many machines: uplinks and a collector beside bare JetStream and COPY",
+    "fleet_questions": "3,000 machines in one database: how long `fdhil fleet status` and the like take",
     "fleet_reanalysis": "All stored windows of a fleet again: one process, 1 and 2 Dask workers, the same bits",
     "web_live": "The live page in a browser: what it costs the web process, and whether the daemon loses a frame by it",
 }

@@ -26,7 +26,7 @@ from nats.aio.client import Client
 
 from fdhil.config.fleet import Database, Fleet, Objects, Server, Stream
 from fdhil.fleet import migrations
-from fdhil.fleet.collector import _COLUMNS, Collector, Row, _row
+from fdhil.fleet.collector import _AT_ONCE, _COLUMNS, Collector, _rows
 from fdhil.fleet.message import Message, Record, decode, joined, of_entry
 from fdhil.fleet.transport import connected, prepare_stream
 from fdhil.fleet.uplink import BATCH, MESSAGE_BYTES, Sender
@@ -179,10 +179,10 @@ def together_of(senders: Sequence[Sender]) -> list[Message]:
     return [message for sender in senders for message, _ in joined(messages_of(sender), MESSAGE_BYTES)]
 
 
-def rows_of(messages: Sequence[Message]) -> list[Row]:
+def rows_of(messages: Sequence[Message]) -> list[str]:
     """Return what is in messages as a database takes it."""
     told = [told for message in messages for told in decode(message.subject, message.payload)]
-    return [_row(record, LISTED) for record in told if isinstance(record, Record)]
+    return list(_rows([(record, LISTED) for record in told if isinstance(record, Record)]))
 
 
 async def publish(client: Client, messages: Sequence[Message]) -> None:
@@ -226,13 +226,13 @@ async def send_one(sender: Sender, client: Client) -> None:
             return
 
 
-async def copy(db: psycopg.AsyncConnection, table: str, rows: Sequence[Row]) -> None:
+async def copy(db: psycopg.AsyncConnection, table: str, rows: Sequence[str]) -> None:
     """Copy rows into a table, as many in a transaction as a collector has."""
     statement = f"COPY {table} ({_COLUMNS}) FROM STDIN".encode()
     for first in range(0, len(rows), TOGETHER):
         async with db.transaction(), db.cursor() as cursor, cursor.copy(statement) as into:
-            for row in rows[first : first + TOGETHER]:
-                await into.write_row(row)
+            for some in range(first, min(first + TOGETHER, len(rows)), _AT_ONCE):
+                await into.write("".join(rows[some : min(some + _AT_ONCE, first + TOGETHER)]))
 
 
 async def collect(bench: Bench, total: int) -> None:

@@ -161,14 +161,15 @@ def _killed(figures: Figures) -> list[str]:
 
 def _cut(figures: Figures) -> list[str]:
     cut = figures["cut"]
+    pace = "" if cut["cut_s"] >= 3600 else "the hour is compressed, the cut is not; "
     return [
         "## What a cut network costs",
         "",
         *pages.paragraph(
             f"""{_when(cut)}
             A network that drops all and tells nobody, for {cut["cut_s"]:.0f} s, while {cut["machines"]} machines
-            record an hour of work ({cut["records"]} records; the hour is compressed, the cut is not; a router that has
-            forgotten the connections when it is back). {cut["through"]} records came through meanwhile. When it was
+            record an hour of work ({cut["records"]} records; {pace}a router that has forgotten the connections when
+            it is back). {cut["through"]} records came through meanwhile. When it was
             back the first came after {cut["first_s"]:.0f} s, which is how long an uplink waits that tried in vain, and
             all were there after {cut["all_s"]:.0f} s: {cut["lost"]} lost, {cut["out_of_order"]} out of order."""
         ),

@@ -2,16 +2,21 @@
 
 A message is answered for when it is in the database for good, so that it is given again, to this collector or another,
 where it was not. What is given twice is known by its message id. Any number of collectors work side by side.
+
+Nearly all that comes is new: it is copied straight into the history. Where some of it is there already the database
+says so, nothing of it is written, and all goes by a table of its own that what is known is left out of. While the
+database writes, the next messages are fetched and read.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from datetime import datetime
-from typing import NoReturn
+from itertools import islice
+from typing import LiteralString, NamedTuple, NoReturn
 
 import psycopg
 from nats.aio.client import Client
@@ -23,6 +28,7 @@ from fdhil.daemon import journal
 from fdhil.errors import StoreError
 from fdhil.fleet import migrations, objects
 from fdhil.fleet.message import Record, Unread, decode
+from fdhil.fleet.migrations import NOTE_INCOMING, NOTE_SHIFTS
 from fdhil.fleet.transport import (
     ERRORS,
     cause_of,
@@ -36,7 +42,24 @@ BATCH = 100  # messages that are committed together
 WAIT_S = 2.0  # for the first of them
 _COLUMNS = "machine, message, recorded_at, store, sequence, axis, kind, stored_at, window_name, record"
 _INCOMING = "CREATE TEMP TABLE IF NOT EXISTS incoming (LIKE fleet.records) ON COMMIT DELETE ROWS"
-_COPY = f"COPY incoming ({_COLUMNS}) FROM STDIN"
+_COPY = f"COPY {{}} ({_COLUMNS}) FROM STDIN"
+NULL = "\\N"  # as COPY reads it
+_AT_ONCE = 64  # rows that are handed over together: the database writes them while the next are made
+_HEARD = "INSERT INTO fleet.heard AS h (machine, store, records, last_sequence, first_stored_at, last_stored_at)"
+_MORE_HEARD = """
+ON CONFLICT (machine, store) DO UPDATE SET records = h.records + excluded.records,
+  last_sequence = greatest(h.last_sequence, excluded.last_sequence),
+  last_stored_at = greatest(h.last_stored_at, excluded.last_stored_at)
+"""
+_COUNT = f"""
+{_HEARD} SELECT * FROM unnest(%s::text[], %s::text[], %s::int8[], %s::int8[], %s::timestamptz[], %s::timestamptz[])
+{_MORE_HEARD}
+"""
+# asked when the rows are written: none can be dropped from then on
+_DROPPED = """
+SELECT FROM unnest(%s::text[], %s::text[], %s::int8[], %s::int8[]) AS n (machine, store, first, last)
+  JOIN fleet.dropped d USING (machine, store) WHERE d.sequences && int8range(n.first, n.last, '[]') LIMIT 1
+"""
 # in one order everywhere, so that two collectors with the same records wait for each other and never in a circle
 _KEEP = f"""
 WITH added AS (
@@ -45,24 +68,32 @@ WITH added AS (
     WHERE (d.machine, d.store) = (i.machine, i.store) AND d.sequences @> i.sequence)
   ORDER BY machine, message, recorded_at
   ON CONFLICT DO NOTHING RETURNING machine, store, sequence, stored_at)
-INSERT INTO fleet.heard AS h (machine, store, records, last_sequence, first_stored_at, last_stored_at)
-  SELECT machine, store, count(*) FILTER (WHERE sequence > 0), max(sequence), min(stored_at), max(stored_at)
+{_HEARD} SELECT machine, store, count(*) FILTER (WHERE sequence > 0), max(sequence), min(stored_at), max(stored_at)
   FROM added GROUP BY machine, store ORDER BY machine, store
-ON CONFLICT (machine, store) DO UPDATE SET records = h.records + excluded.records,
-  last_sequence = greatest(h.last_sequence, excluded.last_sequence),
-  last_stored_at = greatest(h.last_stored_at, excluded.last_stored_at)
+{_MORE_HEARD}
 """
 _REFUSED = "INSERT INTO fleet.refused (subject, reason, payload) VALUES (%s, %s, %s)"
-Row = tuple[str | None, ...]
+Known = Sequence[tuple[Record, datetime]]
+Aside = Sequence[tuple[str, Unread]]
 
 
-@dataclass(frozen=True, slots=True)
-class Received:
+class Received(NamedTuple):
     """What one message held at one place: a record, or what is none."""
 
     subject: str
     stored_at: datetime
     told: Record | Unread
+
+
+@dataclass(slots=True)
+class Count:
+    """What a machine's history tells at once: how many numbered records, the first and last number, when they came."""
+
+    first_stored_at: datetime
+    last_stored_at: datetime
+    records: int = 0
+    first: int = 0
+    last: int = 0
 
 
 async def collect(fleet: Fleet, ready: Callable[[str], None]) -> NoReturn:
@@ -110,27 +141,25 @@ class Collector:
         await db.execute(_INCOMING)
         reader = await prepare_stream(client.jetstream(), self._fleet.stream)
         journal.write_line("the server and the database are there")
-        coming = asyncio.ensure_future(_fetch(reader))
+        coming = asyncio.ensure_future(_next(reader))
         try:
             while True:
-                messages = await coming
-                coming = asyncio.ensure_future(_fetch(reader))  # while these are written
-                await self._take(messages, db)
+                messages, received = await coming
+                coming = asyncio.ensure_future(_next(reader))  # while these are written
+                await self._take(messages, received, db)
                 if client.is_closed:
                     raise ConnectionResetError("the connection has ended")
         finally:
             await _give_back(coming)
 
-    async def _take(self, messages: Sequence[Msg], db: psycopg.AsyncConnection) -> None:
-        """Keep what is in messages, and answer for them."""
+    async def _take(self, messages: Sequence[Msg], received: Sequence[Received], db: psycopg.AsyncConnection) -> None:
+        """Keep what was received in messages, and answer for them."""
         if not messages:
             return
-        received = [each for message in messages for each in _received(message)]
         try:
             await self._keep(received, db)
         except (psycopg.Error, StoreError):
-            for message in messages:  # another collector may have them at once
-                await message.nak()
+            await _refuse(messages)
             raise
         for message in messages:
             await message.ack()
@@ -147,7 +176,7 @@ class Collector:
                 await self._keep(rest, db)
             elif isinstance(told := rest[0].told, Record):
                 aside = Unread(" ".join(str(error).split()), told.payload)
-                await self._write([replace(rest[0], told=aside)], db)
+                await self._write([rest[0]._replace(told=aside)], db)
             else:
                 raise
 
@@ -160,16 +189,90 @@ class Collector:
         months = {(record.recorded_at.year, record.recorded_at.month) for record, _ in known} - self._months
         await migrations.add_months(db, months)
         self._months |= months
+        aside = [(each.subject, each.told) for each in received if isinstance(each.told, Unread)]
+        if not await _written(known, aside, db):
+            async with db.transaction(), db.cursor() as cursor:
+                await _copy(cursor, "incoming", known)
+                await cursor.execute(_KEEP)
+                await cursor.execute(NOTE_INCOMING)
+                await _put_aside(cursor, aside)
+        for subject, unread in aside:
+            journal.write_line(f"a part of what {subject} told is put aside: {unread.reason}", "minor")
+
+
+async def _written(known: Known, aside: Aside, db: psycopg.AsyncConnection) -> bool:
+    """Write what is new as a whole; False where some of it is known or was dropped, and nothing is written."""
+    counts = _counted(known)
+    numbered = [(*source, each.first, each.last) for source, each in counts.items() if each.records]
+    with contextlib.suppress(psycopg.errors.UniqueViolation, psycopg.errors.DeadlockDetected):
         async with db.transaction(), db.cursor() as cursor:
-            async with cursor.copy(_COPY) as rows:
-                for record, stored_at in known:
-                    await rows.write_row(_row(record, stored_at))
-            await cursor.execute(_KEEP)
-            for each in received:
-                if isinstance(each.told, Unread):
-                    values = (each.subject.replace("\x00", ""), each.told.reason, each.told.payload)
-                    await cursor.execute(_REFUSED, values)
-                    journal.write_line(f"a part of what {each.subject} told is put aside: {each.told.reason}", "minor")
+            await _copy(cursor, "fleet.records", known)
+            rows = [(*source, c.records, c.last, c.first_stored_at, c.last_stored_at) for source, c in counts.items()]
+            await cursor.execute(_COUNT, _columns(rows, 6))
+            await cursor.execute(_DROPPED, _columns(numbered, 4))
+            if cursor.rowcount:
+                raise psycopg.Rollback
+            await cursor.execute(NOTE_SHIFTS, _columns(_newest(known), 3))
+            await _put_aside(cursor, aside)
+            return True
+    return False
+
+
+def _counted(known: Known) -> dict[tuple[str, str], Count]:
+    """Return what each history of a machine tells, in one order everywhere."""
+    counts: dict[tuple[str, str], Count] = {}
+    for record, stored_at in known:
+        count = counts.get((record.machine, record.store))
+        if count is None:
+            count = counts[record.machine, record.store] = Count(stored_at, stored_at)
+        count.first_stored_at = min(count.first_stored_at, stored_at)
+        count.last_stored_at = max(count.last_stored_at, stored_at)
+        if record.sequence > 0:
+            count.first = min(count.first, record.sequence) if count.records else record.sequence
+            count.last = max(count.last, record.sequence)
+            count.records += 1
+    return dict(sorted(counts.items()))
+
+
+def _newest(known: Known) -> list[tuple[str, str, datetime]]:
+    """Return what names the newest set of each axis and shift, in one order everywhere."""
+    newest: dict[tuple[str, str, int], tuple[datetime, int, Record]] = {}
+    for record, stored_at in known:
+        if record.kind == "parameters" and '"revision"' in record.text:
+            at = stored_at if record.recorded_at < migrations.FIRST else min(record.recorded_at, stored_at)
+            key = record.machine, record.axis, int(at.timestamp() // migrations.SHIFT_S)
+            if key not in newest or (stored_at, record.sequence) > newest[key][:2]:
+                newest[key] = stored_at, record.sequence, record
+    return [(of.machine, of.message, of.recorded_at) for _, (_, _, of) in sorted(newest.items())]
+
+
+def _columns(rows: Sequence[tuple[object, ...]], count: int) -> list[list[object]]:
+    return [[row[k] for row in rows] for k in range(count)]
+
+
+async def _copy(cursor: psycopg.AsyncCursor, table: LiteralString, known: Known) -> None:
+    rows = _rows(known)
+    async with cursor.copy(_COPY.format(table)) as into:
+        while some := "".join(islice(rows, _AT_ONCE)):
+            await into.write(some)
+
+
+async def _put_aside(cursor: psycopg.AsyncCursor, aside: Aside) -> None:
+    for subject, unread in aside:
+        await cursor.execute(_REFUSED, (subject.replace("\x00", ""), unread.reason, unread.payload))
+
+
+async def _next(reader: JetStreamContext.PullSubscription) -> tuple[list[Msg], list[Received]]:
+    """Return the messages that come next, and what is in them."""
+    messages, received = await _fetch(reader), list[Received]()
+    try:
+        for message in messages:
+            received += _received(message)
+            await asyncio.sleep(0)  # what is written meanwhile goes on
+    except asyncio.CancelledError:
+        await _refuse(messages)
+        raise
+    return messages, received
 
 
 async def _fetch(reader: JetStreamContext.PullSubscription) -> list[Msg]:
@@ -179,12 +282,18 @@ async def _fetch(reader: JetStreamContext.PullSubscription) -> list[Msg]:
         return []
 
 
-async def _give_back(coming: asyncio.Future[list[Msg]]) -> None:
+async def _give_back(coming: asyncio.Future[tuple[list[Msg], list[Received]]]) -> None:
     """Let another collector have at once what came and is not looked at any more."""
     coming.cancel()
     with contextlib.suppress(asyncio.CancelledError, *ERRORS):
-        for message in await coming:
-            await message.nak()
+        messages, _ = await coming
+        await _refuse(messages)
+
+
+async def _refuse(messages: Sequence[Msg]) -> None:
+    """Give messages back: another collector may have them at once."""
+    for message in messages:
+        await message.nak()
 
 
 def _received(message: Msg) -> list[Received]:
@@ -192,9 +301,14 @@ def _received(message: Msg) -> list[Received]:
     return [Received(message.subject, stored_at, told) for told in decode(message.subject, message.data)]
 
 
-def _row(record: Record, stored_at: datetime) -> Row:
-    """Return a row as texts, which are written three times as fast."""
-    return (
-        record.machine, record.message, record.recorded_at.isoformat(), record.store, str(record.sequence), record.axis,
-        record.kind, stored_at.isoformat(), record.window_name, record.text,
-    )  # fmt: skip
+def _rows(known: Known) -> Iterator[str]:
+    """Yield rows as COPY reads them; what a record says of itself has no character that means something there."""
+    before, stored = None, ""
+    for record, stored_at in known:
+        if stored_at is not before:  # all of a message came at once
+            before, stored = stored_at, stored_at.isoformat()
+        text = record.text.replace("\\", "\\\\").replace("\t", "\\t").replace("\r", "\\r")
+        yield (
+            f"{record.machine}\t{record.message}\t{record.recorded_at.isoformat()}\t{record.store}\t{record.sequence}\t"
+            f"{record.axis}\t{record.kind}\t{stored}\t{record.window_name or NULL}\t{text}\n"
+        )

@@ -2,24 +2,41 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from datetime import datetime
-from typing import Any
+from typing import Any, LiteralString
 
+import psycopg
 from pydantic import ValidationError
 
 from fdhil.config import Maintenance
-from fdhil.fleet.sets import Db, Row, newest_sets, std_of
+from fdhil.fleet.sets import OF_AXES, SERVICED, Axis, Db, Row, asked, axes_of, newest_sets, std_of
 from fdhil.records import PARAMETERS, unit_of
 from fdhil.report.history_trends import of_axis
 from fdhil.store.rows import Stamp, StoredWindow
 
 NEWEST_SETS, APART = 180, "1 day"  # half a year
-_FIRST = """
-SELECT DISTINCT ON (s.machine, s.axis) s.* FROM fleet.parameter_sets s JOIN fleet.axes a USING (machine, axis)
-WHERE s.at >= coalesce(a.serviced_at, '-infinity') ORDER BY s.machine, s.axis, s.stored_at, s.sequence
+TOGETHER = 500  # axes that are looked at and kept together
+# ``stored_at`` is never before ``at``, and has an index
+_FIRST: LiteralString = f"""
+SELECT f.* {OF_AXES}, {SERVICED}, LATERAL (SELECT * FROM fleet.parameter_sets s
+  WHERE s.machine = a.machine AND s.axis = a.axis AND s.at >= coalesce(v.serviced_at, '-infinity')
+    AND s.stored_at >= coalesce(v.serviced_at, '-infinity') ORDER BY s.stored_at, s.sequence LIMIT 1) f
 """
+_LAST: LiteralString = f"""
+SELECT a.machine, a.axis, n.*, c.limits, c.made_of, date_bin('1 day', n.at, 'epoch'::timestamptz)::text AS day,
+  v.serviced_at::text AS serviced {OF_AXES} LEFT JOIN fleet.forecasts c USING (machine, axis), {SERVICED},
+  LATERAL (SELECT s.at, "R", "L", "K", "Jt", "ft", "Cd" FROM fleet.shifts s
+    WHERE s.machine = a.machine AND s.axis = a.axis ORDER BY shift DESC LIMIT 1) n
+"""
+_KEEP: LiteralString = """
+INSERT INTO fleet.forecasts SELECT * FROM unnest(%s::text[], %s::text[], %s::text[], %s::jsonb[])
+ON CONFLICT (machine, axis) DO UPDATE SET made_of = excluded.made_of, limits = excluded.limits
+"""
+Limits = Mapping[str, Mapping[str, Any]]
 
 
 def due(db: Db) -> list[dict[str, Any]]:
@@ -27,20 +44,45 @@ def due(db: Db) -> list[dict[str, Any]]:
 
     A limit is what [maintenance] of the machine allows from the first set since the axis' newest service. There is no
     date while a trend is not sure, or was seen for less than three days; none lies farther ahead than five times that.
+    A trend is looked at once a day, as it has one set a day, and when a limit or a service is new; it is kept.
     """
     shares = {row["machine"]: _shares(row["about"]) for row in db.execute("SELECT machine, about FROM fleet.machines")}
-    first = {(row["machine"], row["axis"]): row for row in db.execute(_FIRST)}
-    found = []
-    for key, rows in newest_sets(db, NEWEST_SETS, APART).items():
+    axes = [key for key in axes_of(db) if key[0] in shares]
+    last = {(row["machine"], row["axis"]): row for row in db.execute(_LAST, asked(axes))}
+    of = {key: json.dumps([row["day"], row["serviced"], shares[key[0]]]) for key, row in last.items()}
+    limits: dict[Axis, Limits] = {key: row["limits"] for key, row in last.items() if row["made_of"] == of[key]}
+    old = [key for key in last if key not in limits]
+    for begin in range(0, len(old), TOGETHER):
+        some = old[begin : begin + TOGETHER]
+        limits |= (found := _forecasts(db, some, shares))
+        _keep(db, [(*key, of[key], json.dumps(found[key])) for key in some])
+    told = []
+    for key, each in limits.items():
+        for parameter, limit in each.items():
+            place = {"machine": key[0], "axis": key[1], "parameter": parameter, "unit": unit_of(parameter)}
+            told.append(place | {"value": last[key][parameter]} | dict(limit))
+    return sorted(told, key=lambda each: datetime.fromisoformat(each["date"]))
+
+
+def _forecasts(db: Db, axes: Sequence[Axis], shares: Mapping[str, Mapping[str, float]]) -> dict[Axis, Limits]:
+    """Return the limits that each axis will reach."""
+    first = {(row["machine"], row["axis"]): row for row in db.execute(_FIRST, asked(axes))}
+    found: dict[Axis, Limits] = {key: {} for key in axes}
+    for key, rows in newest_sets(db, NEWEST_SETS, axes, APART).items():
         limits = {
             name: (first[key][name], share)
             for name, share in shares[key[0]].items()
             if key in first and first[key][name]
         }
-        for parameter, told in of_axis(list(map(_as_window, rows)), limits)["limits"].items():
-            place = {"machine": key[0], "axis": key[1], "parameter": parameter, "unit": unit_of(parameter)}
-            found.append(place | {"value": rows[-1][parameter]} | told)
-    return sorted(found, key=lambda each: datetime.fromisoformat(each["date"]))
+        found[key] = of_axis(list(map(_as_window, rows)), limits)["limits"]
+    return found
+
+
+def _keep(db: Db, rows: Sequence[tuple[str, str, str, str]]) -> None:
+    """Keep what was found, where who asks may write."""
+    with suppress(psycopg.errors.InsufficientPrivilege, psycopg.errors.ReadOnlySqlTransaction), db.transaction():
+        db.execute("SET TRANSACTION READ WRITE")
+        db.execute(_KEEP, [list(column) for column in zip(*sorted(rows), strict=True)])
 
 
 def _shares(about: Mapping[str, Any] | None) -> dict[str, float]:

@@ -18,6 +18,8 @@ from psycopg.rows import tuple_row
 from fdhil.errors import StoreError
 
 FIRST_YEAR, LAST_YEAR = 2020, 2099  # of the partitions: a wrong clock makes no others
+FIRST = datetime(FIRST_YEAR, 1, 1, tzinfo=UTC)  # what was recorded before has the time at which it came
+SHIFT_S = 21_600  # of which the newest set stands for all
 LOCK = 7_170_018  # of the advisory lock under which the schema changes
 _FIRST: LiteralString = """
 CREATE TABLE fleet.records (
@@ -144,8 +146,57 @@ CREATE VIEW fleet.loops AS
     record->'unexplained_um' AS unexplained_um, record->'reasons' AS reasons
   FROM fleet.records WHERE kind = 'loops' AND record ? 'structure';
 """
+# of each axis the newest set of every six hours: what is asked of all machines is asked of these, and not of all sets;
+# and when each axis reaches its limits, as it was told last
+_STDS: LiteralString = """
+ARRAY(SELECT CASE WHEN jsonb_typeof(c.v) <> 'number' OR (c.v)::numeric < 0 THEN NULL WHEN (c.v)::numeric < 1e-250 THEN 0
+    WHEN (c.v)::numeric < 1e250 THEN sqrt((c.v)::numeric::float8) END
+  FROM generate_series(0, 5) k, LATERAL (SELECT r.record->'covariance'->k->k AS v) c ORDER BY k)
+"""
+_OF_SHIFTS: LiteralString = f"""
+INSERT INTO fleet.shifts AS s SELECT DISTINCT ON (machine, axis, shift) r.machine, r.axis,
+    date_bin('6 hours', fleet.time_of(r.recorded_at, r.stored_at), 'epoch'::timestamptz) AS shift,
+    fleet.time_of(r.recorded_at, r.stored_at), r.stored_at, r.sequence, (r.record->>'revision')::bigint,
+    (r.record->>'R')::float8, (r.record->>'L')::float8, (r.record->>'K')::float8, (r.record->>'Jt')::float8,
+    (r.record->>'ft')::float8, (r.record->>'Cd')::float8, {_STDS}, (r.record->>'temperature_c')::float8
+"""
+_NEWER: LiteralString = """
+  ORDER BY machine, axis, shift, stored_at DESC, sequence DESC
+ON CONFLICT (machine, axis, shift) DO UPDATE SET at = excluded.at, stored_at = excluded.stored_at,
+  sequence = excluded.sequence, revision = excluded.revision, "R" = excluded."R", "L" = excluded."L",
+  "K" = excluded."K", "Jt" = excluded."Jt", "ft" = excluded."ft", "Cd" = excluded."Cd", stds = excluded.stds,
+  temperature_c = excluded.temperature_c
+WHERE (s.stored_at, s.sequence) < (excluded.stored_at, excluded.sequence)
+"""
+_IS_SET: LiteralString = "WHERE r.kind = 'parameters' AND r.record ? 'revision'"
+NOTE_SHIFTS: LiteralString = f"""
+{_OF_SHIFTS} FROM unnest(%s::text[], %s::text[], %s::timestamptz[]) AS n (machine, message, recorded_at)
+  JOIN fleet.records r USING (machine, message, recorded_at) {_IS_SET} {_NEWER}
+"""
+NOTE_INCOMING: LiteralString = f"""
+{_OF_SHIFTS} FROM incoming i JOIN fleet.records r USING (machine, message, recorded_at) {_IS_SET} {_NEWER}
+"""
+FILL_SHIFTS: LiteralString = f"{_OF_SHIFTS} FROM fleet.told r {_IS_SET} {_NEWER}"
+KNOWN_AXES: LiteralString = """
+WITH RECURSIVE known AS (
+  (SELECT machine, axis FROM fleet.shifts ORDER BY machine, axis LIMIT 1)
+  UNION ALL SELECT n.machine, n.axis FROM known k, LATERAL (SELECT machine, axis FROM fleet.shifts s
+    WHERE (s.machine, s.axis) > (k.machine, k.axis) ORDER BY machine, axis LIMIT 1) n)
+"""
+_SHIFTS: LiteralString = f"""
+CREATE TABLE fleet.shifts (machine text NOT NULL, axis text NOT NULL, shift timestamptz NOT NULL,
+  at timestamptz NOT NULL, stored_at timestamptz NOT NULL, sequence bigint NOT NULL, revision bigint,
+  "R" float8, "L" float8, "K" float8, "Jt" float8, "ft" float8, "Cd" float8, stds float8[], temperature_c float8,
+  PRIMARY KEY (machine, axis, shift));
+CREATE TABLE fleet.forecasts (machine text NOT NULL, axis text NOT NULL, made_of text NOT NULL, limits jsonb NOT NULL,
+  PRIMARY KEY (machine, axis));
+{FILL_SHIFTS};
+CREATE OR REPLACE VIEW fleet.newest_parameter_sets AS {KNOWN_AXES}
+  SELECT n.* FROM known k, LATERAL (SELECT * FROM fleet.parameter_sets s
+    WHERE s.machine = k.machine AND s.axis = k.axis ORDER BY s.stored_at DESC, s.sequence DESC LIMIT 1) n;
+"""
 # what leads from each version to the next, in order: a new one is added at the end, an old one never changes
-_STEPS: tuple[LiteralString, ...] = (_FIRST, _VIEWS, _REANALYSES, _ROLL_OUT, _SISTERS)
+_STEPS: tuple[LiteralString, ...] = (_FIRST, _VIEWS, _REANALYSES, _ROLL_OUT, _SISTERS, _SHIFTS)
 VERSION = len(_STEPS)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from fdhil.fleet.due import due
 from fdhil.fleet.outliers import Course, Sisters, judge, of_machines
 from fdhil.fleet.services import services
-from fdhil.fleet.sets import MONTH_S, Db, Row, ages_months, date_of, known, newest_sets, std_of
+from fdhil.fleet.sets import MONTH_S, Db, Row, ages_months, axes_of, date_of, known, newest_sets, std_of
 from fdhil.records import INTERVAL_95, PARAMETERS, frozen, unit_of
 
 __all__ = ["compare", "outliers", "services", "status", "trend"]
@@ -128,7 +128,7 @@ def _groups(db: Db, by: str, axis: str | None) -> dict[tuple[str, str], list[Row
     """Return the newest sets of each axis, by the label of its machine (or its own) and its letter."""
     labels = {row["machine"]: row["about"] or {} for row in db.execute("SELECT machine, about FROM fleet.machines")}
     groups: dict[tuple[str, str], list[Rows]] = {}
-    for (machine, letter), rows in newest_sets(db, NEWEST_SETS, axis=axis).items():
+    for (machine, letter), rows in newest_sets(db, NEWEST_SETS, axes_of(db, axis)).items():
         groups.setdefault((_label(labels.get(machine, {}), letter, by), letter), []).append(rows)
     return groups
 

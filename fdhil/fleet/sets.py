@@ -14,6 +14,7 @@ from psycopg.rows import DictRow, dict_row
 
 from fdhil.config.fleet import Fleet
 from fdhil.errors import ConnectError, StoreError
+from fdhil.fleet.migrations import KNOWN_AXES
 from fdhil.records import PARAMETERS
 
 MONTH_S = 30 * 86_400.0
@@ -21,18 +22,22 @@ SHIFT = "6 hours"
 SORTED_MB = 64  # in memory: what is asked looks at all sets
 Db = psycopg.Connection[DictRow]
 Row = Mapping[str, Any]
+Axis = tuple[str, str]  # with its machine before it
 # of what is published again and again the newest of each shift stands for all: a course is weeks, not minutes
-_THINNED: LiteralString = """
-SELECT * FROM (SELECT *, row_number() OVER (PARTITION BY machine, axis ORDER BY stored_at DESC, sequence DESC) AS back
-  FROM (SELECT DISTINCT ON (s.machine, s.axis, date_bin(%(apart)s::interval, s.at, 'epoch'::timestamptz)) s.*,
-      coalesce(a.serviced_at, a.first_at) AS since
-    FROM fleet.parameter_sets s JOIN fleet.axes a USING (machine, axis)
-    WHERE (%(machine)s::text IS NULL OR s.machine = %(machine)s) AND (%(axis)s::text IS NULL OR s.axis = %(axis)s)
-      AND s.at >= coalesce(a.serviced_at, '-infinity')
-    ORDER BY s.machine, s.axis, date_bin(%(apart)s::interval, s.at, 'epoch'::timestamptz), s.stored_at DESC,
-      s.sequence DESC
-  ) AS thinned) AS numbered
-WHERE back <= %(most)s ORDER BY machine, axis, back DESC
+_AXES: LiteralString = f"{KNOWN_AXES} SELECT machine, axis FROM known WHERE %(axis)s::text IS NULL OR axis = %(axis)s"
+SERVICED: LiteralString = """
+LATERAL (SELECT max(o.serviced_at) AS serviced_at FROM fleet.services o WHERE o.machine = a.machine
+  AND o.axis IN ('', a.axis) AND o.serviced_at <= now()) v
+"""
+OF_AXES: LiteralString = "FROM unnest(%(machines)s::text[], %(axes)s::text[]) a (machine, axis)"
+_THINNED: LiteralString = f"""
+SELECT n.machine, n.axis, n.sequence, n.at, n."R", n."L", n."K", n."Jt", n."ft", n."Cd", n.stds, n.temperature_c,
+  coalesce(v.serviced_at, f.at) AS since {OF_AXES}, {SERVICED},
+  LATERAL (SELECT at FROM fleet.shifts s WHERE s.machine = a.machine AND s.axis = a.axis ORDER BY shift LIMIT 1) f,
+  LATERAL (SELECT DISTINCT ON (bin) s.*, date_bin(%(apart)s::interval, s.shift, 'epoch'::timestamptz) AS bin
+    FROM fleet.shifts s WHERE s.machine = a.machine AND s.axis = a.axis AND s.at >= coalesce(v.serviced_at, '-infinity')
+    ORDER BY bin DESC, s.stored_at DESC, s.sequence DESC LIMIT %(most)s) n
+ORDER BY n.machine, n.axis, n.stored_at, n.sequence
 """
 
 
@@ -64,11 +69,19 @@ def unreachable(error: psycopg.Error) -> ConnectError:
     return ConnectError("PostgreSQL", text)
 
 
-def newest_sets(
-    db: Db, most: int, apart: str = SHIFT, machine: str | None = None, axis: str | None = None
-) -> dict[tuple[str, str], list[DictRow]]:
-    """Return the newest sets of each axis since its newest service, oldest first, one of each time ``apart``."""
-    rows = db.execute(_THINNED, {"most": most, "apart": apart, "machine": machine, "axis": axis}).fetchall()
+def axes_of(db: Db, axis: str | None = None) -> list[Axis]:
+    """Return the axes, each with its machine, of which there are sets; of one letter alone, or of all."""
+    return [(row["machine"], row["axis"]) for row in db.execute(_AXES, {"axis": axis})]
+
+
+def asked(axes: Sequence[Axis]) -> dict[str, list[str]]:
+    """Return axes as a query with OF_AXES takes them."""
+    return {"machines": [machine for machine, _ in axes], "axes": [axis for _, axis in axes]}
+
+
+def newest_sets(db: Db, most: int, axes: Sequence[Axis], apart: str = SHIFT) -> dict[Axis, list[DictRow]]:
+    """Return the newest sets of axes since the newest service of each, oldest first, one of each time ``apart``."""
+    rows = db.execute(_THINNED, {"most": most, "apart": apart, **asked(axes)}).fetchall()
     return {key: list(own) for key, own in groupby(rows, key=lambda row: (row["machine"], row["axis"]))}
 
 
@@ -80,6 +93,8 @@ def ages_months(rows: Sequence[Row]) -> list[float]:
 def std_of(row: Row, parameter: str) -> float:
     """Return a parameter's standard deviation by the covariance as it was told; NaN where there is none."""
     k = PARAMETERS.index(parameter)
+    if "stds" in row:
+        return math.nan if row["stds"][k] is None else float(row["stds"][k])
     try:
         variance = float(row["covariance"][k][k])
     except (TypeError, IndexError, ValueError):

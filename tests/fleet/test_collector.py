@@ -17,7 +17,7 @@ import pytest
 from fdhil.config.fleet import Fleet, Objects
 from fdhil.errors import StoreError
 from fdhil.fleet import objects
-from fdhil.fleet.collector import Collector, Received, _fetch, _give_back
+from fdhil.fleet.collector import Collector, Received, _fetch, _give_back, _next
 from fdhil.fleet.message import Message, Unread, of_entry
 from fdhil.store.outbox import Entry
 
@@ -62,7 +62,7 @@ def told(log: list[str], window: bytes | None = None) -> Told:
 
 
 async def take(collector: Collector, *messages: Told) -> None:
-    await collector._take(await _fetch(cast(Any, Reader(*messages))), cast(Any, None))
+    await collector._take(*await _next(cast(Any, Reader(*messages))), cast(Any, None))
 
 
 @pytest.fixture
@@ -117,7 +117,7 @@ async def test_that_nothing_came_is_no_fault(nothing: type[Exception]) -> None:
 
 async def test_what_came_meanwhile_is_given_back_when_the_collector_ends() -> None:
     log: list[str] = []
-    coming = asyncio.ensure_future(_fetch(cast(Any, Reader(told(log), told(log)))))
+    coming = asyncio.ensure_future(_next(cast(Any, Reader(told(log), told(log)))))
     await asyncio.wait([coming])
     await _give_back(coming)
     assert log == ["nak", "nak"]

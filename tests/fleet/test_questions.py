@@ -157,7 +157,7 @@ async def test_a_record_that_the_database_does_not_take_is_put_aside_alone(
     received = received_of(told_by(machine)[:13])
     record = received[bad].told
     assert isinstance(record, Record)
-    received[bad] = replace(received[bad], told=replace(record, text='{"text": "\\u0000"}'))
+    received[bad] = received[bad]._replace(told=record._replace(text='{"text": "\\u0000"}'))
     await keep(fleet_of(database, tmp_path), received)
     assert database.ask("SELECT count(*) FROM fleet.records") == [(12,)]
     ((subject, reason, payload),) = database.ask("SELECT subject, reason, payload FROM fleet.refused")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -80,7 +79,7 @@ class TestWithADatabase:
         await keep(works, told[:4] + told[5:])  # the machine has lost its position
         assert database.ask(count) == rows
         assert machines(database)[0][2] == 1
-        await keep(works, [replace(told[4], stored_at=NOW)])
+        await keep(works, [told[4]._replace(stored_at=NOW)])
         assert machines(database)[0][1:3] == (len(told) - 1, 0)
         assert partitions(database)[0] == "records_2026_01"
         assert "records_2026_01" not in let_go(works)["months"]  # it came today: it lives as long as the rest
@@ -95,14 +94,14 @@ class TestWithADatabase:
         let_go(works)
         database.ask("""INSERT INTO fleet.records SELECT machine, 'late', recorded_at, store, 999, axis, kind, now(),
             window_name, record FROM fleet.kept WHERE kind = 'parameters' LIMIT 1""")
-        await keep(works, [replace(told[4], stored_at=NOW)])
+        await keep(works, [told[4]._replace(stored_at=NOW)])
         assert partitions(database) == ["records_other"]
         assert database.ask("SELECT count(*) FROM fleet.records") == [(2,)]
 
     async def test_wrong_clocks_go_by_when_they_came(
         self, works: Fleet, told: list[Received], database: Postgres
     ) -> None:
-        old, young = told[1], replace(told[2], stored_at=NOW)
+        old, young = told[1], told[2]._replace(stored_at=NOW)
         await keep(works, [told_at(old, datetime(1970, 1, 1, tzinfo=UTC), stored=MONTHS[0]), young])
         assert let_go(works)["records_of_wrong_clocks"] == 1
         assert machines(database)[0][1] == 2
@@ -118,7 +117,7 @@ class TestWithADatabase:
         last = told[-1].told
         assert isinstance(last, Record)
         for name, at in ((names[0], MONTHS[1]), (names[1], datetime(2026, 5, 10, tzinfo=UTC)), (names[2], NOW)):
-            await keep(works, [told_at(replace(told[-1], told=replace(last, message=name, window=None)), at)])
+            await keep(works, [told_at(told[-1]._replace(told=last._replace(message=name, window=None)), at)])
             database.ask(f"UPDATE fleet.records SET window_name = '{name}' WHERE message = '{name}'")
         objects.keep(works.objects.directory, names[3], b"window")  # on its way: its row is not there yet
         found = let_go(works)

@@ -90,7 +90,7 @@ async def test_a_service_is_entered_and_what_it_changed_is_told(
     assert f"{day}T00:00:00+00:00  mill-1 axis X  lubricated" in asked("services")[1]
 
     with asking(fleet_of(database, tmp_path)) as db:
-        rows = newest_sets(db, 100)["mill-1", "X"]
+        rows = newest_sets(db, 100, [("mill-1", "X")])["mill-1", "X"]
     assert [row["at"] for row in rows] == [BEGIN + timedelta(days=k) for k in range(SERVICED, DAYS)]
     (since,) = due(asked)
     reached = datetime.fromisoformat(since["date"]) - BEGIN

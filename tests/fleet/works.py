@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -76,7 +75,7 @@ async def keep(fleet: Fleet, received: Sequence[Received]) -> None:
 def told_at(received: Received, at: datetime, stored: datetime | None = None) -> Received:
     """Return what was received as recorded at a time, and stored then or later."""
     assert isinstance(received.told, Record)
-    return replace(received, stored_at=stored or at, told=replace(received.told, recorded_at=at))
+    return received._replace(stored_at=stored or at, told=received.told._replace(recorded_at=at))
 
 
 def at_days(machine: Machine, begin: datetime) -> list[Received]:

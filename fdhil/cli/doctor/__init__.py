@@ -47,7 +47,7 @@ def doctor(config: Path, offline: bool, as_json: bool) -> int:
 
 def _in_order(config: MachineConfig, offline: bool) -> Iterator[Trouble]:
     """Examine from the cause to what depends on it: this PC, its interfaces, the devices behind them, the guard."""
-    from fdhil.cli.doctor import computer, devices, storage, uplink  # late: --help imports nothing heavy
+    from fdhil.cli.doctor import computer, devices, offers, storage, uplink  # late: --help imports nothing heavy
 
     yield from storage.examine_store(config)
     yield from computer.examine_clock(newest_record_s(config.store.directory))
@@ -63,6 +63,7 @@ def _in_order(config: MachineConfig, offline: bool) -> Iterator[Trouble]:
         yield from devices.examine_devices(config, heard, recorded, _progress)
     yield from devices.examine_guard(config)
     yield from uplink.examine_uplink(config, offline)
+    yield from offers.examine_offers(config)
 
 
 def _progress(text: str) -> None:

@@ -1,0 +1,61 @@
+"""fdhil doctor tells of an offer that waits, and of what keeps it from being looked at."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+from fdhil import config as machine_config
+from fdhil.cli.doctor.offers import examine_offers
+from fdhil.config import MachineConfig
+from fdhil.store.offers import ANSWERS_FILE, Answer, add_answer, file_name
+from tests.fleet.offers import Works, machine_of
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> MachineConfig:
+    """A machine with an offer that nobody has answered."""
+    works = Works(tmp_path)
+    config = machine_config.load(machine_of(works, tmp_path / "mill"))
+    config.offers_directory.mkdir(parents=True)
+    (config.offers_directory / file_name("friction", 3)).write_bytes(works.document())
+    return config
+
+
+def told(machine: MachineConfig) -> list[tuple[str, bool]]:
+    found = list(examine_offers(machine))
+    assert all(each.what and each.means and each.mend for each in found)
+    return [(each.code, each.grave) for each in found]
+
+
+def test_an_offer_is_told_until_it_is_answered(machine: MachineConfig) -> None:
+    assert told(machine) == [("OfferWaits", False)]
+    answer = Answer("friction", 3, 1, "0" * 64, "rejected", "Anna", "not now", time.time(), "")
+    add_answer(machine.store.directory, answer)
+    assert told(machine) == []
+
+
+def test_answers_that_cannot_be_read(machine: MachineConfig) -> None:
+    machine.store.directory.mkdir(parents=True, exist_ok=True)
+    (machine.store.directory / ANSWERS_FILE).write_text("{")
+    assert told(machine) == [("OffersUnread", True)]
+
+
+@pytest.mark.parametrize("what", ["the folder", "an offer"])
+def test_what_this_user_may_not_read(what: str, machine: MachineConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = machine.offers_directory
+    shut = folder if what == "the folder" else folder / file_name("friction", 3)
+    monkeypatch.setattr(os, "access", lambda path, _: path != shut)  # root may read all
+    assert ("OffersUnread", True) in told(machine)
+
+
+def test_where_no_works_is_trusted_nothing_is_looked_at(machine: MachineConfig) -> None:
+    alone = machine.model_copy(update={"offers": machine.offers.model_copy(update={"trust": ()})})
+    assert told(alone) == []
+
+
+def test_no_offer_is_no_trouble(tmp_path: Path) -> None:
+    assert told(machine_config.load(machine_of(Works(tmp_path), tmp_path / "mill"))) == []
