@@ -35,7 +35,8 @@ def nobody() -> int | None:
 class Target:
     """A way in: true examples, what any bytes do there, words that its inputs are made of, and how long one may be.
 
-    ``worker`` tells the process that works for this one, whose time and memory count as well.
+    ``worker`` tells the process that works for this one, whose time and memory count as well; ``ready`` begins it, and
+    that is none of the input's time.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Target:
     words: Sequence[bytes] = field(default=())
     longest: int = 4096
     worker: Callable[[], int | None] = nobody
+    ready: Callable[[], object] = nobody
 
 
 def processor_s(target: Target) -> float:
@@ -87,6 +89,7 @@ def judged(target: Target, data: bytes) -> Finding | None:
 
 
 def _judged_once(target: Target, data: bytes) -> Finding | None:
+    target.ready()
     begin_s, before = processor_s(target), peaks_bytes(target)
     try:
         with _given_up():

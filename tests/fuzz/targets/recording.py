@@ -9,7 +9,7 @@ from fdhil.errors import RecordingError
 from fdhil.store import reading_process
 from fdhil.store.export import table_of
 from fdhil.store.recording_table import RecordingTable, recording_of
-from tests.fuzz.tasting import Target, nobody
+from tests.fuzz.tasting import Target
 from tests.store.made import window
 
 WORDS = [b"fdhil-recording-1", b"sample_rate_hz", b"time_s", b"nan", b"inf", b"1e999", b"voltage_samples_V", b"\0" * 8]
@@ -34,5 +34,12 @@ def target_of(name: str, longest: int, words: list[bytes]) -> Target:
         except RecordingError as error:
             assert len(str(error)) < 2000
 
-    worker = nobody if name in ("csv", "parquet") else _reader
-    return Target(f"recording_{name}", [form.encode(few)], taste, [*WORDS, *words], longest, worker)
+    def ready() -> None:
+        if _reader() is None:
+            taste(true)
+
+    true = form.encode(few)
+    given = (f"recording_{name}", [true], taste, [*WORDS, *words], longest)
+    if name in ("csv", "parquet"):
+        return Target(*given)
+    return Target(*given, worker=_reader, ready=ready)
