@@ -68,11 +68,10 @@ class ReadingProcess:
                 stderr=subprocess.DEVNULL,  # libraries complain there of what is damaged
                 start_new_session=True,  # Ctrl-C is for who asks
             )
-        try:
-            self._asked.recv_bytes()
-        except BaseException:
-            self.end()
-            raise
+        with contextlib.ExitStack() as failing:
+            failing.callback(self.end)
+            self._asked.recv_bytes()  # it is ready
+            failing.pop_all()
 
     def answer(self, reader: str, content: bytes, source: str) -> RecordingTable | FdhilError:
         """Return the table or the refusal; EOFError, OSError, ValueError where there is none."""

@@ -33,6 +33,8 @@ def target_of(name: str, longest: int, words: list[bytes]) -> Target:
             recording_of(form.decode(data, "r"), "r")
         except RecordingError as error:
             assert len(str(error)) < 2000
+            process = reading_process._PROCESSES.get(os.getpid())
+            assert process is None or process.child.returncode != 1, f"its reader raised what it must not: {error}"
 
     def ready() -> None:
         if _reader() is None:
