@@ -37,11 +37,13 @@ def read_apart(reader: str, kind: str, content: bytes, source: str) -> Recording
     """
     with _ONE:
         process, answer = _process(source), None
+        refusal = unreadable(source, kind, EOFError("what reads it did not survive it"))
         try:
             answer = process.answer(reader, content, source)
         except (EOFError, OSError, ValueError):
-            why = f"it was not read within {LONGEST_S:g} s" if process.end() == -signal.SIGALRM else _DIED
-            raise unreadable(source, kind, EOFError(why)) from None
+            if process.end() == -signal.SIGALRM:
+                refusal = unreadable(source, kind, EOFError(f"it was not read within {LONGEST_S:g} s"))
+            raise refusal from None
         finally:
             if answer is None:  # also when who asks is interrupted: the next file must not get this one's answer
                 process.end()
@@ -93,7 +95,6 @@ class ReadingProcess:
 
 _ONE = Lock()
 _PROCESSES: dict[int, ReadingProcess] = {}  # by who asks: a process that was forked has none of its parent's
-_DIED = "what reads it did not survive it"
 
 
 def _process(source: str) -> ReadingProcess:
