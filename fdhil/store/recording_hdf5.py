@@ -9,8 +9,10 @@ import numpy as np
 
 from fdhil.errors import FdhilError
 from fdhil.records import Float
+from fdhil.store.reading_process import read_apart
 from fdhil.store.recording_table import UNITS, UNREADABLE, RecordingTable, check_size, unreadable
 
+KIND = "HDF5 file"
 MOST_DATASETS = 1000
 
 
@@ -27,6 +29,11 @@ def encode(table: RecordingTable) -> bytes:
 
 def decode(content: bytes, source: str) -> RecordingTable:
     """Return the table of a file's bytes; datasets in groups by their path. RecordingError when it is no HDF5 file."""
+    return read_apart(__name__, KIND, content, source)
+
+
+def read(content: bytes, source: str) -> RecordingTable:
+    """Return the table in this process, which a damaged file may end."""
     h5py = _h5py()
     try:
         with h5py.File(io.BytesIO(content), "r") as file:
@@ -37,7 +44,7 @@ def decode(content: bytes, source: str) -> RecordingTable:
             }
             headers = {str(key): _text(value) for key, value in file.attrs.items()}
     except UNREADABLE as error:
-        raise unreadable(source, "HDF5 file", error) from None
+        raise unreadable(source, KIND, error) from None
     return RecordingTable(headers, columns)
 
 

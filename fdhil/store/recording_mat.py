@@ -1,6 +1,7 @@
 """Recordings as MATLAB files: one vector each, the headers in a struct ``headers``, the units in a struct ``units``.
 
-Written in version 5, which MATLAB, Octave and scipy read; version 7.3 is HDF5 and is read as such.
+Written in version 5, which MATLAB, Octave and scipy read; version 7.3 is HDF5 and is read as such. A damaged file ends
+scipy's process, so it is read in one of its own.
 """
 
 from __future__ import annotations
@@ -10,8 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from fdhil.store.reading_process import read_apart
 from fdhil.store.recording_table import UNITS, UNREADABLE, RecordingTable, check_size, unreadable
 
+KIND = "MATLAB file"
 MOST_VARIABLES = 1000
 _V73 = b"MATLAB 7.3"
 _NUMBERS = {"double", "single", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"}
@@ -32,10 +35,15 @@ def encode(table: RecordingTable) -> bytes:
 
 def decode(content: bytes, source: str) -> RecordingTable:
     """Return the table of a file's bytes; RecordingError when it is no MATLAB file."""
+    return read_apart(__name__, KIND, content, source)
+
+
+def read(content: bytes, source: str) -> RecordingTable:
+    """Return the table in this process, which a damaged file may end."""
     if content.startswith(_V73):
         from fdhil.store import recording_hdf5
 
-        return recording_hdf5.decode(content, source)
+        return recording_hdf5.read(content, source)
     from scipy import io as scipy_io
     from scipy.io.matlab import MatReadError
 
@@ -51,7 +59,7 @@ def decode(content: bytes, source: str) -> RecordingTable:
         columns = {name: np.atleast_1d(np.asarray(read[name], dtype=np.float64)) for name in vectors}
         headers = _texts(read.get("headers"))
     except (MatReadError, *UNREADABLE) as error:
-        raise unreadable(source, "MATLAB file", error) from None
+        raise unreadable(source, KIND, error) from None
     return RecordingTable(headers, columns)
 
 

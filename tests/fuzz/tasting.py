@@ -7,6 +7,7 @@ where an answer is none that may be given.
 from __future__ import annotations
 
 import gc
+import re
 import resource
 import signal
 import time
@@ -22,17 +23,47 @@ FOUND = FOLDER / "found"
 LONGEST_S = 1.0  # of processor time
 GIVEN_UP_S = 20.0
 MOST_BYTES = 256 * 1024 * 1024
+_PEAK_KIB = re.compile(r"VmHWM:\s*(\d+)")
+
+
+def nobody() -> int | None:
+    """Return the process that works for this one where there is none."""
+    return None
 
 
 @dataclass(frozen=True)
 class Target:
-    """A way in: true examples, what any bytes do there, words that its inputs are made of, and how long one may be."""
+    """A way in: true examples, what any bytes do there, words that its inputs are made of, and how long one may be.
+
+    ``worker`` tells the process that works for this one, whose time and memory count as well; ``ready`` begins it, and
+    that is none of the input's time.
+    """
 
     name: str
     seeds: Sequence[bytes]
     taste: Callable[[bytes], object]
     words: Sequence[bytes] = field(default=())
     longest: int = 4096
+    worker: Callable[[], int | None] = nobody
+    ready: Callable[[], object] = nobody
+
+
+def processor_s(target: Target) -> float:
+    """Return the processor time so far of this process and of the target's workers, those that ended included."""
+    if target.worker is nobody:
+        return time.process_time()
+    ended, pid = resource.getrusage(resource.RUSAGE_CHILDREN), target.worker()
+    # the kernel's clock of another process: clock_getcpuclockid(3)
+    lives_s = 0.0 if pid is None else time.clock_gettime(~pid << 3 | 2)
+    return time.process_time() + ended.ru_utime + ended.ru_stime + lives_s
+
+
+def peaks_bytes(target: Target) -> tuple[int, int]:
+    """Return the most memory that this process and the target's worker ever had."""
+    own, pid = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, target.worker()
+    if pid is None:
+        return own, 0
+    return own, 1024 * int(_PEAK_KIB.findall(Path(f"/proc/{pid}/status").read_text("ascii"))[0])
 
 
 @dataclass(frozen=True)
@@ -58,7 +89,8 @@ def judged(target: Target, data: bytes) -> Finding | None:
 
 
 def _judged_once(target: Target, data: bytes) -> Finding | None:
-    begin_s, before = time.process_time(), _peak_bytes()
+    target.ready()
+    begin_s, before = processor_s(target), peaks_bytes(target)
     try:
         with _given_up():
             target.taste(data)
@@ -66,7 +98,8 @@ def _judged_once(target: Target, data: bytes) -> Finding | None:
         return Finding("slow", target.name, f"more than {GIVEN_UP_S:g} s of processor time")
     except Exception as error:  # noqa: BLE001 - whatever is not declared is what is looked for
         return Finding(type(error).__name__, _place(error), "".join(traceback.format_exception(error))[-3000:])
-    took_s, grown = time.process_time() - begin_s, _peak_bytes() - before
+    took_s = processor_s(target) - begin_s
+    grown = max(now - then for now, then in zip(peaks_bytes(target), before, strict=True))
     if took_s > LONGEST_S:
         return Finding("slow", target.name, f"{took_s:.1f} s of processor time, not {LONGEST_S:g}")
     if grown > MOST_BYTES:
@@ -88,10 +121,6 @@ def _given_up() -> Iterator[None]:
     finally:
         signal.setitimer(signal.ITIMER_VIRTUAL, 0)
         signal.signal(signal.SIGVTALRM, before)
-
-
-def _peak_bytes() -> int:
-    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def _place(error: BaseException) -> str:

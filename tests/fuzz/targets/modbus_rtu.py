@@ -7,7 +7,7 @@ from collections.abc import Coroutine, Sequence
 
 from fdhil.config.sensors import ModbusPlace
 from fdhil.drivers.modbus.line import Answer, Request
-from fdhil.drivers.modbus.rtu import READ_COILS, READ_HOLDING, READ_INPUT, WRITE_REGISTER, crc16, framed
+from fdhil.drivers.modbus.rtu import READ_COILS, READ_HOLDING, READ_INPUT, WRITE_REGISTER, framed
 from fdhil.drivers.modbus.rtu_line import RtuLine
 from fdhil.drivers.serial.port import Chunk
 from fdhil.errors import DeviceError
@@ -65,7 +65,15 @@ def taste(data: bytes) -> None:
 
 
 def _is_frame_of(data: bytes, unit: int) -> bool:
-    return data[0] == unit and any(not crc16(data[:size]) for size in range(5, min(len(data), 64) + 1))
+    """Whether some of the first 64 bytes are a frame, by the checksum as Modbus over serial line V1.02 6.2.2 has it."""
+    crc = 0xFFFF
+    for size, byte in enumerate(data[:64] if data[0] == unit else b"", 1):
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
+        if crc == 0 and size >= 5:
+            return True
+    return False
 
 
 def target() -> Target:

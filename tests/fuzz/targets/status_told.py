@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,10 @@ from tests.shopfloor.made import NOW_MS, status, trouble
 from tests.shopfloor.made import notice as noticed
 
 CONFIG = config_of(Path("/nowhere"), ("X",))
+HEARD, BORN = Listener(CONFIG), Session(CONFIG.publish.mqtt, "node")
+BEFORE = HEARD.news(status("X", notices=[]), NOW_MS)  # what is new is told, not what was there before
+SHOWN = picture(BEFORE)
+BORN.node.births(*BORN._metrics(BEFORE), NOW_MS)
 
 
 def taste(data: bytes) -> None:
@@ -33,14 +38,20 @@ def taste(data: bytes) -> None:
         "line": number[0] if number else None,
         "feed_mm_min": number[-1] if number else 1,
     }
-    listener, session = Listener(CONFIG), Session(CONFIG.publish.mqtt, "node")
-    listener.news({**said, "notices": []}, NOW_MS)
-    news = listener.news(json.loads(json.dumps(said)), NOW_MS)
-    for line in [*lines(None, picture(news)), *map(notice, news.events)]:
+    news = copy.copy(HEARD).news(json.loads(json.dumps(said)), NOW_MS)
+    for line in [*lines(SHOWN, picture(news)), *map(notice, news.events)]:
         assert line.count("|") >= 2
         assert line.isprintable(), line
         line.encode()
-    session.node.births(*session._metrics(news), NOW_MS)
+    _again()._changes(news)
+
+
+def _again() -> Session:
+    """The session that has told what was before, once more; what never changes is shared."""
+    session, node = copy.copy(BORN), copy.copy(BORN.node)
+    session.node, session._notices = node, {}
+    node._aliases, node._told = dict(node._aliases), {device: dict(told) for device, told in node._told.items()}
+    return session
 
 
 def _told(data: bytes) -> list[Any]:

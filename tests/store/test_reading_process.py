@@ -1,0 +1,121 @@
+"""What a damaged file does to the library that reads it, it does to a process of its own: the caller has a sentence."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fdhil.errors import FdhilError, RecordingError
+from fdhil.store import reading_process
+from fdhil.store.export import export_table, table_of
+from fdhil.store.reading_process import read_apart
+from fdhil.store.recordings import read_recording, read_table
+from tests.fuzz.tasting import FOUND
+from tests.store import failing_reader
+from tests.store.made import window
+
+
+@pytest.fixture(autouse=True)
+def _none_before_and_after() -> Iterator[None]:
+    reading_process._end()
+    yield
+    reading_process._end()
+
+
+def _asked(content: bytes, source: str) -> str:
+    table = read_apart(failing_reader.__name__, "such file", content, source)
+    assert table.columns["time_s"].tolist() == [0.0, 1.0, 2.0]
+    return table.headers["of"]
+
+
+@pytest.mark.fault("G8")
+@pytest.mark.parametrize("name", ["mat", "h5"])
+def test_a_file_that_ends_its_reader_is_refused_and_the_next_one_read(name: str, tmp_path: Path) -> None:
+    bad, good = tmp_path / "bad.mat", tmp_path / f"good.{name}"
+    bad.write_bytes((FOUND / "recording_mat" / "vector-of-unknown-type").read_bytes())
+    export_table(table_of(window()), good, {"h5": "hdf5"}.get(name, name))
+    with pytest.raises(RecordingError, match=r"bad\.mat is no MATLAB file.*did not survive it; export it again"):
+        read_recording(bad)
+    assert read_recording(good).axis == "X"
+
+
+@pytest.mark.fault("G8")
+@pytest.mark.parametrize(
+    ("does", "told"),
+    [("crash", "survive"), ("abort", "survive"), ("fill", "survive"), ("talk", "survive"), ("hang", "within 0.3 s")],
+)
+def test_a_reader_that_goes_astray_is_ended(does: str, told: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if does == "hang":
+        monkeypatch.setattr(reading_process, "LONGEST_S", 0.3)
+    with pytest.raises(RecordingError, match=f"^r is no such file .*{told}.*; export it again$"):
+        _asked(does.encode(), "r")
+    assert _asked(b"", "the next") == "the next"
+
+
+def test_an_interrupted_reading_leaves_no_answer_to_the_next_file() -> None:
+    with pytest.raises(KeyboardInterrupt):
+        _asked(b"interrupt", "r")
+    assert _asked(b"", "the next") == "the next"
+
+
+def test_an_idle_reader_that_was_ended_is_begun_anew() -> None:
+    assert _asked(b"", "first") == "first"
+    (process,) = reading_process._PROCESSES.values()
+    process.child.kill()
+    process.child.wait()
+    assert _asked(b"", "second") == "second"
+
+
+def test_a_script_is_not_run_again_and_a_forked_process_has_a_reader_of_its_own(tmp_path: Path) -> None:
+    for n in (120, 150):
+        export_table(table_of(window(n=n, raw=False)), tmp_path / f"{n}.mat", "mat")
+    script = tmp_path / "script.py"
+    script.write_text(
+        textwrap.dedent(
+            """\
+            import os
+            from pathlib import Path
+            from fdhil.store.recordings import read_table
+
+            print("begun", flush=True)
+            assert read_table(Path("120.mat")).columns["time_s"].size == 117
+            forked = os.fork()
+            n = 120 if forked else 150
+            for _ in range(20):
+                assert read_table(Path(f"{n}.mat")).columns["time_s"].size == n - 3
+            print("done", flush=True)
+            if forked:
+                assert os.waitpid(forked, 0)[1] == 0
+            """
+        )
+    )
+    done = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.split() == ["begun", "done", "done"]
+
+
+def test_no_module_beside_the_file_is_taken_for_a_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    export_table(table_of(window()), tmp_path / "r.mat", "mat")
+    (tmp_path / "numpy.py").write_text("raise SystemExit(1)")
+    monkeypatch.chdir(tmp_path)
+    assert read_recording(Path("r.mat")).axis == "X"
+
+
+def test_a_missing_extra_is_told_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "asammdf.py").write_text("raise ImportError")
+    export_table(table_of(window()), tmp_path / "r.mf4", "mdf4")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(FdhilError, match="pip install 'fdhil"):
+        read_table(tmp_path / "r.mf4")
+
+
+@pytest.mark.parametrize("program", ["/nowhere", "/bin/true"])
+def test_a_reader_that_cannot_be_started_is_no_fault_of_the_file(program: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", program)
+    with pytest.raises(RecordingError, match=r"^r was not read, .*cannot be started.*: free memory"):
+        _asked(b"", "r")
