@@ -14,7 +14,7 @@ from fdhil.identification.covariance import aliasing
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.filtering import moving_mean
 from fdhil.identification.innovations import CURRENT, LOAD, SPEED, VOLTAGE, answers, innovations
-from fdhil.identification.motion import UNKNOWN, Motion
+from fdhil.identification.motion import Motion
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.slow_voltage import innovations_of
 from fdhil.records import Float, Reason
@@ -101,12 +101,8 @@ class Bench:
         motion = self._foretold()
         if name == "voltage":
             at = np.array([motion.at_voltage(c) for c in courses])
-            answers = self._answers(VOLTAGE, motion.voltage_mean * at, motion.voltage_rise * at)
-        else:
-            answers = self._answers(_KINDS[name], getattr(motion, name) * courses, None)
-        # a drive that creeps to rest is no random walk, for which its speed is taken there: its innovations lean
-        answers[: 2 * motion.n][np.repeat(motion.mode == UNKNOWN, 2)] = 0.0
-        return answers
+            return self._answers(VOLTAGE, motion.voltage_mean * at, motion.voltage_rise * at)
+        return self._answers(_KINDS[name], getattr(motion, name) * courses, None)
 
     def _foretold(self) -> Motion:
         """Return the motion with each reading as those before it foretell it: a gain acts on what is measured.
