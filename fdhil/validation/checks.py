@@ -13,7 +13,7 @@ from fdhil.validation.agreement import values_apart
 from fdhil.validation.evidence import LEAST_ROWS, Evidence
 from fdhil.validation.interruptions import interruptions
 from fdhil.validation.plausibility import clipped, gaps, missing_stages, not_finite, position_parted
-from fdhil.validation.rest import friction_at_rest, rest_faults
+from fdhil.validation.rest import friction_at_rest, rest_faults, rest_untold
 from fdhil.validation.simulation import expected_fit_percent
 from fdhil.validation.slow_fitted import slow_faults_beside
 from fdhil.validation.slow_readings import slow_voltage_faults
@@ -205,6 +205,7 @@ OF_THE_FIT: Sequence[Check] = (
     # a late current seems to move a shaft at rest
     Check("standstill", rest_faults, _sound, ("late voltage", "late current")),
     Check("friction at rest", friction_at_rest, _sound, ("late voltage", "late current"), weighed=True),
+    Check("rest", rest_untold, _sound, ("late voltage", "late current", "estimate")),
     Check("delay", _late, _fitted, ("late voltage", "late current", "standstill")),
     Check("simulation", _simulation, _fitted, (*MODEL, "delay"), weighed=True),
     Check("values", _values, _fitted, (*MODEL, "delay")),

@@ -192,6 +192,21 @@ class Evidence:
         return late * whole / max(all_cut, 1e-300)
 
     @cached_property
+    def resting(self) -> tuple[float, float] | None:
+        """How surely friction at low speed tells what holds the axis at rest: its deviation, N.m, and um at the table.
+
+        None without such friction. No row tells it at rest: it is drawn on from the slowest that surely move. An axis
+        that comes to rest stays where it holds, so what is not known of it is where the axis rests.
+        """
+        estimate, p = self.told, self.parameters
+        if estimate is None or p is None or "stribeck" not in estimate.names:
+            return None
+        at = [estimate.names.index(name) for name in ("Cd", "stribeck")]
+        deviation = math.sqrt(float(estimate.covariance[np.ix_(at, at)].sum()))
+        loop = TableError.of(p, self.window.pitch_mm, self.axis)
+        return deviation, deviation * loop.lasting_um(self.window.dt_s)
+
+    @cached_property
     def told(self) -> Estimate | None:
         """The estimate with the intervals that hold although the model lacks what was found."""
         if self.estimate is None or not self.sound:
