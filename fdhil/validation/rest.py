@@ -12,7 +12,7 @@ from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.motion import Noise
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.windows import carried, smooth
-from fdhil.records import INTERVAL_95, Reason, Window
+from fdhil.records import Reason, Window
 from fdhil.validation.evidence import Evidence
 from fdhil.validation.significance import BUDGET
 
@@ -50,22 +50,6 @@ def friction_at_rest(evidence: Evidence) -> Iterator[Reason]:
     yield from _holding(window, fit, rows)
     if (late := evidence.breakaway) is not None:
         yield evidence.with_cost(late.reason(), evidence.breakaway_um(late))
-
-
-def rest_untold(evidence: Evidence) -> Iterator[Reason]:
-    """Yield a reason where friction at low speed leaves open, at 95 %, where within the tolerance the axis rests."""
-    weight, resting = evidence.weight, evidence.resting
-    if weight is None or resting is None:
-        return
-    torque, um = (INTERVAL_95 * deviation for deviation in resting)
-    if not weight.allows(um):
-        text = (
-            f"friction at rest is told to +-{torque:.3g} N.m, and where the axis rests to +-{weight.told(um)}, "
-            f"limit {weight.told(weight.limit_um)}"
-        )
-        yield Reason(
-            "LowExcitation", text, "lubricate the slide-way, or record rapids with smoother ends and less noise"
-        )
 
 
 def _contradiction(window: Window, fit: Fit, noise: Noise, rows: Rows, lost_v: float) -> Iterator[Reason]:

@@ -87,4 +87,4 @@ def test_friction_that_rises_towards_rest_is_believed_where_it_tells_where_the_a
     (window,) = find_windows(sticking.recording)
     verdict = analyse(window, SETTINGS).verdict
     assert verdict.accepted == told
-    assert ["friction at rest is told to" in reason.text for reason in verdict.reasons] == ([] if told else [True])
+    assert ["the axis may slip" in reason.text for reason in verdict.reasons] == ([] if told else [True])
