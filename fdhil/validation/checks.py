@@ -105,8 +105,8 @@ def _estimate_faults(evidence: Evidence) -> Iterator[Reason]:
 def _slips(evidence: Evidence) -> Iterator[Reason]:
     """Yield a reason where friction falls so much with speed that the axis sticks and slips, or may do so.
 
-    It may where friction does rise towards rest, three deviations do not exclude that it slips, and where the axis rests
-    is not told to the tolerance: neither by that friction, which no row tells at rest, nor by a replay.
+    It may where friction does rise towards rest, three deviations do not exclude that it slips, and the place where it
+    rests is not told to the tolerance: neither by that friction, which no row tells at rest, nor by a replay.
     """
     estimate, weight, resting = evidence.estimate, evidence.weight, evidence.resting
     if estimate is None or "stribeck" not in estimate.names:
