@@ -103,14 +103,30 @@ def _estimate_faults(evidence: Evidence) -> Iterator[Reason]:
 
 
 def _slips(evidence: Evidence) -> Iterator[Reason]:
-    """Yield a reason where friction falls so much with speed that the axis sticks and slips."""
-    if evidence.estimate is None or "stribeck" not in evidence.estimate.terms:
+    """Yield a reason where friction falls so much with speed that the axis sticks and slips, or may do so.
+
+    It may where friction does rise towards rest, three deviations do not exclude that it slips, and the place where it
+    rests is not told to the tolerance: neither by that friction, which no row tells at rest, nor by a replay.
+    """
+    estimate, weight, resting = evidence.estimate, evidence.weight, evidence.resting
+    if estimate is None or "stribeck" not in estimate.names:
         return
-    more, dry = evidence.estimate.value("stribeck"), abs(evidence.estimate.value("Cd"))
-    torque_nm = evidence.estimate.value("K") * float(np.nanmax(np.abs(evidence.window.current_a)))
-    if more > max(dry, SLIPPING_SHARE * torque_nm):
-        text = f"friction at low speed is {more:.3g} N.m higher than the dry friction of {dry:.3g} N.m: the axis slips"
-        yield Reason("ValidationFailed", text, "lubricate the slide-way, and look at its guides, before anything else")
+    more, dry = estimate.value("stribeck"), abs(estimate.value("Cd"))
+    torque_nm = estimate.value("K") * float(np.nanmax(np.abs(evidence.window.current_a)))
+    least, advice = (
+        max(dry, SLIPPING_SHARE * torque_nm),
+        "lubricate the slide-way, and look at its guides, first of all",
+    )
+    text = f"higher than the dry friction of {dry:.3g} N.m: the axis"
+    if more > least:
+        yield Reason("ValidationFailed", f"friction at low speed is {more:.3g} N.m {text} slips", advice)
+    elif weight is not None and resting is not None:
+        beyond, um = SURE * resting.deviation_nm, SURE * resting.um
+        told = weight.allows(um) or weight.allows(evidence.rests_off_um)
+        if resting.deviation_nm < more <= least < more + beyond and not told:
+            may = f"friction at low speed is {more:.3g} +- {beyond:.2g} N.m {text} may slip"
+            limit = f"where it rests is told to {weight.told(um)}, limit {weight.told(weight.limit_um)}"
+            yield Reason("ValidationFailed", f"{may}, and {limit}", advice)
 
 
 def _no_fit(evidence: Evidence) -> Iterator[Reason]:

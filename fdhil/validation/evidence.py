@@ -20,6 +20,7 @@ from fdhil.identification.without_voltage import fit as fit_torque
 from fdhil.records import PARAMETERS, Bool, Estimate, Float, Parameters, Reason, Window, rms
 from fdhil.validation.backlash import DeadBand, backlash
 from fdhil.validation.breakaway import Breakaway, breakaway
+from fdhil.validation.replay import replay_window
 from fdhil.validation.score_bench import Finding
 from fdhil.validation.selection import Lacking, lacking
 from fdhil.validation.sensor_reconstruction import Bridge
@@ -46,6 +47,18 @@ class Signal:
     unit: str
     values: Float
     step: float
+
+
+@dataclass(frozen=True, slots=True)
+class Resting:
+    """The deviations of friction at low speed, and of the place (um) at which the axis comes to rest by it.
+
+    No row tells that friction at rest: it is drawn on from the slowest that surely move. What holds the axis there
+    decides where it stays.
+    """
+
+    deviation_nm: float
+    um: float
 
 
 def signals_of(window: Window) -> tuple[Signal, ...]:
@@ -190,6 +203,29 @@ class Evidence:
         courses = loop.um(np.array([to_and_fro(row) for row in torques]), self.window.dt_s)
         whole, all_cut, late = (rms(row) for row in courses)
         return late * whole / max(all_cut, 1e-300)
+
+    @cached_property
+    def resting(self) -> Resting | None:
+        """How surely friction at low speed is told, and with it the place where the axis rests; None without such."""
+        estimate, p = self.told, self.parameters
+        if estimate is None or p is None or "stribeck" not in estimate.names:
+            return None
+        at = [estimate.names.index(name) for name in ("Cd", "stribeck")]
+        holds = math.sqrt(float(estimate.covariance[np.ix_(at, at)].sum()))
+        loop = TableError.of(p, self.window.pitch_mm, self.axis)
+        return Resting(estimate.std("stribeck"), holds * loop.lasting_um(self.window.dt_s))
+
+    @cached_property
+    def rests_off_um(self) -> float:
+        """How far from where a replay of the rapid comes to rest the axis rested, RMS; infinite without a replay."""
+        window, axis, end = self.window, self.axis, self.moving[1]
+        if axis is None or self.parameters is None:
+            return math.inf
+        told = replay_window(window, self.parameters, axis, self.sync_period_s or window.dt_s)
+        if told is None:
+            return math.inf
+        rests = self.at_rest & np.isfinite(window.position_mm) & (np.arange(window.n) >= end)
+        return rms(1e3 * (window.position_mm - told.predicted_mm)[rests]) if rests.any() else math.inf
 
     @cached_property
     def told(self) -> Estimate | None:

@@ -14,7 +14,7 @@ from fdhil.identification.covariance import aliasing
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.filtering import moving_mean
 from fdhil.identification.innovations import CURRENT, LOAD, SPEED, VOLTAGE, answers, innovations
-from fdhil.identification.motion import UNKNOWN, Motion
+from fdhil.identification.motion import Motion
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.slow_voltage import innovations_of
 from fdhil.records import Float, Reason
@@ -62,25 +62,29 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """One fitted window on which alternatives are tried: how innovations answer, and what the parameters imitate."""
+    """One fitted window on which alternatives are tried: how innovations answer, and what imitates them.
+
+    ``imitating`` (m, k + c) are jacobian and the courses that the voltage may have within its samples; ``inverse``
+    (k + c, k + c) is the covariance of their sizes, of which one deviation of each course is all that is expected;
+    ``held`` (k + c,) are the sizes that the innovations show.
+    """
 
     fit: Fit
+    imitating: Float
     inverse: Float
-    basis: Float
-    imitated: Float
+    held: Float
     coloured: float = 1.0
 
     @classmethod
     def of(cls, fit: Fit) -> Bench:
-        """Return the bench for a window's fit: ``basis`` (m, k + 1 + c) is jacobian, innovations and courses.
-
-        ``imitated`` (k, 1 + c) is what the parameters make of the last two.
-        """
-        inverse = inverse_of(fit.information)[0]
-        others = np.column_stack([fit.residuals, courses(fit)])
+        """Return the bench for a window's fit."""
+        imitating = np.column_stack([fit.jacobian, courses(fit)])
+        gram, k = imitating.T @ imitating, fit.jacobian.shape[1]
+        gram[:k, :k] = fit.information
+        gram[range(k, len(gram)), range(k, len(gram))] += 1.0
+        inverse = inverse_of(gram)[0]
         coloured = 1.0 + 2.0 * max(0.0, expected_correlation(fit)[0])
-        imitated = inverse @ (fit.jacobian.T @ others)
-        return cls(fit, inverse, np.column_stack([fit.jacobian, others]), imitated, coloured)
+        return cls(fit, imitating, inverse, inverse @ (imitating.T @ fit.residuals), coloured)
 
     @property
     def motion(self) -> Motion:
@@ -101,12 +105,8 @@ class Bench:
         motion = self._foretold()
         if name == "voltage":
             at = np.array([motion.at_voltage(c) for c in courses])
-            answers = self._answers(VOLTAGE, motion.voltage_mean * at, motion.voltage_rise * at)
-        else:
-            answers = self._answers(_KINDS[name], getattr(motion, name) * courses, None)
-        # a drive that creeps to rest is no random walk, for which its speed is taken there: its innovations lean
-        answers[: 2 * motion.n][np.repeat(motion.mode == UNKNOWN, 2)] = 0.0
-        return answers
+            return self._answers(VOLTAGE, motion.voltage_mean * at, motion.voltage_rise * at)
+        return self._answers(_KINDS[name], getattr(motion, name) * courses, None)
 
     def _foretold(self) -> Motion:
         """Return the motion with each reading as those before it foretell it: a gain acts on what is measured.
@@ -160,36 +160,31 @@ class Bench:
         change: Float = self.fit.residuals - innovations(motion, theta, gains, load)
         return change
 
-    def scores(self, directions: Float) -> tuple[Float, Float, Float]:
-        """Return score (q,) and course scores (q, c) of ``directions`` (m, q), and (k, q) their share in the jacobian.
+    def scores(self, directions: Float) -> tuple[Float, Float]:
+        """Return score (q,) and information (q, q) of ``directions`` (m, q) beyond what imitates them.
 
-        Scores are those beyond what the parameters imitate; the course's are what the voltage's unknown course within
-        its samples may give.
+        What the voltage's course within its samples may give is taken out as far as it is expected, so that what it
+        does not give is seen as sharply as ever (generalised least squares).
         """
-        seen = self.basis.T @ directions
-        shared, beyond = np.split(seen, [len(self.inverse)])
-        beyond = beyond - self.imitated.T @ shared
-        return beyond[0], beyond[1:].T, shared
+        shared = self.imitating.T @ directions
+        score = directions.T @ self.fit.residuals - shared.T @ self.held
+        return score, directions.T @ directions - shared.T @ self.inverse @ shared
 
     def best(self, matrix: Float) -> tuple[int, float, float, Float]:
         """Return index, statistic, amplitude and (m,) of the column of ``matrix`` (m, q) with the largest statistic."""
-        score, course, shared = self.scores(matrix)
-        whole = np.einsum("mq,mq->q", matrix, matrix)
-        weight = whole - np.einsum("kq,kq->q", shared, self.inverse @ shared)
-        statistic, amplitude = self.tested(score, weight, whole, course)
+        score, information = self.scores(matrix)
+        statistic, amplitude = self.tested(score, np.diag(information), np.einsum("mq,mq->q", matrix, matrix))
         k = int(np.argmax(np.abs(statistic)))
         return k, float(statistic[k]), float(amplitude[k]), matrix[:, k]
 
-    def tested(self, score: Float, weight: Float, whole: Float, course: Float) -> tuple[Float, Float]:
+    def tested(self, score: Float, weight: Float, whole: Float) -> tuple[Float, Float]:
         """Return statistics and amplitudes; 0 where the parameters imitate all but rounding of ``whole``.
 
-        The variance of a score is its ``weight``, more where innovations hang together, and the squares of what one
-        standard deviation of each of the voltage's ``course`` (..., c) within the samples gives.
+        The variance of a score is its ``weight``, more where innovations hang together.
         """
         seen = weight > IMITATED * whole
         safe = np.where(seen, weight, 1.0)
-        variance = self.coloured * safe + (course**2).sum(axis=-1)
-        return np.where(seen, score / np.sqrt(variance), 0.0), np.where(seen, score / safe, 0.0)
+        return np.where(seen, score / np.sqrt(self.coloured * safe), 0.0), np.where(seen, score / safe, 0.0)
 
 
 def courses(fit: Fit) -> Float:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fdhil.identification.estimators.maximum_likelihood import Fit
-from fdhil.identification.normal import inverse_gram, solve
+from fdhil.identification.normal import inverse_of
 from fdhil.records import Float
 from fdhil.validation.score_bench import Bench, Finding
 
@@ -45,30 +45,32 @@ def lacking(fit: Fit, findings: Sequence[Finding]) -> list[Lacking]:
     if not any(finding.sure for finding in findings):
         return []
     bench = Bench.of(fit)
-    jacobian, directions = fit.jacobian, np.column_stack([finding.direction for finding in findings])
-    shared = bench.inverse @ (jacobian.T @ directions)
-    beyond = directions - jacobian @ shared  # what the parameters do not imitate
-    others = np.column_stack([fit.residuals, bench.basis[:, jacobian.shape[1] + 1 :]])
-    others = others - jacobian @ (bench.inverse @ (jacobian.T @ others))
+    directions = np.column_stack([finding.direction for finding in findings])
+    score, information = bench.scores(directions)
     whole = np.einsum("mq,mq->q", directions, directions)
     taken: list[int] = []
     alike: list[npt.NDArray[np.intp]] = []
     while len(taken) < len(findings):
-        rest = _beside(beyond[:, taken], beyond)
-        seen = rest.T @ others
-        statistic, _ = bench.tested(seen[:, 0], np.einsum("mq,mq->q", rest, rest), whole, seen[:, 1:])
+        shares = (
+            information[:, taken] @ inverse_of(information[np.ix_(taken, taken)])[0]
+            if taken
+            else np.zeros((len(score), 0))
+        )
+        rest = np.diag(information) - np.einsum("qt,qt->q", shares, information[:, taken])
+        statistic, _ = bench.tested(score - shares @ score[taken], rest, whole)
         statistic[taken] = 0.0
         best = int(np.argmax(np.abs(statistic)))
         if not replace(findings[best], statistic=float(statistic[best])).sure:
             break
         taken.append(best)
         alike.append(np.flatnonzero(np.square(statistic) > statistic[best] ** 2 - NO_WORSE**2))
+    moved = inverse_of(fit.information)[0] @ (fit.jacobian.T @ directions)
 
     def beside_others(n: int, k: int) -> Lacking:
         """Return alternative ``k`` at the place of the ``n``-th that was taken."""
         places = [*taken[:n], k, *taken[n + 1 :]]
-        amplitude = float(solve(beyond[:, places], others[:, 0])[0][n])
-        return _lacking(findings[k], amplitude, shared[:, k])
+        amplitude = float((inverse_of(information[np.ix_(places, places)])[0] @ score[places])[n])
+        return _lacking(findings[k], amplitude, moved[:, k])
 
     found = []
     for n, k in enumerate(taken):
@@ -77,16 +79,8 @@ def lacking(fit: Fit, findings: Sequence[Finding]) -> list[Lacking]:
     return found
 
 
-def _beside(basis: Float, directions: Float) -> Float:
-    """Return what of ``directions`` (m, q) the columns of ``basis`` (m, b) do not hold."""
-    if not basis.size:
-        return directions
-    rest: Float = directions - basis @ (inverse_gram(basis)[0] @ (basis.T @ directions))
-    return rest
-
-
-def _lacking(finding: Finding, amplitude: float, shared: Float) -> Lacking:
+def _lacking(finding: Finding, amplitude: float, moved: Float) -> Lacking:
     """Return a finding with its amplitude beside the others; a sensor's own change has the other sign."""
     load = None if finding.load_nm is None else amplitude * finding.load_nm
     told = amplitude if load is not None else -amplitude
-    return Lacking(replace(finding, amplitude=told), amplitude * shared, load)
+    return Lacking(replace(finding, amplitude=told), amplitude * moved, load)

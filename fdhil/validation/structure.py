@@ -50,16 +50,15 @@ def _load(bench: Bench, edges: npt.NDArray[np.int_], drift: Float) -> Finding:
     """Try a constant torque between every two edges, and one that rises over the move."""
     motion = bench.motion
     matrix = bench.load_answers(_steps_and_drift(edges[:-1], drift))
-    score, course, shared = bench.scores(matrix)
+    score, information = bench.scores(matrix)
     gram = matrix.T @ matrix
-    information = gram - shared.T @ bench.inverse @ shared
-    rising = bench.tested(score[-1:], information[-1:, -1], gram[-1:, -1], course[-1:])
+    rising = bench.tested(score[-1:], information[-1:, -1], gram[-1:, -1])
     # a load from edge a to edge b is the step at a less the step at b; none begins at the last
-    for part in (score, course, gram, information):
+    for part in (score, gram, information):
         part[-1] = 0.0
     gram[:, -1] = information[:, -1] = 0.0
     apart, whole = score[:, None] - score[None, :], _apart(gram)
-    statistic, amplitude = bench.tested(apart, _apart(information), whole, course[:, None] - course[None, :])
+    statistic, amplitude = bench.tested(apart, _apart(information), whole)
     a, b = np.unravel_index(int(np.argmax(np.abs(np.triu(statistic, 1)))), statistic.shape)
     span = f"acts from {edges[a] * motion.dt_s:.3f} to {edges[b] * motion.dt_s:.3f} s of the window"
     found = (float(statistic[a, b]), float(amplitude[a, b]))

@@ -72,6 +72,11 @@ class TableError:
         out: Float = np.fft.irfft(np.fft.rfft(whole) * self.response(size, dt_s), size)[..., :n]
         return out
 
+    def lasting_um(self, dt_s: float) -> float:
+        """Return how far 1 N.m that comes and stays moves the table before the loop has taken it away, um."""
+        since: Float = dt_s * np.arange(math.ceil(SETTLED_S / dt_s), dtype=np.float64)
+        return float(np.abs(self.um(since, dt_s)).max())
+
     def noise_um(self, white: float, walk: float, n: int, dt_s: float) -> float:
         """Return the RMS (um) of a momentum that is white noise, and of one that walks, by their deviation a row."""
         size = quick_size(n + 3 * math.ceil(SETTLED_S / dt_s))

@@ -14,6 +14,7 @@ from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
 from fdhil.records import Window, frozen
 from fdhil.validation.backlash import backlash, dead_band, overrun
+from fdhil.validation.selection import lacking
 from fdhil.validation.structure import findings
 from studies import drives, faults
 from studies.drives import Drive, Move
@@ -76,6 +77,26 @@ def test_the_noise_that_a_gain_scales_is_no_witness_for_it() -> None:
 def test_a_drive_that_creeps_to_rest_is_no_witness_for_a_gain() -> None:
     good = faults.good(np.random.default_rng([81, 1, 870]))  # 7 deviations were seen after the move
     assert [analyse(window, SETTINGS).verdict.reasons for window in find_windows(good.recording)] == [(), ()]
+
+
+@pytest.mark.parametrize(
+    ("study", "seed", "text"),
+    [
+        (1, 1813, "the gain of current drifts by +6"),
+        (1, 1933, "the gain of current drifts by +5"),
+        # instants, of whose course a torque within the move explains nearly as much
+        (2, 1963, "the gain of current drifts by -5"),
+    ],
+)
+def test_a_gain_that_drifts_by_little_is_told_by_its_own_size_and_refused(study: int, seed: int, text: str) -> None:
+    drifting = faults.KINDS["gain drift"].make(np.random.default_rng([study, 2, seed]))
+    (window,) = find_windows(drifting.recording)
+    fit = fit_windows([window], SETTINGS)
+    assert fit is not None
+    first, *_ = lacking(fit, findings(fit))
+    assert first.finding.text.format(first.finding.amplitude).startswith(text)
+    assert abs(first.finding.amplitude) == pytest.approx(drifting.severity, rel=0.15)
+    assert "CalibrationSuspect" in {reason.code for reason in analyse(window, SETTINGS).verdict.reasons}
 
 
 @pytest.mark.parametrize(("field", "name"), [("voltage_v", "voltage"), ("current_a", "current")])

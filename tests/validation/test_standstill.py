@@ -11,11 +11,12 @@ import pytest
 
 from fdhil.config import Identification
 from fdhil.identification.estimators import maximum_likelihood
-from fdhil.identification.windows import moving_range
+from fdhil.identification.windows import find_windows, moving_range
 from fdhil.pipeline import analyse
 from fdhil.records import Float, Reason, Window, frozen
 from fdhil.validation import Evidence
 from fdhil.validation.rest import rest_faults
+from studies import faults
 from tests.identification.recorded import windows
 
 SETTINGS = Identification()
@@ -76,3 +77,14 @@ def _lost(window: Window, begin: int, rows: int) -> Window:
         speed_rad_s=spoilt(window.speed_rad_s),
         position_mm=spoilt(window.position_mm),
     )
+
+
+@pytest.mark.parametrize(("seed", "told"), [(322, False), (2602, True)])
+def test_friction_that_rises_towards_rest_is_believed_where_it_tells_where_the_axis_rests(
+    seed: int, told: bool
+) -> None:
+    sticking = faults.KINDS["Stribeck friction"].make(np.random.default_rng([1, 2, seed]))
+    (window,) = find_windows(sticking.recording)
+    verdict = analyse(window, SETTINGS).verdict
+    assert verdict.accepted == told
+    assert ["the axis may slip" in reason.text for reason in verdict.reasons] == ([] if told else [True])
