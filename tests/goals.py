@@ -69,10 +69,11 @@ def of_verdicts(figures: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[
     kinds = [(name, kind) for study in figures.values() for name, kind in study.items()]
     bad = [kind for name, kind in kinds if name != "good"]
     good = [kind for name, kind in kinds if name == "good"]
-    faulty, validated = (sum(kind[key] for kind in bad) for key in ("count", "accepted"))
+    faulty, validated, harmful = (sum(kind[key] for kind in bad) for key in ("count", "accepted", "harmful"))
     clean, windows, refused = (sum(kind[key] for kind in good) for key in ("count", "windows", "refused"))
     figure = (
-        f"{validated} of {faulty:,} faulty ones validated, {refused} of {windows:,} windows of {clean:,} clean refused"
+        f"{validated} of {faulty:,} faulty ones validated, {harmful} of them to harm; "
+        f"{refused} of {windows:,} windows of {clean:,} clean refused"
     )
     met = not validated and faulty >= 3000 and clean >= 2000 and refused <= 0.01 * windows
     return {"met": met, "figure": figure}
