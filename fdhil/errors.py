@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 MOST_TOLD, MOST_CHARACTERS = 51, 2000  # no file makes a message without end
+LONGEST_WORD = 60  # of a program, as it is shown
 
 
 class FdhilError(Exception):
@@ -116,7 +117,8 @@ class ProgramError(FdhilError):
     def __init__(self, line: int, word: str, message: str) -> None:
         self.line = line
         self.word = word
-        place = ", ".join(part for part in (f"line {line}" if line else "", repr(word) if word else "") if part)
+        shown = word if len(word) <= LONGEST_WORD else f"{word[:LONGEST_WORD]}..."
+        place = ", ".join(part for part in (f"line {line}" if line else "", repr(shown) if word else "") if part)
         super().__init__(f"{place}: {message}" if place else message)
 
 

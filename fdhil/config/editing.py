@@ -43,6 +43,8 @@ def edited(text: str, values: Mapping[str, Any], note: str) -> str:
 def _put(document: dict[str, Any], outer: Sequence[str], key: str, value: Any) -> None:
     for name in outer:
         document = document.setdefault(name, {})
+        if not isinstance(document, dict):
+            raise NotEditable(f"its {name} is no table; change it by hand")
     document[key] = list(value) if isinstance(value, tuple) else value
 
 
