@@ -22,7 +22,7 @@ from fdhil.config import Identification
 from fdhil.config.fleet import Database, Fleet, Objects
 from fdhil.fleet import migrations, objects, reanalysis
 from fdhil.fleet.changes import changes
-from fdhil.fleet.questions import asking, entered
+from fdhil.fleet.sets import asking, entered
 from fdhil.fleet.window_work import Method, code_digest
 from fdhil.fleet.workers import workers
 from fdhil.identification.windows import find_windows
