@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,11 @@ def test_a_page_is_what_its_figures_say(study: str) -> None:
     for library in ("Python", "numpy", "scipy", "numba"):
         assert f"{library} " in figures["run"]["versions"]
     assert "local changes" not in figures["run"]["commit"]
+
+
+@pytest.mark.parametrize("name", benchmarks.BENCHMARKS)
+def test_a_benchmark_finds_what_it_measures(name: str) -> None:
+    assert import_module(f"benchmarks.{name}").__doc__
 
 
 def test_the_benchmarks_page_is_what_its_figures_say() -> None:

@@ -113,10 +113,8 @@ def _slips(evidence: Evidence) -> Iterator[Reason]:
         return
     more, dry = estimate.value("stribeck"), abs(estimate.value("Cd"))
     torque_nm = estimate.value("K") * float(np.nanmax(np.abs(evidence.window.current_a)))
-    least, advice = (
-        max(dry, SLIPPING_SHARE * torque_nm),
-        "lubricate the slide-way, and look at its guides, first of all",
-    )
+    least = max(dry, SLIPPING_SHARE * torque_nm)
+    advice = "lubricate the slide-way, and look at its guides, first of all"
     text = f"higher than the dry friction of {dry:.3g} N.m: the axis"
     if more > least:
         yield Reason("ValidationFailed", f"friction at low speed is {more:.3g} N.m {text} slips", advice)
