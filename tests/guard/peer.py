@@ -18,6 +18,7 @@ from tests.guard.machine import DEMAND_AT_REST, Drive, Frame
 ANSWER_S = 0.3
 NEVER = 1 << 30
 SLOW_S = 0.02
+SETTLED_S = 0.5
 HOLDING_ANSWER_S = 8.0
 
 
@@ -59,7 +60,8 @@ class Peer(threading.Thread):
         self.ended = threading.Event()
         self._inbox = b""
         self._offset_frames = 0
-        self._answered = False
+        self._frames_before = 0
+        self.standing = False
         self._server = socket.create_server(("127.0.0.1", 0))
         self.port: int = self._server.getsockname()[1]
         self._client: socket.socket | None = None
@@ -68,9 +70,10 @@ class Peer(threading.Thread):
     def run(self) -> None:
         self._server.settimeout(0.05)
         while not self.ended.is_set():
+            self.standing = not self.syncing
             if self._client is None:
                 self._accept()
-            elif self.syncing:
+            elif not self.standing:
                 self._cycle()
             else:
                 self._listen(self.period_s)
@@ -113,6 +116,8 @@ class Peer(threading.Thread):
     def _cycle(self) -> None:
         time.sleep(max(self.pause_s, SLOW_S if self.row >= self.slow_from else 0.0))
         self.tick += 1
+        waits = self.lockstep and self._offset_frames > self._frames_before
+        self._frames_before = before = self._offset_frames
         sampled = [frame for drive in self.drives for frame in drive.at_sync(self.tick)]
         self.latched.append((self.tick, tuple(d.target for d in self.drives), tuple(d.offset for d in self.drives)))
         last = len(self.demand[0]) - 1
@@ -127,15 +132,12 @@ class Peer(threading.Thread):
         self.row += self.playing
         sync = (0x080, bytes([(self.tick - 1) % 240 + 1]))
         self._transmit(encode([sync, *sampled, *streamed]))
-        before = self._offset_frames
-        waits = self.lockstep and self._answered
         answer_s = HOLDING_ANSWER_S if any(drive.offset for drive in self.drives) else ANSWER_S
         deadline_s = time.monotonic() + (answer_s if waits else self.period_s)
         while time.monotonic() < deadline_s and not self.ended.is_set() and self._client is not None:
             if waits and (not self.expected or self._offset_frames - before >= len(self.drives)):
                 break
             self._listen(min(0.02, max(0.0, deadline_s - time.monotonic())))
-        self._answered = self._offset_frames > before
 
     def _transmit(self, text: bytes) -> None:
         assert self._client is not None
@@ -168,6 +170,15 @@ class Peer(threading.Thread):
                 if cob_id == 0x300 + drive.node_id:
                     self._offset_frames += 1
                     drive.received_offset = int.from_bytes(data, "little", signed=True)
+
+    def settle(self) -> None:
+        """Stand until the guard has answered what it heard: it ran ahead until the first offsets came."""
+        self.syncing = False
+        self.wait(lambda: self.standing, "a standstill")
+        frames = -1
+        while frames != (frames := self._offset_frames):
+            time.sleep(SETTLED_S)
+        self.syncing = True
 
     def offsets_sent(self, node: int = 1) -> list[tuple[int, int]]:
         """(SYNC count, increments) of the offset frames to one node."""
