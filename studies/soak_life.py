@@ -135,13 +135,25 @@ def clients(life: Life) -> int:
     return browse(shop) + scrape(shop) + viewer_that_leaves(shop) + rude_client(shop)
 
 
+def arm(life: Life) -> bool:
+    """Arm a program; what an earlier correction may have left in the drives is adopted first, as an operator would."""
+    shop = life.shop
+    token = (shop.folder / "run" / "token").read_text("utf-8").strip()
+    for code in ("OffsetStands", None):
+        answer = shop.ask("arm", program=str(shop.folder / "corner.ngc"), token=token)
+        if not code or answer.get("code") != code:
+            break
+        adopted = shop.command("adopt", "--yes", fine=(0, 1, 3)).get("ok")
+        life.happened["adopted" if adopted else "an adoption refused"] += 1
+    if not answer.get("ok"):
+        life.failed[f"arm: {answer.get('code')}"] += 1
+    return bool(answer.get("ok"))
+
+
 def armed(life: Life) -> int:
     """Arm a program and cut it."""
     shop = life.shop
-    token = (shop.folder / "run" / "token").read_text("utf-8").strip()
-    answer = shop.ask("arm", program=str(shop.folder / "corner.ngc"), token=token)
-    if not answer.get("ok"):
-        life.failed[f"arm: {answer.get('code')}"] += 1
+    if not arm(life):
         return 0
     shop.play(shop.folder / "corner.ngc")
     shop.wait(lambda: shop.told("state") in ("OFF", "OFF(SHADOW)", "FROZEN"), "the guard comes to rest")
@@ -158,11 +170,10 @@ def armed_and_hurt(life: Life) -> int:
 
 def disarmed(life: Life) -> int:
     """Arm, and disarm at once."""
-    shop = life.shop
-    token = (shop.folder / "run" / "token").read_text("utf-8").strip()
-    if shop.ask("arm", program=str(shop.folder / "corner.ngc"), token=token).get("ok"):
-        life.happened["disarmed"] += 1
-    return int(not shop.ask("disarm").get("ok"))
+    if not arm(life):
+        return 0
+    life.happened["disarmed"] += 1
+    return int(not life.shop.ask("disarm").get("ok"))
 
 
 def frames_lost(life: Life) -> int:

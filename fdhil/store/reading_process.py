@@ -1,8 +1,8 @@
 """Reads recordings of other programs' formats in a process of its own, which a damaged file may end, hang or fill.
 
 The libraries that read them go where a damaged file points, beyond their own memory too: whoever reads a file lives on,
-and is told so in a sentence. ``python -m fdhil.store.reading_process`` is that process: it reads one file after
-another, and ends when nobody asks any more.
+and is told so in a sentence. ``python -m fdhil.store.reading_process`` has the libraries loaded and forks for each
+file, so that nothing which one file broke is there when the next one is read; it ends when nobody asks any more.
 """
 
 from __future__ import annotations
@@ -13,12 +13,16 @@ import json
 import os
 import resource
 import signal
+import socket
 import subprocess
 import sys
+import traceback
 from collections.abc import Iterator
 from importlib import import_module
 from multiprocessing.connection import Connection, Pipe
+from pathlib import Path
 from threading import Lock
+from typing import Any
 
 import numpy as np
 
@@ -26,70 +30,107 @@ from fdhil import errors
 from fdhil.errors import FdhilError, RecordingError
 from fdhil.store.recording_table import RecordingTable, unreadable
 
-LONGEST_S = 120.0  # the largest file that is taken at all needs a tenth of it
-MEMORY_BYTES = 4 << 30
+LONGEST_S = 120.0  # by the clock; the largest file that is taken at all needs a tenth of it
+MOST_BYTES = 4 << 30
+LONGEST_NAME = 200
+
+
+def most_processor_s(size: int) -> float:
+    """Return how long a file of so many bytes may be read: twenty times what a slow computer needs."""
+    return min(1.0 + 2e-6 * size, LONGEST_S)
+
+
+def most_memory_bytes(size: int) -> int:
+    """Return what reading a file of so many bytes may need; the best that is compressed grows by a factor of 150."""
+    return min((256 << 20) + 256 * size, MOST_BYTES)
 
 
 def read_apart(reader: str, kind: str, content: bytes, source: str) -> RecordingTable:
     """Return what ``read(content, source)`` of the module ``reader`` does, or raise its FdhilError.
 
-    RecordingError where its process did not survive the file, a ``kind`` by its name.
+    RecordingError where its process did not survive the file, a ``kind`` by its name. The module's ``library`` loads
+    what it reads with.
     """
     with _ONE:
         process, answer = _process(source), None
-        refusal = unreadable(source, kind, EOFError("what reads it did not survive it"))
         try:
             answer = process.answer(reader, content, source)
-        except (EOFError, OSError, ValueError):
-            if process.end() == -signal.SIGALRM:
-                refusal = unreadable(source, kind, EOFError(f"it was not read within {LONGEST_S:g} s"))
-            raise refusal from None
         finally:
-            if answer is None:  # also when who asks is interrupted: the next file must not get this one's answer
+            if answer is None:  # who asks is interrupted: the next file must not get this one's answer
                 process.end()
     if isinstance(answer, FdhilError):
         raise answer
+    if isinstance(answer, str):
+        raise unreadable(source, kind, EOFError(answer))
     return answer
 
 
 class ReadingProcess:
-    """The process that reads, as the one that asks sees it. EOFError, OSError where it cannot be started."""
+    """The process that reads, as the one that asks sees it. EOFError, OSError where it cannot be started.
+
+    ``ended`` is how the fork that read the last file ended: 0, or by which signal, as a negative number.
+    """
 
     def __init__(self) -> None:
-        self._asked, there = Pipe()
+        self.ended = 0
+        self._asked, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         command = [sys.executable, "-P", "-m", __name__, str(there.fileno())]
         # it finds what is found here, and needs no thread for a sum
         given = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OPENBLAS_NUM_THREADS": "1"}
-        with there:
-            self.child = subprocess.Popen(
-                command,
-                env=given,
-                pass_fds=(there.fileno(),),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,  # libraries complain there of what is damaged
-                start_new_session=True,  # Ctrl-C is for who asks
-            )
         with contextlib.ExitStack() as failing:
+            failing.callback(self._asked.close)
+            with there:
+                self.child = subprocess.Popen(
+                    command,
+                    env=given,
+                    pass_fds=(there.fileno(),),
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,  # libraries complain there of what is damaged
+                    start_new_session=True,  # Ctrl-C is for who asks
+                )
             failing.callback(self.end)
-            self._asked.recv_bytes()  # it is ready
+            self._told()  # it is ready
             failing.pop_all()
 
-    def answer(self, reader: str, content: bytes, source: str) -> RecordingTable | FdhilError:
-        """Return the table or the refusal; EOFError, OSError, ValueError where there is none."""
-        self._asked.send_bytes(json.dumps([reader, source, LONGEST_S]).encode())
-        self._asked.send_bytes(content)
-        told = json.loads(self._asked.recv_bytes())
-        if "error" in told:
-            refusal: FdhilError = getattr(errors, told["error"])(told["text"])
-            return refusal
-        columns = {name: np.frombuffer(self._asked.recv_bytes()).copy() for name in told["columns"]}
-        return RecordingTable(told["headers"], columns)
+    def answer(self, reader: str, content: bytes, source: str) -> RecordingTable | FdhilError | str:
+        """Return the table, the reader's refusal, or in words what became of the fork that read."""
+        try:
+            answer = self._answer(reader, content, source)
+        except (EOFError, OSError, ValueError):
+            answer = None
+        try:
+            self.ended = self._told()
+        except (EOFError, OSError):  # it was ended itself
+            self.ended = self.end()
+        if answer is not None and not self.ended:
+            return answer
+        if self.ended == -signal.SIGALRM:
+            return f"it was not read within {LONGEST_S:g} s"
+        if self.ended == -signal.SIGPROF:
+            return f"it was not read within {most_processor_s(len(content)):.0f} s of processor time"
+        return "what reads it did not survive it"
+
+    def _answer(self, reader: str, content: bytes, source: str) -> RecordingTable | FdhilError:
+        here, there = Pipe()
+        with here:
+            with there:
+                socket.send_fds(self._asked, [reader.encode()], [there.fileno()])
+            here.send_bytes(json.dumps([source, LONGEST_S]).encode())
+            here.send_bytes(content)
+            return receive(here)
+
+    def _told(self) -> int:
+        told = self._asked.recv(LONGEST_NAME)
+        if not told:
+            raise EOFError
+        return int(told)
 
     def end(self) -> int:
-        """End it; return how it ended."""
+        """End it and its fork; return how it ended."""
         self._asked.close()
-        self.child.kill()
+        if self.child.poll() is None:
+            os.killpg(self.child.pid, signal.SIGKILL)
         return self.child.wait()
 
 
@@ -101,6 +142,7 @@ def _process(source: str) -> ReadingProcess:
     """Return the process that reads for this one; it is begun with the first file and ends with this one."""
     process = _PROCESSES.get(os.getpid())
     if process is None or process.child.poll() is not None:
+        _end()
         try:
             process = _PROCESSES[os.getpid()] = ReadingProcess()
         except (EOFError, OSError) as error:
@@ -117,31 +159,72 @@ def _end() -> None:
 
 
 def main() -> None:
-    """Read one file after another, until nobody asks any more."""
-    for what, most in {resource.RLIMIT_AS: MEMORY_BYTES, resource.RLIMIT_CORE: 0}.items():
-        with contextlib.suppress(OSError, ValueError):  # a sandbox may forbid it
-            resource.setrlimit(what, (most, most))
-    asked = Connection(int(sys.argv[1]))
-    asked.send_bytes(b"ready")
-    with contextlib.suppress(EOFError, OSError):
+    """Fork for one file after another, and tell how each fork ended, until nobody asks any more."""
+    with contextlib.suppress(OSError, ValueError):  # a sandbox may forbid it
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    asked = socket.socket(fileno=int(sys.argv[1]))
+    asked.send(b"0")
+    with contextlib.suppress(OSError):
         while True:
-            reader, source, longest_s = json.loads(asked.recv_bytes())
-            content = asked.recv_bytes()
-            signal.setitimer(signal.ITIMER_REAL, longest_s)  # what it sends ends this process, in a library too
-            for part in _answer(reader, content, source):
-                asked.send_bytes(part)
-            signal.setitimer(signal.ITIMER_REAL, 0)
+            name, descriptors, _, _ = socket.recv_fds(asked, LONGEST_NAME, 1)
+            if not name:
+                return
+            reader = import_module(name.decode())
+            with contextlib.suppress(FdhilError):  # the fork tells what is missing
+                reader.library()
+            forked = os.fork()
+            if forked == 0:
+                asked.close()
+                _read_and_end(reader, descriptors[0])
+            os.close(descriptors[0])
+            asked.send(str(os.waitstatus_to_exitcode(os.waitpid(forked, 0)[1])).encode())
 
 
-def _answer(reader: str, content: bytes, source: str) -> Iterator[bytes]:
+def _read_and_end(reader: Any, descriptor: int) -> None:
+    """Read one file in the fork, within the limits for its size."""
+    code = 1
     try:
-        table: RecordingTable = import_module(reader).read(content, source)
+        asked = Connection(descriptor)
+        source, longest_s = json.loads(asked.recv_bytes())
+        answer(asked, reader, asked.recv_bytes(), source, longest_s)
+        code = 0
+    except BaseException:  # noqa: BLE001 - this process is nobody's but the file's
+        traceback.print_exc()
+    finally:
+        os._exit(code)
+
+
+def answer(asked: Connection, reader: Any, content: bytes, source: str, longest_s: float) -> None:
+    """Read a file in this process, within the limits for its size, and send the table or the refusal."""
+    has = int(Path("/proc/self/statm").read_text("ascii").split()[0]) * resource.getpagesize()
+    _, most = resource.getrlimit(resource.RLIMIT_AS)
+    with contextlib.suppress(OSError, ValueError):  # a sandbox may forbid it
+        resource.setrlimit(resource.RLIMIT_AS, (has + most_memory_bytes(len(content)), most))
+    signal.setitimer(signal.ITIMER_REAL, longest_s)  # what these send ends this process, in a library too
+    signal.setitimer(signal.ITIMER_PROF, most_processor_s(len(content)))
+    for part in _parts(reader, content, source):
+        asked.send_bytes(part)
+
+
+def _parts(reader: Any, content: bytes, source: str) -> Iterator[bytes]:
+    try:
+        table: RecordingTable = reader.read(content, source)
     except FdhilError as error:
         yield json.dumps({"error": type(error).__name__, "text": str(error)}).encode()
         return
     yield json.dumps({"headers": dict(table.headers), "columns": [*table.columns]}).encode()
     for values in table.columns.values():
         yield np.asarray(values, dtype=np.float64).tobytes()
+
+
+def receive(asked: Connection) -> RecordingTable | FdhilError:
+    """Return the table or the refusal; EOFError, OSError, ValueError where there is none."""
+    told = json.loads(asked.recv_bytes())
+    if "error" in told:
+        refusal: FdhilError = getattr(errors, told["error"])(told["text"])
+        return refusal
+    columns = {name: np.frombuffer(asked.recv_bytes()).copy() for name in told["columns"]}
+    return RecordingTable(told["headers"], columns)
 
 
 if __name__ == "__main__":

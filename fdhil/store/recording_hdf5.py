@@ -19,7 +19,7 @@ MOST_DATASETS = 1000
 def encode(table: RecordingTable) -> bytes:
     """Return a table as the bytes of an HDF5 file. FdhilError without the extra ``hdf5``."""
     content = io.BytesIO()
-    with _h5py().File(content, "w") as file:
+    with library().File(content, "w") as file:
         file.attrs.update(table.headers)
         for name, values in table.columns.items():
             stored = file.create_dataset(name, data=values, compression="gzip", shuffle=True)
@@ -34,7 +34,7 @@ def decode(content: bytes, source: str) -> RecordingTable:
 
 def read(content: bytes, source: str) -> RecordingTable:
     """Return the table in this process, which a damaged file may end."""
-    h5py = _h5py()
+    h5py = library()
     try:
         with h5py.File(io.BytesIO(content), "r") as file:
             found = _vectors(file, h5py)
@@ -65,7 +65,8 @@ def _text(value: Any) -> str:
     return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
 
 
-def _h5py() -> Any:
+def library() -> Any:
+    """Return what reads and writes such files. FdhilError without the extra."""
     try:
         import h5py
     except ImportError:

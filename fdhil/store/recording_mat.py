@@ -22,14 +22,10 @@ _NUMBERS = {"double", "single", "int8", "int16", "int32", "int64", "uint8", "uin
 
 def encode(table: RecordingTable) -> bytes:
     """Return a table as the bytes of a MATLAB file."""
-    from scipy import io as scipy_io  # late: it is slow to import
-
-    savemat: Any = scipy_io.savemat  # its stubs know no file in memory
-
     units = {name: UNITS[name] for name in table.columns if name in UNITS}
     content = io.BytesIO()
     content_of = {"headers": dict(table.headers), "units": units, **table.columns}
-    savemat(content, content_of, long_field_names=True, oned_as="column", do_compression=True)
+    library().savemat(content, content_of, long_field_names=True, oned_as="column", do_compression=True)
     return content.getvalue()
 
 
@@ -44,21 +40,16 @@ def read(content: bytes, source: str) -> RecordingTable:
         from fdhil.store import recording_hdf5
 
         return recording_hdf5.read(content, source)
-    from scipy import io as scipy_io
-    from scipy.io.matlab import MatReadError
-
-    whosmat: Any = scipy_io.whosmat
-    loadmat: Any = scipy_io.loadmat
-
+    scipy_io = library()
     try:
-        told = whosmat(io.BytesIO(content))
+        told = scipy_io.whosmat(io.BytesIO(content))
         vectors = [name for name, shape, kind in told[:MOST_VARIABLES] if kind in _NUMBERS and _is_vector(shape)]
         check_size(max((max(shape) for name, shape, _ in told if name in vectors), default=0), len(vectors), source)
         wanted = [*vectors, *(name for name, shape, kind in told if (name, kind) == ("headers", "struct"))]
-        read: dict[str, Any] = loadmat(io.BytesIO(content), variable_names=wanted, squeeze_me=True)
+        read: dict[str, Any] = scipy_io.loadmat(io.BytesIO(content), variable_names=wanted, squeeze_me=True)
         columns = {name: np.atleast_1d(np.asarray(read[name], dtype=np.float64)) for name in vectors}
         headers = _texts(read.get("headers"))
-    except (MatReadError, *UNREADABLE) as error:
+    except (scipy_io.matlab.MatReadError, *UNREADABLE) as error:
         raise unreadable(source, KIND, error) from None
     return RecordingTable(headers, columns)
 
@@ -72,3 +63,10 @@ def _texts(headers: Any) -> dict[str, str]:
     if headers is None or getattr(headers, "dtype", None) is None or headers.dtype.names is None:
         return {}
     return {name: str(headers[name]) for name in headers.dtype.names}
+
+
+def library() -> Any:
+    """Return scipy's reader and writer; its stubs know no file in memory."""
+    from scipy import io as scipy_io  # late: it is slow to import
+
+    return scipy_io

@@ -27,7 +27,7 @@ _COMMENT = re.compile(r"<TX>(.*?)</TX>", re.DOTALL)
 
 def encode(table: RecordingTable) -> bytes:
     """Return a table as the bytes of an MDF 4.10 file. FdhilError without the extra ``mdf``."""
-    asammdf = _asammdf()
+    asammdf = library()
     time_s = table.columns["time_s"]
     signals = [
         asammdf.Signal(samples=values, timestamps=time_s, name=name, unit=UNITS.get(name, ""))
@@ -52,7 +52,7 @@ def decode(content: bytes, source: str) -> RecordingTable:
 
 def read(content: bytes, source: str) -> RecordingTable:
     """Return the table in this process, which a damaged file may end."""
-    asammdf = _asammdf()
+    asammdf = library()
     if not content.startswith(b"MDF ") or content[64:68] != b"##HD":  # what is older or cut off is none of version 4
         raise unreadable(source, KIND, ValueError("it does not begin as one"))
     try:
@@ -89,7 +89,8 @@ def _headers(comment: str) -> dict[str, str]:
     return {str(key): str(value) for key, value in told.items()} if isinstance(told, dict) else {}
 
 
-def _asammdf() -> Any:
+def library() -> Any:
+    """Return what reads and writes such files. FdhilError without the extra."""
     try:
         import asammdf
     except ImportError:

@@ -47,13 +47,25 @@ def test_a_file_that_ends_its_reader_is_refused_and_the_next_one_read(name: str,
 @pytest.mark.fault("G8")
 @pytest.mark.parametrize(
     ("does", "told"),
-    [("crash", "survive"), ("abort", "survive"), ("fill", "survive"), ("talk", "survive"), ("hang", "within 0.3 s")],
+    [
+        ("crash", "survive"),
+        ("abort", "survive"),
+        ("fill", "survive"),
+        ("talk", "survive"),
+        ("sleep", "within 0.3 s"),
+        ("hang", "within 1 s of processor time"),
+    ],
 )
 def test_a_reader_that_goes_astray_is_ended(does: str, told: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    if does == "hang":
+    if does == "sleep":
         monkeypatch.setattr(reading_process, "LONGEST_S", 0.3)
     with pytest.raises(RecordingError, match=f"^r is no such file .*{told}.*; export it again$"):
         _asked(does.encode(), "r")
+    assert _asked(b"", "the next") == "the next"
+
+
+def test_what_one_file_broke_is_whole_for_the_next_one() -> None:
+    assert _asked(b"break", "one") == "one"
     assert _asked(b"", "the next") == "the next"
 
 
