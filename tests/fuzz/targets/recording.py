@@ -6,7 +6,9 @@ quick; that a fork's end is told as a refusal is tested beside the product.
 
 from __future__ import annotations
 
+import faulthandler
 import multiprocessing
+import os
 import signal
 import sys
 import traceback
@@ -62,6 +64,9 @@ def _read_all(module: Any, asked: Connection, others: Connection) -> None:
     """Read one file after another, as a fork of the product does."""
     others.close()  # its end is to be heard
     signal.signal(signal.SIGVTALRM, signal.SIG_DFL)
+    faulthandler.disable()
+    told = os.fdopen(os.dup(2), "w")
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libraries complain there of what is damaged
     module.library()
     while True:
         try:
@@ -71,7 +76,8 @@ def _read_all(module: Any, asked: Connection, others: Connection) -> None:
         try:
             reading_process.answer(asked, module, content, "r", reading_process.LONGEST_S)
         except BaseException:  # noqa: BLE001 - whatever is not declared is what is looked for
-            traceback.print_exc()
+            traceback.print_exc(file=told)
+            told.flush()
             sys.exit(RAISED)
 
 
