@@ -47,11 +47,15 @@ class Judged:
 
 @dataclass
 class Tally:
-    """What became of the recordings of one kind; ``least`` is the smallest severity, ``wrong`` holds seeds."""
+    """What became of the recordings of one kind; ``least`` is the smallest severity, ``wrong`` holds seeds.
+
+    ``silent`` counts those that were accepted without a warning; None where that was not counted.
+    """
 
     count: int = 0
     accepted: int = 0
     harmful: int = 0
+    silent: int | None = None
     right: int = 0
     windows: int = 0
     refused: int = 0
@@ -121,6 +125,8 @@ def tally(judged: Iterable[Judged], kinds: Mapping[str, faults.Kind]) -> dict[st
         entry.count += 1
         entry.accepted += one.accepted
         entry.harmful += bool(one.harm)
+        silent = one.accepted and not one.codes and not one.warned
+        entry.silent = (entry.silent or 0) + silent
         entry.windows += one.windows
         entry.refused += one.refused
         entry.least = one.severity if entry.least is None else min(entry.least, one.severity)
@@ -128,7 +134,7 @@ def tally(judged: Iterable[Judged], kinds: Mapping[str, faults.Kind]) -> dict[st
         entry.left_open.update(one.left_open)
         is_good = one.kind == GOOD
         entry.right += not one.codes if is_good else bool(kinds[one.kind].named & {*one.codes, *one.warned})
-        if one.harm or (is_good and not one.accepted):
+        if one.harm or (not one.accepted if is_good else silent):
             entry.wrong.append(one.seed)
     return counted
 
@@ -138,16 +144,17 @@ def report(counted: Mapping[str, Tally], kinds: Mapping[str, faults.Kind]) -> li
     fine, bad = counted[GOOD], [counted[name] for name in kinds]
     parts = ("count", "accepted", "harmful", "right")
     recordings, accepted, harmful, right = (sum(getattr(e, part) for e in bad) for part in parts)
+    silent = sum(entry.accepted if entry.silent is None else entry.silent for entry in bad)
     lines = paragraph(
         f"""Good: {fine.windows} windows of {fine.count} recordings, {fine.refused} windows refused
         ({_percent(fine.refused, fine.windows)}; {_at_most(fine.refused, fine.windows)}), {len(fine.wrong)} recordings
-        without a validated pool. Reasons: {listed(fine.codes) or "none"}."""
+        without a validated pool{_warned(fine)}. Reasons: {listed(fine.codes) or "none"}."""
     )
     if fine.left_open:
         nulls = ", ".join(f"{count} without {names}" for names, count in fine.left_open.most_common())
         lines += paragraph(f"{fine.left_open.total()} windows are accepted with a null and its reason: {nulls}.")
     lines += paragraph(
-        f"""Bad: {recordings} recordings, {accepted} accepted, {harmful} of them to harm
+        f"""Bad: {recordings} recordings, {accepted} accepted, {silent} of them without a warning, {harmful} to harm
         ({_at_most(harmful, recordings)}), {_percent(right, recordings)} named rightly. {_worst(counted, kinds)}"""
     )
     wrong = [f"{name} {', '.join(map(str, entry.wrong))}" for name, entry in counted.items() if entry.wrong]
@@ -159,11 +166,16 @@ def report(counted: Mapping[str, Tally], kinds: Mapping[str, faults.Kind]) -> li
         "recordings",
         "smallest severity",
         "accepted",
+        "without a warning",
         "harmful",
         "named rightly",
         "reasons given",
     ]
-    return [*lines, *grid([*columns, "reasons given"], rows), ""]
+    return [*lines, *grid(columns, rows), ""]
+
+
+def _warned(fine: Tally) -> str:
+    return "" if fine.silent is None else f", {fine.accepted - fine.silent} accepted with a warning"
 
 
 def _row(name: str, kind: faults.Kind, entry: Tally) -> list[str]:
@@ -175,6 +187,7 @@ def _row(name: str, kind: faults.Kind, entry: Tally) -> list[str]:
         str(entry.count),
         least,
         str(entry.accepted),
+        str(entry.accepted if entry.silent is None else entry.silent),
         str(entry.harmful),
         right,
         listed(entry.codes),

@@ -56,7 +56,10 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
         and friction to match, pitch 5 to 40 mm, rapids of 9 to 60 m/min at 1.5 to 8 m/s2 with 5 to 60 ms smoothing,
         rows 0.25 to 2 ms apart, voltage as means or instants, noise 0.1 to 0.5 %, sensors in steps of 0.001 to 0.2 % of
         their peak, positions in 0.1 to 5 um. Each bad recording has one fault of random severity, whose smallest is
-        listed. "Named rightly" means that one of the reasons given is the class of that fault."""
+        listed. "Named rightly" means that one of the reasons or warnings given is the class of that fault. A bad
+        recording is judged wrongly that does harm (a parameter beyond its interval, or a path beyond its tolerance), or
+        that is accepted without a warning: a fault that is too small for any parameter may be told and the model
+        kept."""
     )
     for study, counted in figures.items():
         lines += [f"## Study {study}", "", *report({k: Tally.of(v) for k, v in counted.items()}, faults.KINDS)]

@@ -78,8 +78,8 @@ def _history_blind(figures: Figures) -> None:
 def _some_accepted(figures: Figures) -> None:
     (first, *_) = figures.values()
     for fault in first.values():
-        fault |= {"accepted": 0, "harmful": 0, "wrong": []}
-    first["backlash"] |= {"accepted": 3, "right": 0, "wrong": [24, 54, 84]}
+        fault |= {"accepted": 0, "harmful": 0, "silent": 0, "wrong": []}
+    first["backlash"] |= {"accepted": 3, "silent": 3, "right": 0, "wrong": [24, 54, 84]}
 
 
 def _intervals_lie(figures: Figures) -> None:
@@ -107,7 +107,7 @@ def _intervals_lie(figures: Figures) -> None:
             "verdicts",
             _some_accepted,
             "backlash (100%)",
-            (" 3 accepted, 0 of them to harm (", "backlash (0%)", "backlash 24, 54, 84"),
+            (" 3 accepted, 3 of them without a warning, 0 to harm (", "backlash (0%)", "backlash 24, 54, 84"),
         ),
         ("slow_sensor", _intervals_lie, "", ("that of Jt holds the truth least often: 2 %", " 77 windows refused")),
     ],
