@@ -22,7 +22,7 @@ R6 | daemon killed in the cut | the guard is at zero 1,000 of 1,000 times, no st
 R7 | guard restarted over an offset | 0 steps beyond the limit in 500
 R8 | wrong values of a wire accepted | 0 of 100,000 stale Modbus answers, 10,000 stale SDO answers, 100,000 wrong counts
 R9 | loss told | what is told lost is what was lost, over 1,000,000 frames
-R10 | recordings judged wrongly | of 3,000 faulty ones 0 validated to harm or unwarned, of 2,000 clean ones 1 % refused at most
+R10 | recordings judged wrongly | 0 of 3,000 faulty validated to harm or unwarned, at most 1 % of 2,000 clean refused
 R11 | the guard's own tests | every branch, every vector of interlocks, mutation score of 95 %
 R12 | fuzzed inputs | 1,000,000 a target: no undeclared exception, 1 s and 256 MB at most
 R13 | long life | memory, descriptors and threads flat over 168 h at speed-up and over hours of real time
