@@ -92,7 +92,7 @@ def test_the_goal_is_met_where_nothing_grows_for_long_enough(
 ) -> None:
     samples(tmp_path / "week", grown_mb, rounds, 4.0, emergencies)
     samples(tmp_path / "hours", 0.0, 300, 120.0, emergencies)
-    week, hours = soak.figures_of(tmp_path / "week", per_day=False), soak.figures_of(tmp_path / "hours", per_day=True)
+    week, hours = soak.figures_of(tmp_path / "week", per_day=False), [soak.figures_of(tmp_path / "hours", per_day=True)]
     assert week["processes"]["guard"]["samples"] == (rounds - 4) - (rounds - 4) // 2
     assert soak.goal(week, hours)["met"] is met
     figures = plain({"week": week, "hours": hours, "goals": {"R13": soak.goal(week, hours)}})
@@ -103,10 +103,23 @@ def test_the_goal_is_met_where_nothing_grows_for_long_enough(
 
 def test_without_real_hours_it_is_not_met(tmp_path: Path) -> None:
     samples(tmp_path / "week", 0.0, 252, 4.0, 1_000_000)
-    week, hours = soak.figures_of(tmp_path / "week", per_day=False), soak.figures_of(tmp_path / "hours", per_day=True)
-    told = soak.goal(week, hours)
+    told = soak.goal(soak.figures_of(tmp_path / "week", per_day=False), [])
     assert not told["met"]
     assert "0 of 8 real hours" in told["figure"]
+
+
+def test_real_hours_are_added_and_nothing_may_grow_in_them_for_certain(tmp_path: Path) -> None:
+    samples(tmp_path / "week", 0.0, 252, 4.0, 1_000_000)
+    samples(tmp_path / "flat", 0.0, 300, 48.0, 0)
+    samples(tmp_path / "grows", 0.1, 300, 48.0, 0)
+    week = soak.figures_of(tmp_path / "week", per_day=False)
+    flat, grows = (soak.figures_of(tmp_path / name, per_day=True) for name in ("flat", "grows"))
+    assert not soak.goal(week, [flat])["met"]
+    assert soak.goal(week, [flat, flat])["met"]
+    assert not soak.goal(week, [flat, grows])["met"]
+    assert "### Run 2" in soak.page(
+        RUN, plain({"week": week, "hours": [flat, flat], "goals": {"R13": soak.goal(week, [])}})
+    )
 
 
 def test_a_week_has_a_million_emergencies_and_every_event() -> None:
