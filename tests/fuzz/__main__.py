@@ -57,7 +57,6 @@ def _fuzz(options: argparse.Namespace, corpus: Path, folder: Path) -> None:
     except ImportError:
         sys.exit("atheris is not installed; there is one for Linux and Python below 3.14: make setup with that")
 
-    _compare_arrays_untraced(atheris)
     with atheris.instrument_imports(include=["fdhil"], exclude=[*kernels(), *UNSEEN], enable_loader_override=False):
         from tests.fuzz import tasting
         from tests.fuzz.targets import target_of
@@ -77,6 +76,7 @@ def _fuzz(options: argparse.Namespace, corpus: Path, folder: Path) -> None:
     kept.mkdir(parents=True, exist_ok=True)
     flags = [f"-seed={options.seed}", f"-max_len={target.longest}", f"-dict={words}", "-verbosity=0", "-timeout=600"]
     atheris.Setup([sys.argv[0], *flags, "-rss_limit_mb=4096", f"-artifact_prefix={kept}/", str(corpus)], search.taste)
+    _compare_arrays_untraced(atheris)  # the setup has put its own in place
     atheris.Fuzz()
 
 
