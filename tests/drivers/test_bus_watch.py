@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from fdhil.drivers.can.frames import frames_of
 from fdhil.drivers.can.node_watch import NodeWatch, emcy_text
-from fdhil.drivers.can.sync_grid import SyncGrid
+from fdhil.drivers.can.sync_grid import LONGEST_SILENCE_S, SyncGrid
 from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.cia402.bus_decoder import BusDecoder
 from fdhil.records import Notice, TickTimes
@@ -35,6 +35,40 @@ def test_whole_turns_of_the_counter_are_told_by_time() -> None:
     grid = SyncGrid(0.001)
     got = grid.feed(frames_of(syncs([0, 1, 242, 243 + 480])))
     assert got.syncs.tick.tolist() == [0, 1, 242, 723]
+
+
+@pytest.mark.parametrize("missed", [240, 5_000, 30_123, 59_000])
+def test_the_syncs_of_a_silence_are_counted(missed: int) -> None:
+    grid = SyncGrid(0.001)
+    grid.feed(frames_of(syncs([0, 1])))
+    # the counter is right where the time is not quite
+    assert grid.feed(frames_of(syncs([missed + 2], step_ns=MS + 500))).syncs.tick.tolist() == [missed + 2]
+    assert grid.missed == missed
+
+
+@pytest.mark.parametrize("hours", [0.05, 16, 24 * 365 * 170])
+def test_a_longer_silence_is_a_new_beginning(hours: float) -> None:
+    """An NC that was off overnight left out 60 million rows, all of which were made at once."""
+    grid, begin = SyncGrid(0.001), round(hours * 3_600_000)
+    before = grid.feed(frames_of(syncs([0, 1]))).syncs.tick
+    after = grid.feed(frames_of(syncs(list(range(begin, begin + 50))))).syncs.tick
+    longest = round(LONGEST_SILENCE_S * 1000)
+    assert longest - 240 < after[0] - before[-1] < longest + 240
+    assert np.diff(after).tolist() == [1] * 49
+    assert (after[0] - begin) % 240 == 0  # as its counter says
+    assert grid.missed == after[0] - before[-1] - 1
+
+
+@pytest.mark.parametrize("block", [1, 500])
+def test_what_a_block_leaves_out_is_bounded_however_its_clock_jumps(block: int) -> None:
+    """Each SYNC seems to come hours after the one before it."""
+    grid = SyncGrid(0.001)
+    rows = [(k * 10_000_000 * MS, 0x80, bytes([k % 240 + 1])) for k in range(500)]
+    fed = [grid.feed(frames_of(rows[start : start + block])) for start in range(0, 500, block)]
+    steps = np.diff([-1, *(each.last_tick for each in fed)])
+    assert steps.max() < LONGEST_SILENCE_S * 1000 + 2 * 240 * block
+    assert [each.syncs.tick.size for each in fed] == [block] * len(fed)  # none is put aside
+    assert np.all(np.diff(np.concatenate([each.syncs.tick for each in fed])) > 0)
 
 
 def test_a_simulated_machine_that_was_held_up_misses_nothing() -> None:

@@ -117,6 +117,21 @@ def test_a_lost_sync_is_no_lost_pdo_wherever_the_blocks_part() -> None:
         assert decoder.counters()["pdo_lost"] == 0, cut
 
 
+@pytest.mark.parametrize("hours", [0.01, 1, 16])
+def test_what_comes_after_a_long_silence_is_sampled_as_before(hours: float) -> None:
+    frames = Wire().frames()
+    half = int(np.flatnonzero(frames["id"] == 0x80)[100])
+    begun = frames[half:].copy()
+    begun["t_ns"] += round(hours * 15_000) * 240_000_000  # as if the NC had gone on counting
+    (got, _, _), (true, _, _) = decode_all([frames[:half], begun]), decode_all([frames])
+    left_out = np.diff(got["tick"]).max()
+    assert 1000 < left_out <= 61_000
+    after = slice(-int((true["tick"] > 102).sum()), None)
+    for name in ("demand_mm", "position_mm", "speed_rad_s", "current_a", "voltage_v", "offset_mm", "statusword"):
+        np.testing.assert_array_equal(got[name][after], true[name][after])
+        np.testing.assert_array_equal(got[name][:96], true[name][:96])
+
+
 def test_a_target_that_stands_still_is_not_lost_with_a_sync() -> None:
     wire = Wire(n=60)
     wire.reference = {k: min(k, 30) for k in wire.reference}

@@ -2,7 +2,9 @@
 
 With a counter byte (0x1019, 1 to at most 240) lost SYNCs are counted and the grid stays right; without one a lost SYNC
 cannot be seen, and each SYNC is one tick. Arrival times serve two purposes only: to tell 1 from 241 periods, and to
-see at once where a counter begins again that does not go up to 240.
+see at once where a counter begins again that does not go up to 240. What comes after a silence longer than
+``LONGEST_SILENCE_S`` is a new beginning: by then the counter fits any time, so it stands that far behind, and no
+farther, however long the NC was off and wherever a clock jumped.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from fdhil.drivers.can.sync_producers import SyncProducers
 from fdhil.records import Int, Notice, TickTimes
 
 COUNTER_RANGE = 240
+LONGEST_SILENCE_S = 60.0  # twice as far as a window reaches back: none has rows from both sides
 _SHORT_RANGE = 16  # a counter that begins again so soon cannot tell back from forth
 _STEADY = 0.25  # of a period
 _UNCOUNTED = 8  # SYNCs without a counter, one after the other, until the producer with one is gone
@@ -45,6 +48,8 @@ class SyncGrid:
     def __init__(self, sync_period_s: float, realtime: bool = True) -> None:
         self._period_ns = sync_period_s * 1e9
         self._realtime = realtime
+        self._longest_silence = round(LONGEST_SILENCE_S / sync_period_s)
+        self._unheard_left = self._longest_silence
         self._last_tick = -1
         self._last_counter: int | None = None
         self._last_ns: int | None = None
@@ -64,6 +69,7 @@ class SyncGrid:
         can_id, length, data = (np.ascontiguousarray(frames[name]) for name in ("id", "dlc", "data"))
         where = np.flatnonzero(can_id == COB_SYNC)
         before = self._last_tick
+        self._unheard_left = self._longest_silence
         if where.size == 0:
             empty = TickTimes(np.empty(0, np.int64), np.empty(0, np.int64))
             return Ticked(can_id, length, data, np.full(frames.size, before, np.int64), empty, before)
@@ -172,14 +178,18 @@ class SyncGrid:
         """Whole turns of the counter that went by unheard.
 
         The elapsed time must fit a whole number of turns within 2 %: a simulated machine that was held up and then
-        goes on where it was fits none.
+        goes on where it was fits none. All of a block's are no more than the longest silence, or one for each SYNC.
         """
         if not self._realtime or self._last_ns is None:
             return 0
         elapsed = (t_ns - self._last_ns) / self._period_ns
         turns = round((elapsed - ahead) / self._range)
         fits = max(min(2.0, self._range / 8), 0.02 * elapsed)
-        return turns if turns > 0 and abs(elapsed - ahead - turns * self._range) <= fits else 0
+        if turns <= 0 or abs(elapsed - ahead - turns * self._range) > fits:
+            return 0
+        counted = max(1, min(turns, self._unheard_left // self._range))
+        self._unheard_left -= counted * self._range
+        return counted
 
     def _collisions(self, stamps: Int) -> tuple[Notice, ...]:
         """Say once when two nodes send SYNC."""
