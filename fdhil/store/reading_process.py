@@ -36,8 +36,8 @@ LONGEST_NAME = 200
 
 
 def most_processor_s(size: int) -> float:
-    """Return how long a file of so many bytes may be read: twenty times what a slow computer needs."""
-    return min(1.0 + 2e-6 * size, LONGEST_S)
+    """Return how long a file of so many bytes may be read: more than ten times what a slow computer needs."""
+    return min(0.8 + 2e-6 * size, LONGEST_S)
 
 
 def most_memory_bytes(size: int) -> int:
@@ -108,7 +108,7 @@ class ReadingProcess:
         if self.ended == -signal.SIGALRM:
             return f"it was not read within {LONGEST_S:g} s"
         if self.ended == -signal.SIGPROF:
-            return f"it was not read within {most_processor_s(len(content)):.0f} s of processor time"
+            return f"it was not read within {most_processor_s(len(content)):.2g} s of processor time"
         return "what reads it did not survive it"
 
     def _answer(self, reader: str, content: bytes, source: str) -> RecordingTable | FdhilError:

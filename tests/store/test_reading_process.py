@@ -53,7 +53,7 @@ def test_a_file_that_ends_its_reader_is_refused_and_the_next_one_read(name: str,
         ("fill", "survive"),
         ("talk", "survive"),
         ("sleep", "within 0.3 s"),
-        ("hang", "within 1 s of processor time"),
+        ("hang", "within 0.8 s of processor time"),
     ],
 )
 def test_a_reader_that_goes_astray_is_ended(does: str, told: str, monkeypatch: pytest.MonkeyPatch) -> None:

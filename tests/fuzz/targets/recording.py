@@ -63,7 +63,8 @@ class _Reader:
 def _read_all(module: Any, asked: Connection, others: Connection) -> None:
     """Read one file after another, as a fork of the product does."""
     others.close()  # its end is to be heard
-    signal.signal(signal.SIGVTALRM, signal.SIG_DFL)
+    for number in (signal.SIGVTALRM, signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE, signal.SIGILL):
+        signal.signal(number, signal.SIG_DFL)  # who fuzzes has handlers of its own
     faulthandler.disable()
     told = os.fdopen(os.dup(2), "w")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libraries complain there of what is damaged
