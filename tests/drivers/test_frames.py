@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdhil.drivers.can.frame_history import CHUNK_FRAMES, FrameHistory
+from fdhil.drivers.can.frame_history import CHUNK_FRAMES, FrameHistory, candump
 from fdhil.drivers.can.frames import DEFAULT_RING_FRAMES, FRAME, FrameRing, Frames
 
 
@@ -85,3 +85,16 @@ def test_a_history_holds_a_chunk_more_than_it_must_at_most() -> None:
     for start in range(0, 10 * CHUNK_FRAMES, 50):
         history.add(flood(start, 50))
     assert sum(chunk.size for chunk in history._chunks) <= 1001 + CHUNK_FRAMES
+
+
+def test_a_log_of_a_flood_is_made_piece_by_piece() -> None:
+    frames = flood(0, FLOOD)
+    tracemalloc.start()
+    try:
+        log = candump("can0", frames)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert log.count("\n") == FLOOD
+    assert log.endswith(candump("can0", frames[-1:]))
+    assert peak < 4 * len(log)

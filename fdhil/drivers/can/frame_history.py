@@ -55,6 +55,11 @@ class FrameHistory:
 
 def candump(bus: str, frames: Frames) -> str:
     """Return frames as lines of a ``candump -l`` log, which ``canplayer`` and others read; stamps are monotonic."""
+    pieces = range(0, frames.size, CHUNK_FRAMES)  # an object for each line of ten seconds would be many at a time
+    return "".join(_lines(bus, frames[begin : begin + CHUNK_FRAMES]) for begin in pieces)
+
+
+def _lines(bus: str, frames: Frames) -> str:
     lines = []
     columns = (frames[name].tolist() for name in ("t_ns", "id", "dlc", "data"))
     for t_ns, can_id, length, data in zip(*columns, strict=True):
