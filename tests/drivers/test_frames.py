@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
+import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdhil.drivers.can.frames import FrameRing
+from fdhil.drivers.can.frame_history import CHUNK_FRAMES, FrameHistory, candump
+from fdhil.drivers.can.frames import DEFAULT_RING_FRAMES, FRAME, FrameRing, Frames
 
 
 @given(st.lists(st.integers(0, 12), max_size=40))
@@ -36,3 +41,60 @@ def test_a_frame_survives_the_ring() -> None:
         assert int(frame["dlc"]) == length
         assert int(frame["data"]).to_bytes(8, "little")[:length] == bytes(range(length))
     assert ring.drain().size == 0
+
+
+FLOOD = 50_000
+PERIOD_NS = 1_000_000
+HEAP_BYTES = 64_000  # of objects; the frames themselves are twenty times that
+
+
+def flood(first: int, count: int) -> Frames:
+    """Return so many frames a millisecond apart, each with its number as data."""
+    frames = np.zeros(count, FRAME)
+    frames["data"] = np.arange(first, first + count)
+    frames["t_ns"] = frames["data"] * PERIOD_NS
+    return frames
+
+
+@pytest.mark.fault("F10")
+def test_what_holds_frames_takes_nothing_of_the_heap_which_keeps_its_holes() -> None:
+    tracemalloc.start()
+    try:
+        ring, history = FrameRing(DEFAULT_RING_FRAMES), FrameHistory(kept_s=FLOOD * PERIOD_NS * 1e-9)
+        for start in range(0, FLOOD, 1250):
+            history.add(flood(start, 1250))
+        taken, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert ring.room == DEFAULT_RING_FRAMES
+    assert history.frames().size == FLOOD
+    assert taken < HEAP_BYTES
+
+
+@given(st.lists(st.integers(0, 3 * CHUNK_FRAMES), max_size=8), st.integers(0, 4 * CHUNK_FRAMES))
+def test_a_history_returns_the_newest_frames_in_order(sizes: list[int], kept: int) -> None:
+    history, sent = FrameHistory(kept_s=kept * PERIOD_NS * 1e-9), 0
+    for size in sizes:
+        history.add(flood(sent, size))
+        sent += size
+        assert history.frames()["data"].tolist() == list(range(max(0, sent - kept - 1), sent))
+
+
+def test_a_history_holds_a_chunk_more_than_it_must_at_most() -> None:
+    history = FrameHistory(kept_s=1.0)
+    for start in range(0, 10 * CHUNK_FRAMES, 50):
+        history.add(flood(start, 50))
+    assert sum(chunk.size for chunk in history._chunks) <= 1001 + CHUNK_FRAMES
+
+
+def test_a_log_of_a_flood_is_made_piece_by_piece() -> None:
+    frames = flood(0, FLOOD)
+    tracemalloc.start()
+    try:
+        log = candump("can0", frames)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert log.count("\n") == FLOOD
+    assert log.endswith(candump("can0", frames[-1:]))
+    assert peak < 4 * len(log)

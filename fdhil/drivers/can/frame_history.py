@@ -6,34 +6,60 @@ from collections import deque
 
 import numpy as np
 
-from fdhil.drivers.can.frames import ERROR_FLAG, FRAME, Frames
+from fdhil.drivers.can.frames import ERROR_FLAG, FRAME, Frames, pages_for
 
 KEPT_S = 10.0
+CHUNK_FRAMES = 1 << 13
 
 
 class FrameHistory:
-    """Blocks of frames; whole blocks go once all of their frames are older than ``kept_s`` (by receive stamp)."""
+    """The frames of the last ``kept_s`` (by receive stamp), copied into chunks on pages of their own.
+
+    A chunk goes whole once all of its frames are older. Blocks as they come are of any size: those of a flood of
+    frames would leave the heap full of holes that nothing else fills.
+    """
 
     def __init__(self, kept_s: float = KEPT_S) -> None:
         self._kept_ns = round(kept_s * 1e9)
-        self._blocks: deque[Frames] = deque()
+        self._chunks: deque[Frames] = deque()  # of each the part that is filled
+        self._newest, self._filled = np.empty(0, FRAME), CHUNK_FRAMES
 
     def add(self, frames: Frames) -> None:
         """Keep a block."""
         if not frames.size:
             return
-        self._blocks.append(frames)
-        oldest = int(frames["t_ns"][-1]) - self._kept_ns
-        while int(self._blocks[0]["t_ns"][-1]) < oldest:
-            self._blocks.popleft()
+        oldest_ns = int(frames["t_ns"][-1]) - self._kept_ns
+        while frames.size:
+            frames = self._fill(frames)
+        while int(self._chunks[0]["t_ns"][-1]) < oldest_ns:
+            self._chunks.popleft()
+
+    def _fill(self, frames: Frames) -> Frames:
+        """Copy what finds room in the newest chunk, a new one where that is full; return the rest."""
+        if self._filled == CHUNK_FRAMES:
+            self._newest, self._filled = np.frombuffer(pages_for(CHUNK_FRAMES), FRAME), 0
+            self._chunks.append(self._newest[:0])
+        begin, self._filled = self._filled, min(CHUNK_FRAMES, self._filled + frames.size)
+        self._newest[begin : self._filled] = frames[: self._filled - begin]
+        self._chunks[-1] = self._newest[: self._filled]
+        return frames[self._filled - begin :]
 
     def frames(self) -> Frames:
         """Return what is kept, oldest first; may be called from another thread than ``add``."""
-        return np.concatenate([np.empty(0, FRAME), *list(self._blocks)])
+        kept = np.concatenate([np.empty(0, FRAME), *list(self._chunks)])
+        if not kept.size:
+            return kept
+        recent = kept["t_ns"] >= kept["t_ns"][-1] - self._kept_ns
+        return kept[int(recent.argmax()) :]
 
 
 def candump(bus: str, frames: Frames) -> str:
     """Return frames as lines of a ``candump -l`` log, which ``canplayer`` and others read; stamps are monotonic."""
+    pieces = range(0, frames.size, CHUNK_FRAMES)  # an object for each line of ten seconds would be many at a time
+    return "".join(_lines(bus, frames[begin : begin + CHUNK_FRAMES]) for begin in pieces)
+
+
+def _lines(bus: str, frames: Frames) -> str:
     lines = []
     columns = (frames[name].tolist() for name in ("t_ns", "id", "dlc", "data"))
     for t_ns, can_id, length, data in zip(*columns, strict=True):

@@ -7,6 +7,7 @@ decoded with shifts and masks instead of a loop.
 
 from __future__ import annotations
 
+import mmap
 import struct
 from collections.abc import Iterable
 
@@ -30,15 +31,24 @@ def frames_of(rows: Iterable[tuple[int, int, bytes]]) -> Frames:
     return np.frombuffer(raw, FRAME)
 
 
+def pages_for(frames: int) -> mmap.mmap:
+    """Return zeroed memory for so many frames on pages of its own: they go back as soon as nobody holds it.
+
+    What is set free on the heap of a thread stays with that thread, and may be full of holes.
+    """
+    return mmap.mmap(-1, frames * FRAME.itemsize, flags=mmap.MAP_PRIVATE)
+
+
 class FrameRing:
     """A ring of frames between one writer (the receive thread) and one reader.
 
-    Slots are reused, nothing is allocated while it runs. When the reader is late the newest frames are refused and
+    Slots are reused, nothing is allocated while it runs; they are on pages of their own, since a bus that is opened
+    again has a new ring, each time in another thread. When the reader is late the newest frames are refused and
     counted in ``overflowed``: a hole with a known size, never a torn frame.
     """
 
     def __init__(self, capacity: int = DEFAULT_RING_FRAMES) -> None:
-        self._buffer = bytearray(capacity * FRAME.itemsize)
+        self._buffer = pages_for(capacity)
         self._frames = np.frombuffer(self._buffer, FRAME)
         self._capacity = capacity
         self._written = 0
