@@ -158,7 +158,7 @@ def report(counted: Mapping[str, Tally], kinds: Mapping[str, faults.Kind]) -> li
         ({_at_most(harmful, recordings)}), {_percent(right, recordings)} named rightly. {_worst(counted, kinds)}"""
     )
     wrong = [f"{name} {', '.join(map(str, entry.wrong))}" for name, entry in counted.items() if entry.wrong]
-    lines += paragraph(f"Judged wrongly, by seed: {'; '.join(wrong) or 'none'}.")
+    lines += paragraph(f"Judged wrongly, or without a warning, by seed: {'; '.join(wrong) or 'none'}.")
     rows = [_row(name, kind, counted[name]) for name, kind in kinds.items() if counted[name].count]
     columns = [
         "fault",

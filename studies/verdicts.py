@@ -7,6 +7,7 @@ gets one fault of random severity. The table goes to ``docs/studies/verdicts.md`
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -40,12 +41,13 @@ def _rng(draws: Sequence[int]) -> np.random.Generator:
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """Return for each study what became of its recordings, by kind."""
-    found: dict[str, Any] = {}
+    path = options.out / "verdicts.json"
+    found: dict[str, Any] = json.loads(path.read_text("utf-8"))["figures"] if options.add and path.is_file() else {}
     for study in options.study:
         results = list(survey(range(options.good), partial(good, study=study), options.processes))
         results += survey(range(options.bad), partial(bad, study=study), options.processes)
         found[str(study)] = {name: vars(entry) for name, entry in tally(results, faults.KINDS).items()}
-    return found
+    return dict(sorted(found.items()))
 
 
 def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
@@ -57,9 +59,9 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
         rows 0.25 to 2 ms apart, voltage as means or instants, noise 0.1 to 0.5 %, sensors in steps of 0.001 to 0.2 % of
         their peak, positions in 0.1 to 5 um. Each bad recording has one fault of random severity, whose smallest is
         listed. "Named rightly" means that one of the reasons or warnings given is the class of that fault. A bad
-        recording is judged wrongly that does harm (a parameter beyond its interval, or a path beyond its tolerance), or
-        that is accepted without a warning: a fault that is too small for any parameter may be told and the model
-        kept."""
+        recording is judged wrongly that does harm (a parameter beyond its interval, or a path beyond its tolerance): a
+        fault that is too small for that may be told as a warning, and the model kept. One that is accepted without a
+        warning is listed, too."""
     )
     for study, counted in figures.items():
         lines += [f"## Study {study}", "", *report({k: Tally.of(v) for k, v in counted.items()}, faults.KINDS)]
@@ -77,6 +79,7 @@ def main() -> None:
     parser.add_argument("--good", type=int, default=1500, help="recordings; each holds one or two windows")
     parser.add_argument("--bad", type=int, default=3000)
     parser.add_argument("--study", type=int, nargs="+", default=[1], help="seeds of whole studies")
+    parser.add_argument("--add", action="store_true", help="to the studies that the figures have")
     pages.conduct("verdicts", parser, _seeds, measure)
 
 
