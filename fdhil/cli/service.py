@@ -29,6 +29,7 @@ AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON d
 @CONFIG
 @click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Left out: the config's, else the best.")
 @click.option("--json", "as_json", is_flag=True, help="Write each line as a JSON object to stdout.")
+@verdict
 def run(config: Path, method: str | None, as_json: bool) -> int:
     """Run the daemon of the machine in CONFIG: listen, identify, predict; correct only when armed.
 
