@@ -261,11 +261,10 @@ def _check(settings: Settings) -> None:
         _check_limits(axis, settings.sync_period_s)
     if len(settings.sent_ids) != 1 + len(settings.axes) + sum(a.feedforward is not None for a in settings.axes):
         raise ValueError("two of our PDOs share one COB-ID")
-    pdos = [pdo for axis in settings.axes for pdo in (axis.target, *axis.tpdos)]
-    others = {pdo.cob_id for pdo in pdos} | {COB_HEARTBEAT + axis.node_id for axis in settings.axes}
-    if len({axis.name for axis in settings.axes}) < len(settings.axes) or len({pdo.cob_id for pdo in pdos}) < len(pdos):
+    heard = [pdo.cob_id for axis in settings.axes for pdo in (axis.target, *axis.tpdos)]
+    if len({axis.name for axis in settings.axes}) < len(settings.axes) or len(set(heard)) < len(heard):
         raise ValueError("two axes are one")
-    if settings.sent_ids & others:
+    if settings.sent_ids & {*heard, *(COB_HEARTBEAT + axis.node_id for axis in settings.axes)}:
         raise ValueError("a COB-ID that is ours is another sender's: of the NC's set-points or a drive")
 
 
