@@ -111,6 +111,22 @@ def test_two_drives_with_one_node_id_are_refused() -> None:
     assert "two drives of one bus have the same node_id" in faults(document)
 
 
+@pytest.mark.parametrize("section", ["guard", "play"])
+def test_a_heartbeat_of_ours_under_a_drives_node_id_is_refused(section: str) -> None:
+    document = bench_document() | {section: {"node_id": 2}}
+    assert f"{section}.node_id: it is that of drive Y" in faults(document)
+
+
+def test_one_bus_by_two_names_is_refused() -> None:
+    """Every SYNC would be sent twice on it, and two drives of one node-ID would pass."""
+    place = {"interface": "socketcand", "host": "127.0.0.1", "port": 29536}
+    document = bench_document() | {"bus": {"can0": place, "can1": place}}
+    document["axis"]["Y"]["drive"] = {"node_id": 1, "bus": "can1"}
+    assert "bus.can1: it leads to the same place as [bus.can0]" in faults(document)
+    document["bus"]["can1"] = {**place, "channel": "can1"}
+    config.parse(document)
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [

@@ -149,14 +149,16 @@ class ArmingDesk:
         return {"ok": True, "state": "FEEDFORWARD", "text": text, **summary}
 
     async def _hand_over(
-        self, ask: Callable[[Prepared, str], Answer], prepared: Prepared, summary: Answer, token: str
+        self,
+        ask: Callable[[Prepared, str, Callable[[], bool]], Answer],
+        prepared: Prepared,
+        summary: Answer,
+        token: str,
     ) -> Answer:
         """Ask the guard in a thread; what it grants is armed, what it refuses is answered with what was planned."""
-        if self._given_up:
-            return refusal("Abandoned", "the arming was abandoned while it was prepared", "arm again when it is wanted")
         prepared.facts["journal_writable"] = self._store.fault is None
         try:
-            answer = await asyncio.to_thread(ask, prepared, token)
+            answer = await asyncio.to_thread(ask, prepared, token, lambda: self._given_up)
         except DeviceError as error:
             return self._without_guard(error)
         if not answer["ok"]:

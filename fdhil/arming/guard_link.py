@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+from fdhil.arming.answers import ABANDONED
 from fdhil.arming.checked_program import Piece
 from fdhil.arming.guard_client import GuardClient
 from fdhil.arming.preparing import Armament, Feeding
@@ -113,13 +114,20 @@ class GuardLink:
             except DeviceError:
                 self._status = {**self._status, "text": "the connection is lost"}
 
-    def arm(self, armament: Armament, token: str) -> Mapping[str, Any]:
-        """Load the table and arm (blocking); return the guard's answer. DeviceError when there is no guard."""
+    def arm(self, armament: Armament, token: str, given_up: Callable[[], bool]) -> Mapping[str, Any]:
+        """Load the table and arm (blocking), unless it is ``given_up`` by then; return the guard's answer.
+
+        A disarm that was answered while this waited for its turn was the operator's last word. DeviceError when there
+        is no guard.
+        """
         with self._asked(arming=True) as client:
+            if given_up():
+                return ABANDONED
             answer = self._load(client, armament, armament.begin)
             if not answer["ok"]:
                 return answer
-            return self._ask(client, lambda: client.arm(token, armament.stream.program_digest, armament.facts))
+            digest, facts = armament.stream.program_digest, armament.facts
+            return self._ask(client, lambda: client.arm(token, digest, facts), given_up)
 
     @staticmethod
     def _load(client: GuardClient, armament: Armament, piece: Piece, renew: bool = False) -> Mapping[str, Any]:
@@ -136,15 +144,20 @@ class GuardLink:
         with self._asked() as client:
             return self._load(client, armament, piece, renew=True)
 
-    def feed_forward(self, feeding: Feeding, token: str) -> Mapping[str, Any]:
-        """Switch the on-line feed-forward on (blocking); return the guard's answer. DeviceError without a guard."""
+    def feed_forward(self, feeding: Feeding, token: str, given_up: Callable[[], bool]) -> Mapping[str, Any]:
+        """Switch the on-line feed-forward on (blocking), as ``arm`` does. DeviceError without a guard."""
         with self._asked(arming=True) as client:
-            return self._ask(client, lambda: client.feed_forward(token, feeding.laws, feeding.facts))
+            return self._ask(client, lambda: client.feed_forward(token, feeding.laws, feeding.facts), given_up)
 
     @staticmethod
-    def _ask(client: GuardClient, arm: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
+    def _ask(
+        client: GuardClient, arm: Callable[[], Mapping[str, Any]], given_up: Callable[[], bool]
+    ) -> Mapping[str, Any]:
         """Ask until the interlocks have been good for long enough, for a few seconds; any other no is final."""
+        answer: Mapping[str, Any] = ABANDONED
         for _ in range(SETTLING_TRIES):
+            if given_up():
+                return ABANDONED
             client.alive(None)  # planning took its time: the guard must know us as alive when it is asked
             answer = arm()
             if answer["ok"] or [told["code"] for told in answer.get("refused", [])] != ["NotSettled"]:

@@ -62,7 +62,7 @@ def read_token(run_directory: Path) -> str:
     """Return the token. ConnectError when there is none, DeviceError when others can read it."""
     path = run_directory / TOKEN_NAME
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
     except FileNotFoundError:
         raise ConnectError(
             "daemon", f"has never run here ({path} is missing); start it with `fdhil run CONFIG`"

@@ -16,6 +16,7 @@ from fdhil.cli.audited import audited
 from fdhil.cli.commission_guide import Asked, Guide, confirm, room_of, told
 from fdhil.cli.commission_steps import FEEDFORWARD, STEPS, moves_of, planned, trial_moves
 from fdhil.cli.commission_trial import try_commissioned
+from fdhil.cli.failing import verdict
 from fdhil.errors import ConfigError, ConfigFault, DriveFault
 
 if TYPE_CHECKING:
@@ -40,6 +41,7 @@ SCHEMA = "fdhil-commission-1"
 )
 @click.option("--yes", is_flag=True, help="Do not ask before an axis moves, or PDOs are written.")
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
+@verdict
 def commission(
     config: Path,
     only: str | None,

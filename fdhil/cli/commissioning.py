@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import config as machine_config
+from fdhil.cli.failing import verdict
 from fdhil.errors import DeviceError
 from fdhil.guard.protocol import SOCKET_NAME
 
@@ -112,6 +113,7 @@ def _node_row(node: Node, unanswered: str) -> list[str]:
 @click.command()
 @CONFIG
 @AS_JSON
+@verdict
 def check(config: Path, as_json: bool) -> int:
     """Check that the machine on the bus is the one in CONFIG: identity, mapping, scales, cycle, rapid signal, sensors.
 

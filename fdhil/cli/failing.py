@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import click
 
 from fdhil.errors import ConfigError, ConfigFault, FdhilError
 
 SCHEMA = "fdhil-error-1"
+Given = ParamSpec("Given")
+Result = TypeVar("Result")
 STOPPED = 130
+STANDARD_ERROR = 2
 TROUBLE = 3
 NO_CACHE = (
     "compiled code can be kept neither beside fdhil nor in the home of this user; nothing was started; "
@@ -58,8 +62,31 @@ def run_safely(command: click.Command) -> int:
     return int(result or 0)
 
 
+def verdict(command: Callable[Given, Result]) -> Callable[Given, Result]:
+    """Mark a command whose exit code 0 is a yes: where nobody took its answer, it is 3."""
+
+    @functools.wraps(command)
+    def run(*given: Given.args, **options: Given.kwargs) -> Result:
+        try:
+            result = command(*given, **options)
+            sys.stdout.flush()
+        except BrokenPipeError:
+            _drop_stdout()
+            click.get_current_context().exit(TROUBLE)
+        return result
+
+    return run
+
+
 def prepare_streams() -> None:
-    """Make standard output and error take whatever is said: a terminal without ± shows ?, a closed one nothing."""
+    """Make standard output and error take whatever is said: a terminal without ± shows ?, a closed one nothing.
+
+    What was closed is /dev/null from here on, also in programs started from here: a bus that was opened in its place
+    would be sent what is said.
+    """
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= STANDARD_ERROR:
+        os.set_inheritable(descriptor, True)
+    os.close(descriptor)
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:

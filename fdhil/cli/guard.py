@@ -12,7 +12,7 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cli.bus_lock import lock_bus
-from fdhil.cli.main import run_safely
+from fdhil.cli.failing import prepare_streams, run_safely
 from fdhil.errors import DeviceError
 from fdhil.guard.protocol import SETTINGS_NAME
 from fdhil.guard.settings import from_json, to_json
@@ -71,6 +71,7 @@ def _write(file: Path, text: str) -> None:
 
 def main() -> None:
     """Run the command; an error is one sentence on stderr and its exit code."""
+    prepare_streams()
     sys.exit(run_safely(guard))
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import tables
+from fdhil.cli.failing import verdict
 from fdhil.cli.options import COLUMNS, OutputFile, Writing
 from fdhil.errors import RecordingError
 from fdhil.records import INTERVAL_95, unit_of
@@ -47,6 +48,7 @@ UNREADABLE = 3
 )
 @COLUMNS
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
+@verdict
 def identify(
     recordings: tuple[Path, ...],
     config_path: Path | None,

@@ -16,6 +16,7 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cli.audited import audited
+from fdhil.cli.failing import verdict
 from fdhil.errors import DeviceError, DriveFault
 from fdhil.guard.protocol import SOCKET_NAME
 
@@ -32,6 +33,7 @@ SIGNALS: Mapping[int, str] = {
     signal.SIGINT: "stopped by Ctrl-C",
     signal.SIGTERM: "stopped by SIGTERM",
     signal.SIGHUP: "the terminal is gone",
+    signal.SIGQUIT: "stopped by Ctrl-\\",
 }
 
 
@@ -43,6 +45,7 @@ SIGNALS: Mapping[int, str] = {
 @click.option("--dry-run", is_flag=True, help="Check the program and say what would move; opens no bus.")
 @click.option("--yes", is_flag=True, help="Do not ask before the axes move.")
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
+@verdict
 def play(
     program: Path, config_path: Path, go_to_start: bool, hold: bool, dry_run: bool, yes: bool, as_json: bool
 ) -> int:

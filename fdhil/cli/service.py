@@ -14,6 +14,7 @@ import click
 from fdhil import config as machine_config
 from fdhil import tables
 from fdhil.cli.audited import write_after, write_before
+from fdhil.cli.failing import verdict
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON d
 @CONFIG
 @click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Left out: the config's, else the best.")
 @click.option("--json", "as_json", is_flag=True, help="Write each line as a JSON object to stdout.")
+@verdict
 def run(config: Path, method: str | None, as_json: bool) -> int:
     """Run the daemon of the machine in CONFIG: listen, identify, predict; correct only when armed.
 
@@ -77,6 +79,7 @@ def status(config: Path, as_json: bool) -> None:
 @click.option("--method", type=click.Choice(list(tables.CORRECTIONS)), help="Left out: the best there is.")
 @click.option("--whole", is_flag=True, help="Arm only when all of a long PROGRAM has passed, however long that takes.")
 @AS_JSON
+@verdict
 def arm(config: Path, program: Path | None, method: str | None, whole: bool, as_json: bool) -> None:
     """Arm the correction of one PROGRAM (or demand CSV) on the machine of CONFIG.
 
@@ -93,8 +96,7 @@ def arm(config: Path, program: Path | None, method: str | None, whole: bool, as_
         raise click.UsageError("only --method flatness needs no PROGRAM; name the program to correct")
     machine = machine_config.load(config)
     if program is not None:
-        with program.open("rb"):  # a file that is not there is trouble, not the daemon's no
-            pass
+        os.close(os.open(program, os.O_RDONLY | os.O_NONBLOCK))  # a missing file is trouble, not the daemon's no
     from fdhil.arming.token import read_token
 
     request = {
@@ -137,6 +139,7 @@ class _Shown:
 @click.command()
 @CONFIG
 @AS_JSON
+@verdict
 def disarm(config: Path, as_json: bool) -> None:
     """Ramp the correction to zero, disarm, and wait until zero is read back.
 
@@ -194,6 +197,7 @@ def _disarm_at_the_guard(config: Path, silent: DeviceError) -> Mapping[str, Any]
 @CONFIG
 @click.option("--yes", is_flag=True, help="Do not ask.")
 @AS_JSON
+@verdict
 def adopt(config: Path, yes: bool, as_json: bool) -> None:
     """Ramp to zero what an earlier correction may have left in the drives of CONFIG (the guard's state FROZEN).
 

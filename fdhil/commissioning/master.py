@@ -196,6 +196,12 @@ class Master:
             self._plan.extend(values)
             return self.cycle + 1
 
+    def drop_offsets(self) -> int:
+        """Send none of the planned offsets any more; return the one that was sent last."""
+        with self._lock:
+            self._plan.clear()
+            return self.offset
+
     @property
     def playing(self) -> bool:
         """Whether planned offsets still wait to be sent."""

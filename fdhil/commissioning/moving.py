@@ -16,7 +16,7 @@ from fdhil.commissioning.set_points import Bounds, SetPoints
 from fdhil.errors import DriveFault
 from fdhil.records import Float
 
-ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 PATIENCE = 20.0  # times as long as the set-points take
 SILENT_CYCLES = 20
 LAG_CYCLES = 300  # an axis may follow so much later than its last set-point
@@ -83,11 +83,19 @@ def following(masters: Sequence[Master], bounds: Sequence[Bounds]) -> Iterator[S
 @contextlib.contextmanager
 def undisturbed() -> Iterator[None]:
     """Take no notice of a second Ctrl-C while the axes are braked."""
+    with held_back():
+        yield
+
+
+@contextlib.contextmanager
+def held_back() -> Iterator[list[int]]:
+    """Let no Ctrl-C end what puts an axis at rest; gives the signals that came meanwhile."""
+    came: list[int] = []
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield came
         return
-    with handling(signal.SIG_IGN):
-        yield
+    with handling(lambda number, _frame: came.append(number)):
+        yield came
 
 
 @contextlib.contextmanager

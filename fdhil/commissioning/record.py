@@ -153,8 +153,8 @@ def load_record(
     """
     path = record_path(directory, axis)
     try:
-        with path.open("rb") as file:
-            raw = file.read(MAX_RECORD_BYTES + 1)
+        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
+            raw = file.read(MAX_RECORD_BYTES + 1) or b""  # None: a pipe in its place that nobody writes to
     except FileNotFoundError:
         return None
     except OSError as error:

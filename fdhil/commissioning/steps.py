@@ -20,6 +20,7 @@ from fdhil.commissioning.compare import found_fingerprint
 from fdhil.commissioning.feedforward import feedforward_open, prove_feedforward
 from fdhil.commissioning.finding import read_optional
 from fdhil.commissioning.master import Master
+from fdhil.commissioning.moving import held_back
 from fdhil.commissioning.progress import Found, Progress
 from fdhil.commissioning.record import CommissioningRecord, axis_digest
 from fdhil.commissioning.survey import (
@@ -126,10 +127,10 @@ def zero_offset(master: Master) -> None:
 
 
 def ramp(master: Master, goal: int, step: int | None = None) -> int:
-    """Move the offset to ``goal`` increments by ``step`` per cycle; returns the cycle of the first value."""
+    """Move the offset from where it is to ``goal`` by ``step`` increments per cycle; return the cycle of the first."""
     per_mm = master.config.axis[master.axis].scaling.increments_per_mm
     step = step or max(1, round(_limits(master).max_speed_mm_s * per_mm * master.period_s / 4))
-    start = master.offset
+    start = master.drop_offsets()  # Ctrl-C may have come in the midst of another ramp
     count = math.ceil(abs(goal - start) / step)
     sign = 1 if goal > start else -1
     first = master.play_offset([*(start + sign * step * k for k in range(1, count)), *([goal] if count else [])])
@@ -333,21 +334,28 @@ def rolled_back(master: Master) -> Iterator[None]:
 
     What cannot be undone is told beside what went wrong.
     """
-    failure: DeviceError | None = None
-    faults: list[str] = []
     try:
         yield
-    except DeviceError as error:
-        failure = error
-    finally:
+    except BaseException as error:  # Ctrl-C, too
+        _roll_back(master, f"{str(error) or 'it was interrupted'}; ")
+        raise
+    if _roll_back(master):
+        raise KeyboardInterrupt
+
+
+def _roll_back(master: Master, first: str = "") -> bool:
+    """Offset to 0, drive disabled; return whether somebody wanted to stop it: all of it is done before that is heard.
+
+    ProtocolError, after ``first``, when the drive could not be left as it was.
+    """
+    faults: list[str] = []
+    with held_back() as came:
         for step in (zero_offset, disable):
             try:
                 step(master)
             except DeviceError as error:
                 faults.append(str(error))
-    if failure is not None and not faults:
-        raise failure
     if faults:
-        first = f"{failure}; " if failure is not None else ""
         text = f"{first}the drive could not be left as it was ({'; '.join(faults)}); power it off and on again"
-        raise ProtocolError(master.device, text) from failure
+        raise ProtocolError(master.device, text)
+    return bool(came)

@@ -63,3 +63,10 @@ class CanBus(Section):
     def may_send(self) -> bool:
         """Whether fdhil can send here: an adapter of python-can is listened to, and no more."""
         return self.interface in OWN_WAYS
+
+    @property
+    def place(self) -> tuple[str, ...] | None:
+        """Where it leads to, as far as the file tells; None where that is still to be chosen (port 0)."""
+        if self.interface != "socketcand":
+            return (self.interface, self.channel)
+        return (self.interface, self.channel, self.host, str(self.port)) if self.port else None

@@ -72,18 +72,30 @@ class MachineConfig(Section):
             faults += [f"axis.{name}.{doubt.key}: {doubt.text}" for doubt in found if limits or not doubt.possible]
             faults += limits
         faults += line_faults(self._line_users())
-        if self.play.node_id == self.guard.node_id:
-            faults.append("play.node_id: it is the guard's node_id; both send a heartbeat")
-        # the PDOs of a device's second axis are those of the next node-ID
-        ids = {(axis.drive.bus, self.node_id(name) + axis.drive.logical_axis) for name, axis in self.axis.items()}
-        if len(ids) < len(self.axis):
-            faults.append("axis: two drives of one bus have the same node_id")
+        faults += self._node_faults()
         faults += [f"sim.axis.{name}: there is no [axis.{name}]" for name in self.sim.axis if name not in self.axis]
         told = self.uplink.axis_labels if self.uplink is not None else ()
         faults += [f"uplink.axis_labels.{name}: there is no [axis.{name}]" for name in told if name not in self.axis]
         if faults:
             raise ValueError("\n".join(faults))
         return self
+
+    def _node_faults(self) -> Iterator[str]:
+        """Yield what would make two senders of one COB-ID."""
+        if self.play.node_id == self.guard.node_id:
+            yield "play.node_id: it is the guard's node_id; both send a heartbeat"
+        drives = {self.node_id(name): name for name in self.axis}
+        for section, node_id in (("guard", self.guard.node_id), ("play", self.play.node_id)):
+            if node_id in drives:
+                yield f"{section}.node_id: it is that of drive {drives[node_id]}; both send a heartbeat"
+        # the PDOs of a device's second axis are those of the next node-ID
+        ids = {(axis.drive.bus, self.node_id(name) + axis.drive.logical_axis) for name, axis in self.axis.items()}
+        if len(ids) < len(self.axis):
+            yield "axis: two drives of one bus have the same node_id"
+        places: dict[tuple[str, ...], str] = {}
+        for name, bus in self.bus.items():
+            if bus.place is not None and places.setdefault(bus.place, name) != name:
+                yield f"bus.{name}: it leads to the same place as [bus.{places[bus.place]}]; keep one of them"
 
     def _line_users(self) -> Iterator[LineUser]:
         """Yield the sensors on serial devices."""

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import select
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
-from typing import Literal
+from typing import Literal, TextIO
 
 from fdhil.records import (
     PARAMETERS,
@@ -30,6 +31,7 @@ BURST = 20  # lines of one class that are written before a flood of it is only c
 REFILL_PER_S = 1.0
 
 _for_programs = threading.Event()  # whether lines are JSON
+_dropped = {"lines": 0}  # that nobody took, since the last that somebody did
 
 
 def printable(text: str) -> str:
@@ -49,17 +51,45 @@ def lines_as_json(wanted: bool) -> Iterator[None]:
 
 
 def write_line(text: str, severity: Severity = "info") -> None:
-    """Write one line to stderr with the local time; to the journal, which has the time, with its priority."""
+    """Write one line to stderr with the local time; to the journal, which has the time, with its priority.
+
+    Nobody waits for who reads it: where nothing is taken now, or a disk is full, the line is dropped, and it is told
+    later how many were.
+    """
+    lost = _dropped["lines"]
+    if lost and _written(*_line(f"{lost} lines could not be written before this one", "minor")):
+        _dropped["lines"] = 0
+    if not _written(*_line(text, severity)):
+        _dropped["lines"] += 1
+
+
+def _line(text: str, severity: Severity) -> tuple[TextIO, str]:
+    """Where a line goes, and how it reads there."""
     now = datetime.now().astimezone()
     if _for_programs.is_set():
         line = {"time": now.isoformat(timespec="milliseconds"), "severity": severity, "text": text}
-        sys.stdout.write(json.dumps(line) + "\n")
-        sys.stdout.flush()
-        return
+        return sys.stdout, json.dumps(line) + "\n"
     stamp = f"{now:%Y-%m-%d %H:%M:%S}.{now.microsecond // 1000:03d} "
     prefix = f"<{_PRIORITY[severity]}>" if os.environ.get("JOURNAL_STREAM") else stamp
-    sys.stderr.write(f"{prefix}{printable(text)}\n")
-    sys.stderr.flush()
+    return sys.stderr, f"{prefix}{printable(text)}\n"
+
+
+def _written(stream: TextIO, line: str) -> bool:
+    """Write a line as far as it is taken at once: a full pipe, or a terminal that was halted, would hold all up."""
+    try:
+        descriptor = stream.fileno()
+    except (OSError, ValueError):  # a text in memory
+        stream.write(line)
+        return True
+    poll = select.poll()
+    poll.register(descriptor, select.POLLOUT)
+    left = line.encode(stream.encoding, "replace")
+    try:
+        while left and poll.poll(0) == [(descriptor, select.POLLOUT)]:
+            left = left[os.write(descriptor, left[: select.PIPE_BUF]) :]
+    except OSError:
+        return False
+    return not left
 
 
 def line_of(outcome: Outcome) -> tuple[str, Severity]:

@@ -44,6 +44,7 @@ LAST_RETRY_S = 5.0
 WATCHDOG_S = 2.0
 LISTEN_S = 0.25
 RESOURCES_S = 10.0
+STOPPING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 STUCK_S = 60.0  # a batch that is digested for so long hangs
 
 
@@ -93,10 +94,11 @@ class Service:
         self._delay_s = FIRST_RETRY_S
 
     async def run(self) -> Standing:
-        """Serve until SIGTERM or SIGINT; return what may still be applied. BusLocked when another daemon serves it."""
+        """Serve until a signal asks to stop; return what may still be applied. BusLocked when another one serves it."""
         loop = asyncio.get_running_loop()
         with sole_owner(self._run_directory):
-            for number in (signal.SIGTERM, signal.SIGINT):
+            stopping = [number for number in STOPPING if signal.getsignal(number) is not signal.SIG_IGN]  # as by nohup
+            for number in stopping:
                 loop.add_signal_handler(number, self._stop.set)
             try:
                 await self._serve()
@@ -105,7 +107,7 @@ class Service:
                 stands = await self._desk.stand_down()
                 await self._audit.written()
                 await asyncio.to_thread(self._store.close)
-                for number in (signal.SIGTERM, signal.SIGINT):
+                for number in stopping:
                     loop.remove_signal_handler(number)
                 if self._opened.is_set() or not stands.nothing:  # else it never ran, and the error alone is told
                     self._say_stopped(stands)

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from fdhil.cia402 import Object, PdoEntry, lay_out
+from fdhil.cia402 import COB_HEARTBEAT, Object, PdoEntry, lay_out
 from fdhil.errors import ConfigError, ConfigFault
 from fdhil.guard import feedforward
 from fdhil.guard.limits import OffsetLimits, ceilings
@@ -261,6 +261,11 @@ def _check(settings: Settings) -> None:
         _check_limits(axis, settings.sync_period_s)
     if len(settings.sent_ids) != 1 + len(settings.axes) + sum(a.feedforward is not None for a in settings.axes):
         raise ValueError("two of our PDOs share one COB-ID")
+    heard = [pdo.cob_id for axis in settings.axes for pdo in (axis.target, *axis.tpdos)]
+    if len({axis.name for axis in settings.axes}) < len(settings.axes) or len(set(heard)) < len(heard):
+        raise ValueError("two axes are one")
+    if settings.sent_ids & {*heard, *(COB_HEARTBEAT + axis.node_id for axis in settings.axes)}:
+        raise ValueError("a COB-ID that is ours is another sender's: of the NC's set-points or a drive")
 
 
 def _check_axis(axis: AxisSettings) -> None:

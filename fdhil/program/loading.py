@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import stat
 from pathlib import Path
 
 from fdhil.config import MachineConfig
@@ -25,9 +27,19 @@ def load_trajectory(path: Path, config: MachineConfig) -> Trajectory:
 
 
 def program_digest(path: Path) -> str:
-    """Return the SHA-256 of a program's or demand's bytes, 64 hexadecimal digits; ProgramError when it is not there."""
+    """Return the SHA-256 of a program's or demand's bytes, 64 hexadecimal digits.
+
+    ProgramError when it is not there, or no plain file: a pipe would never end, and nothing could be read of it again.
+    """
     try:
-        with path.open("rb") as file:
+        with open(path, "rb", opener=_at_once) as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise ProgramError(0, "", f"{path} is a pipe or a device; give the program as a plain file")
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise ProgramError(0, "", f"{path} cannot be read ({error.strerror}); check the path") from None
+
+
+def _at_once(path: str, flags: int) -> int:
+    """Open a file; a pipe that nobody writes to is not waited for."""
+    return os.open(path, flags | os.O_NONBLOCK)

@@ -130,3 +130,29 @@ async def test_what_is_given_up_while_it_is_planned_is_not_armed(
     assert set(guard.heard) <= {"disarm", "status"}
     assert desk.armed is None
     desk.guard.close()
+
+
+async def test_a_disarm_that_is_answered_before_the_guard_is_asked_to_arm_is_the_last_word(
+    config: MachineConfig, guard: Guard, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All is planned, and the guard's slow answer to another request is waited for when the operator disarms."""
+    feeding = SimpleNamespace(laws={}, facts={}, summary=dict, progress=dict)
+    monkeypatch.setattr("fdhil.arming.desk.prepare_feeding", lambda *_: feeding)
+    guard.says = lambda _kind: {**FINE, "state": "OFF"}
+    desk = ArmingDesk(config, OutcomeStore(config), folder)
+    desk.begin({}, [])
+    asked, disarmed, feed_forward = threading.Event(), threading.Event(), desk.guard.feed_forward
+
+    def its_turn_comes_late(*given: Any) -> Any:
+        asked.set()
+        assert disarmed.wait(60.0)
+        return feed_forward(*given)
+
+    monkeypatch.setattr(desk.guard, "feed_forward", its_turn_comes_late)
+    arming = asyncio.create_task(desk.arm({"request": "arm", "method": "flatness", "token": read_token(folder)}))
+    assert await asyncio.to_thread(asked.wait, 60.0)
+    assert (await desk.disarm())["ok"]
+    disarmed.set()
+    assert (await arming)["code"] == "Abandoned"
+    assert "feedforward" not in guard.heard
+    desk.guard.close()

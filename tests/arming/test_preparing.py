@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from fdhil.arming.whole_plan import plan_whole
 from fdhil.commissioning.record import CommissioningRecord, axis_digest, save_record
 from fdhil.config import MachineConfig
 from fdhil.daemon.outcome_store import OutcomeStore
+from fdhil.errors import ProgramError
 from fdhil.identification.loops import DIFFER
 from fdhil.program import program_digest
 from fdhil.records import LoopEstimate, Notice, Reason, Skill, Verdict
@@ -216,6 +218,16 @@ async def test_the_operators_token_decides_and_a_missing_guard_is_told(config: M
     assert (await desk.arm({"request": "arm", "token": token}))["code"] == "BadRequest"
     assert (await desk.disarm())["code"] == "GuardAbsent"
     assert not (await desk.stand_down()).heard
+
+
+@pytest.mark.timeout(100)
+def test_a_pipe_is_no_program_and_nobody_waits_for_it(config: MachineConfig, tmp_path: Path) -> None:
+    """Nothing else could be armed, and the daemon could not stop, for as long as nobody writes to it."""
+    os.mkfifo(tmp_path / "program.ngc")
+    axis = AxisKnowledge(published(), 0.0, None, ())
+    for program in (tmp_path / "program.ngc", Path(os.devnull)):
+        with pytest.raises(ProgramError, match="give the program as a plain file"):
+            prepare(program, None, config, dict.fromkeys(config.axis, axis))
 
 
 def test_a_changed_load_is_remembered_until_new_parameters_come(config: MachineConfig, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import socket
 import stat
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -123,6 +124,25 @@ def test_it_becomes_the_guard_owns_its_bus_and_stops_cleanly(
     assert (ready["event"], ready["axes"]) == ("ready", ["X", "Y"])
     assert [code for code, _ in seconds] == [3, 3]
     assert all("BusLocked" in refused and len(refused.splitlines()) == 1 for _, refused in seconds)
+    assert peer.sent == []
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
+def test_a_guard_whose_output_is_closed_says_nothing_on_the_bus(closed: str, tmp_path: Path, peer: Peer) -> None:
+    """The descriptor that is free must not become the bus: the journal would be written to it."""
+    config = write_config(tmp_path, peer.port)
+    command = f"exec {sys.executable} -m fdhil.cli.guard {config} {closed}"
+    with subprocess.Popen(["bash", "-c", command], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        deadline_s = time.monotonic() + 60
+        while not (tmp_path / "fdhil-data" / "run" / "guard.sock").exists():
+            assert process.poll() is None, process.communicate()
+            assert time.monotonic() < deadline_s
+            time.sleep(0.05)
+        held = {number: str(Path(f"/proc/{process.pid}/fd/{number}").readlink()) for number in range(3)}
+        process.send_signal(signal.SIGTERM)
+        _, told = process.communicate()
+    assert not any(where.startswith("socket:") for where in held.values()), held
+    assert told == b""
     assert peer.sent == []
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import socket
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -140,6 +142,17 @@ def test_a_refusal_exits_1_with_class_cause_and_next_action(machine: Path, tmp_p
     with answering(machine, answer):
         code, out, _ = fdhil("disarm", machine, "--json", capsys=capsys)
     assert (code, json.loads(out)) == (1, answer)
+
+
+@pytest.mark.parametrize("how", ["--json", "2>&1 >/dev/null"])
+def test_a_no_that_nobody_took_is_no_yes(how: str, machine: Path) -> None:
+    """What may still be applied is then known to nobody; exit code 0 would say that nothing is."""
+    refused = {"ok": False, "code": "OffsetStands", "text": "30 um may still be applied", "advice": "hold the feed"}
+    command = f"sleep 0.5; exec {sys.executable} -m fdhil disarm {machine}"
+    with answering(machine, refused):
+        script = f"set -o pipefail; ({command} {how}) | true"
+        done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=100)
+    assert (done.returncode, done.stdout, done.stderr) == (3, "", "")
 
 
 def test_arm_shows_how_far_the_check_of_a_long_program_is(machine: Path, capsys: Any) -> None:

@@ -105,14 +105,24 @@ def test_who_may_not_read_the_key_believes_the_digest_alone_if_it_says_so(
 ) -> None:
     save_record(RECORD, tmp_path)
 
-    def refuse(path: Any, *_: Any) -> int:
-        assert Path(path).name == KEY_NAME
+    really_open = os.open
+
+    def refuse(path: Any, *given: Any) -> int:
+        if Path(path).name != KEY_NAME:
+            return really_open(path, *given)
         raise PermissionError(errno.EACCES, "Permission denied")
 
     monkeypatch.setattr(os, "open", refuse)
     with pytest.raises(StoreError, match="may not be read by this user"):
         load_record(tmp_path, "X")
     assert load_record(tmp_path, "X", may_lack_key=True) == RECORD
+
+
+@pytest.mark.timeout(60)
+def test_a_pipe_in_the_place_of_a_record_is_none_and_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(record_path(tmp_path, "X"))
+    with pytest.raises(StoreError, match="is no commissioning record"):
+        load_record(tmp_path, "X")
 
 
 def test_the_key_may_lie_elsewhere(tmp_path: Path) -> None:

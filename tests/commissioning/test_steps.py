@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import signal
 import time
 import uuid
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import can
+import numpy as np
 import pytest
 
 from fdhil.cia402 import Object, State
@@ -398,3 +400,68 @@ def test_states_are_shown(peer: tuple[DrivePeer, MachineConfig]) -> None:
         assert master.state() is State.SWITCH_ON_DISABLED
         enable(master)
         assert master.state() is State.OPERATION_ENABLED
+
+
+class KeptOffsets(DrivePeer):
+    """A simulated drive that keeps every offset it was sent, and fires Ctrl-C once one of them is ``interrupt_at``."""
+
+    def __init__(self, config: MachineConfig, interrupt_at: int | None = None) -> None:
+        super().__init__(config)
+        self.offsets = [0]
+        self.interrupt_at: int | None = interrupt_at
+
+    def take(self, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
+        if can_id == 0x301:
+            self.offsets.append(int.from_bytes(data[:4], "little", signed=True))
+            if self.offsets[-1] == self.interrupt_at:
+                self.interrupt_at = None
+                signal.raise_signal(signal.SIGINT)
+        return super().take(can_id, data)
+
+
+def enabled_and_rolled_back(settings: MachineConfig, step: Callable[[Master], object]) -> None:
+    """A step as a commissioning runs it."""
+    with Master(settings, "X") as master, rolled_back(master):
+        prepare(master)
+        enable(master)
+        step(master)
+
+
+@pytest.mark.parametrize("interrupt_at", [12, 33])
+def test_a_ramp_that_is_stopped_on_its_way_turns_round_there(interrupt_at: int) -> None:
+    settings = config()
+    with KeptOffsets(settings, interrupt_at) as drive:
+        with pytest.raises(KeyboardInterrupt):
+            enabled_and_rolled_back(settings, sign_test)
+        offsets = drive.offsets
+    assert max(map(abs, np.diff(offsets))) <= 20  # never what a plan of before and one of now have between them
+    assert max(offsets) <= 33
+    assert offsets[-1] == 0
+    assert drive.drive.power.state.name == "SWITCH_ON_DISABLED"
+
+
+def test_ctrl_c_while_all_is_rolled_back_is_heard_once_that_is_done() -> None:
+    settings = config()
+    with KeptOffsets(settings) as drive:
+
+        def out(master: Master) -> None:
+            steps.ramp(master, 30, 1)
+            drive.interrupt_at = 14  # on the way back
+
+        with pytest.raises(KeyboardInterrupt):
+            enabled_and_rolled_back(settings, out)
+        assert drive.offsets[-1] == 0
+    assert drive.drive.power.state.name == "SWITCH_ON_DISABLED"
+    assert drive.drive.dictionary.number(0x60B0) == 0
+
+
+def test_what_could_not_be_rolled_back_is_told_after_ctrl_c_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = config()
+
+    def fails(master: Master) -> None:
+        raise DriveFault(master.device, "it still holds an offset")
+
+    monkeypatch.setattr(steps, "zero_offset", fails)
+    left = pytest.raises(ProtocolError, match="interrupted; the drive could not be left as it was")
+    with DrivePeer(settings), left, Master(settings, "X") as master, rolled_back(master):
+        raise KeyboardInterrupt

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import re
 import socket
+import sys
 import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -164,6 +166,28 @@ def test_lines_carry_priorities_in_the_journal_and_no_escapes_anywhere(
     line = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{3} Öl µm"
     assert re.fullmatch(rf"<3>bad \\x1b\[31m\\nforged\n{line}\n", capsys.readouterr().err)
     assert printable("\u202e") == "\\u202e"
+
+
+@pytest.mark.fault("F11")
+@pytest.mark.timeout(60)
+def test_a_log_that_nobody_reads_holds_nothing_up_and_what_it_lacks_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pager, or a terminal that was halted with Ctrl-S, and then a reader that has gone."""
+    monkeypatch.setattr(journal, "_dropped", {"lines": 0})
+    reader, writer = os.pipe()
+    with os.fdopen(reader, "rb", 0) as read, os.fdopen(writer, "w") as stream:
+        monkeypatch.setattr(sys, "stderr", stream)
+        for _ in range(2_000):
+            journal.write_line("x" * 100)
+        told = read.read(1 << 20).count(b"\n")
+        journal.write_line("last")
+        lines = read.read(1 << 20).decode().splitlines()
+        assert lines[0].endswith(f" {2_000 - told} lines could not be written before this one")
+        assert lines[1].endswith(" last")
+        read.close()
+        journal.write_line("said to nobody")
+    with Path("/dev/full").open("w") as full:
+        monkeypatch.setattr(sys, "stderr", full)
+        journal.write_line("on a full disk")
 
 
 @pytest.mark.fault("F12")

@@ -314,6 +314,31 @@ def test_two_axes_on_one_offset_are_refused() -> None:
         from_json(json.dumps(document))
 
 
+@pytest.mark.parametrize("taken", [("axes", 1, "target"), ("axes", 0, "target"), ("axes", 1, "tpdos", 0)])
+def test_an_offset_under_another_senders_id_is_refused(taken: tuple[str | int, ...]) -> None:
+    """It would reach the drive as half a set-point, or the NC as what a drive says."""
+    document = inner = json.loads(to_json(settings()))
+    for key in taken:
+        inner = inner[key]
+    document["axes"][0]["offset"]["cob_id"] = inner["cob_id"]
+    with pytest.raises(ConfigError, match="is another sender's"):
+        from_json(json.dumps(document))
+
+
+def test_a_heartbeat_of_ours_in_a_drives_name_is_refused() -> None:
+    document = json.loads(to_json(settings()))
+    document["node_id"] = document["axes"][1]["node_id"]
+    with pytest.raises(ConfigError, match="is another sender's"):
+        from_json(json.dumps(document))
+
+
+def test_two_axes_that_are_one_are_refused() -> None:
+    document = json.loads(to_json(settings()))
+    document["axes"][1]["tpdos"] = document["axes"][0]["tpdos"]
+    with pytest.raises(ConfigError, match="two axes are one"):
+        from_json(json.dumps(document))
+
+
 def test_what_may_be_sent_and_how_long_silence_is() -> None:
     made: Settings = settings()
     assert made.sent_ids == {0x301, 0x302, 0x764}

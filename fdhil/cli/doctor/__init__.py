@@ -13,6 +13,7 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cli.doctor.trouble import Trouble
+from fdhil.cli.failing import verdict
 from fdhil.daemon.clock import newest_record_s
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ SCHEMA = "fdhil-doctor-1"
 @click.argument("config", type=click.Path(path_type=Path))
 @click.option("--offline", is_flag=True, help="Look at this PC alone, and leave buses and sensors in peace.")
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
+@verdict
 def doctor(config: Path, offline: bool, as_json: bool) -> int:
     """Tell what is wrong with this PC, bus, drives, sensors, store, clock and rights: what to mend first comes first.
 
