@@ -10,7 +10,6 @@ import argparse
 import gc
 import hashlib
 import json
-import operator
 import os
 import sys
 import tempfile
@@ -19,15 +18,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from tests.fuzz import TARGETS
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 COMPILED = ("njit", "@compiled", "@inlined")
 # what ends the process that reads is found once; to look for more of it costs a start each time
 UNSEEN = ["fdhil.store.reading_process"]
-ORDERS = (operator.lt, operator.le, operator.eq, operator.ne, operator.gt, operator.ge)  # as in dis.cmp_op
 
 
 def kernels() -> list[str]:
@@ -76,22 +72,7 @@ def _fuzz(options: argparse.Namespace, corpus: Path, folder: Path) -> None:
     kept.mkdir(parents=True, exist_ok=True)
     flags = [f"-seed={options.seed}", f"-max_len={target.longest}", f"-dict={words}", "-verbosity=0", "-timeout=600"]
     atheris.Setup([sys.argv[0], *flags, "-rss_limit_mb=4096", f"-artifact_prefix={kept}/", str(corpus)], search.taste)
-    _compare_arrays_untraced(atheris)  # the setup has put its own in place
     atheris.Fuzz()
-
-
-def _compare_arrays_untraced(atheris: Any) -> None:
-    """Have arrays compared by themselves: atheris 3.0 keeps what a comparison gave for ever, some 50 KiB an input."""
-    from atheris.version_dependent import CMP_OP_SHIFT_AMOUNT
-
-    traced = atheris._trace_cmp
-
-    def compared(one: Any, other: Any, order: int, number: int, constant: bool) -> Any:
-        if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
-            return ORDERS[order >> CMP_OP_SHIFT_AMOUNT](one, other)
-        return traced(one, other, order, number, constant)
-
-    atheris._trace_cmp = compared
 
 
 def _escaped(word: bytes) -> str:
