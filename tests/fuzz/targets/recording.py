@@ -63,7 +63,7 @@ class _Reader:
 def _read_all(module: Any, asked: Connection, others: Connection) -> None:
     """Read one file after another, as a fork of the product does."""
     others.close()  # its end is to be heard
-    for number in (signal.SIGVTALRM, signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE, signal.SIGILL):
+    for number in signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP}:
         signal.signal(number, signal.SIG_DFL)  # who fuzzes has handlers of its own
     faulthandler.disable()
     told = os.fdopen(os.dup(2), "w")
