@@ -116,7 +116,8 @@ def page(run: Mapping[str, str], figures: Mapping[str, Any]) -> str:
         given, more than {LONGEST_S:g} s of processor time or more than {MOST_BYTES >> 20} MiB for one input. {total:,}
         inputs went to {len(parts)} ways in, over all runs so far, those before the last one to earlier code.
         {found or "None"} of them hurt in the last run of its way in. {len(whole)} of the ways in have had {GOAL:,}
-        inputs or more. `python -m studies.fuzz --inputs {GOAL} --add` goes on."""
+        inputs or more. A process' memory holds what atheris keeps of each array that it compared, too. `python -m
+        studies.fuzz --inputs {GOAL} --add` goes on."""
     )
     names = ("way in", "inputs", "processor s", "slowest ms", "process MiB", "hurt", "hurt before, mended")
     lines += grid(names, [_row(name, part, figures["mended"].get(name, [])) for name, part in parts.items()])
