@@ -68,9 +68,9 @@ def test_what_is_accepted_or_named_wrongly_is_counted_for_good_and_bad_alike() -
     told = " ".join("\n".join(judging.report(counted, kinds)).split())
     assert "Good: 3 windows of 2 recordings, 1 windows refused (33.33%" in told
     assert "1 windows are accepted with a null and its reason: 1 without L." in told
-    assert "Bad: 2 recordings, 1 accepted, 1 of them to harm" in told
-    assert "Judged wrongly, by seed: good 2; stuck 4." in told
-    assert "| stuck | B11 | 2 | 0.01 s | 1 | 1 | 50% | 1 StuckValue |" in told
+    assert "Bad: 2 recordings, 1 accepted, 1 of them without a warning, 1 to harm" in told
+    assert "Judged wrongly, or without a warning, by seed: good 2; stuck 4." in told
+    assert "| stuck | B11 | 2 | 0.01 s | 1 | 1 | 1 | 50% | 1 StuckValue |" in told
 
 
 def test_a_good_recording_is_judged_good_and_a_turned_one_is_not() -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
@@ -59,9 +59,7 @@ class FaultEntry(BaseModel):
     @classmethod
     def _known(cls, name: str) -> str:
         if name not in FAULTS:
-            near = difflib.get_close_matches(name, FAULTS, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise ValueError(f"{name!r} is none of {', '.join(FAULTS)}{hint}")
+            raise ValueError(_unknown(name))
         return name
 
     @field_validator("data")
@@ -235,3 +233,11 @@ FAULTS: Mapping[str, FaultKind] = {
     "sync_lost": FaultKind(_sync_lost, needs_axis=False),
     "frame": FaultKind(_frame, needs_axis=False),
 }
+
+
+@lru_cache(16)
+def _unknown(name: str) -> str:
+    """Say what a name may have meant; a long script may hold one mistake many times."""
+    near = difflib.get_close_matches(name, FAULTS, n=1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    return f"{name!r} is none of {', '.join(FAULTS)}{hint}"
