@@ -91,6 +91,7 @@ def hang(live: LiveGuard, cycles: int) -> int:
     os.waitid(os.P_PID, live.guard, os.WSTOPPED | os.WNOWAIT)
     live.waits = False
     live.cycle()
+    live.drain()
     before = live.sent
     live.run(cycles - 1)
     os.kill(live.guard, signal.SIGCONT)

@@ -231,6 +231,12 @@ class LiveGuard:
                 return
             self._turn(max(0.0, due_s - now_s) if answered else 0.1)
 
+    def drain(self) -> None:
+        """Take what waits on the bus already: a computer that was held up has not read it yet."""
+        before = -1
+        while before != (before := self.sent):
+            self._turn(0.0)
+
     def _turn(self, wait_s: float) -> None:
         readers: list[Any] = [*self._bus.readers(), self._journal]
         if self.daemon is not None and not self.daemon.armed:
