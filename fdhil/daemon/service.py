@@ -32,7 +32,7 @@ from fdhil.daemon.notify import notify
 from fdhil.daemon.offer_watch import OfferWatch
 from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.daemon.record_queue import RecordQueue
-from fdhil.daemon.resources import ResourceWatch, Use, uses
+from fdhil.daemon.resources import ResourceWatch, Use, give_back_what_is_freed, uses
 from fdhil.daemon.status import Watch
 from fdhil.errors import DeviceError, FdhilError, StoreError
 from fdhil.pipeline import AxisPipeline, Record
@@ -369,6 +369,7 @@ def run(config: MachineConfig, open_source: OpenSource, method: str | None = Non
 
     FdhilError when it cannot start or meets what it must not survive.
     """
+    give_back_what_is_freed()
     service = Service(config, open_source, method)
     try:
         return asyncio.run(service.run())

@@ -21,6 +21,27 @@ def used() -> dict[str, int]:
     return {use.name: use.used for use in uses()}
 
 
+FREED = """
+import numpy as np
+from fdhil.daemon.resources import give_back_what_is_freed, uses
+give_back_what_is_freed()
+for _ in range(3):
+    np.ones(3 << 20)  # by itself glibc would lay blocks of up to this size among the small ones from now on
+before = uses()[0].used
+large, small = [], []
+for _ in range(40):
+    large.append(np.ones(1 << 17))
+    small.append(np.ones(100))
+del large
+print(uses()[0].used - before)
+"""
+
+
+def test_a_large_block_that_is_freed_is_given_back() -> None:
+    said = subprocess.run([sys.executable, "-c", FREED], capture_output=True, text=True, check=True)
+    assert int(said.stdout) < 5e6  # of 42 MB
+
+
 GROW = """
 import os, threading
 from fdhil.daemon.resources import uses
