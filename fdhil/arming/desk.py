@@ -70,6 +70,7 @@ class ArmingDesk:
         self._standstill = Standstill(config)
         self._feeder: StreamFeeder | None = None
         self._given_up = False
+        self._disarms: int | None = None
         self._disarming: asyncio.Future[Answer] | None = None
         self.guard = GuardLink(config.guard.run_directory or run_directory)
 
@@ -115,6 +116,7 @@ class ArmingDesk:
             if not await self._landed():
                 text = f"what was armed before is still on, in state {self.guard.state}"
                 return refusal("NotOff", text, "run fdhil disarm or wait until it has ended, then arm again")
+            self._disarms = self.guard.disarms
             if self.guard.state in ("FROZEN", "lost"):
                 way_out = ADOPT if self.guard.connected else START_AND_ADOPT
                 text = f"the guard is {self.guard.state}: {self.guard.standing}"
@@ -150,7 +152,7 @@ class ArmingDesk:
 
     async def _hand_over(
         self,
-        ask: Callable[[Prepared, str, Callable[[], bool]], Answer],
+        ask: Callable[[Prepared, str, Callable[[], bool], int | None], Answer],
         prepared: Prepared,
         summary: Answer,
         token: str,
@@ -158,7 +160,7 @@ class ArmingDesk:
         """Ask the guard in a thread; what it grants is armed, what it refuses is answered with what was planned."""
         prepared.facts["journal_writable"] = self._store.fault is None
         try:
-            answer = await asyncio.to_thread(ask, prepared, token, lambda: self._given_up)
+            answer = await asyncio.to_thread(ask, prepared, token, lambda: self._given_up, self._disarms)
         except DeviceError as error:
             return self._without_guard(error)
         if not answer["ok"]:

@@ -76,17 +76,30 @@ class GuardClient:
         finally:
             os.close(descriptor)
 
-    def arm(self, token: str, program_digest: str, facts: Mapping[str, bool]) -> dict[str, Any]:
-        """Arm the loaded table; ``facts`` as in ``interlocks.FACTS``."""
+    def arm(
+        self, token: str, program_digest: str, facts: Mapping[str, bool], disarms: int | None = None
+    ) -> dict[str, Any]:
+        """Arm the loaded table; ``facts`` as in ``interlocks.FACTS``.
+
+        ``disarms``: as many as the status said before all this was prepared; the guard refuses when there was another.
+        """
         request = {"request": "arm", "token": token, "program_digest": program_digest, "facts": dict(facts)}
-        return self.ask(request)
+        return self.ask(_as_of(disarms, request))
 
     def feed_forward(
-        self, token: str, laws: Mapping[str, Mapping[str, Any]], facts: Mapping[str, bool]
+        self,
+        token: str,
+        laws: Mapping[str, Mapping[str, Any]],
+        facts: Mapping[str, bool],
+        disarms: int | None = None,
     ) -> dict[str, Any]:
-        """Switch the on-line feed-forward on; ``laws`` per axis as in ``feedforward.Law``, facts as its interlocks."""
+        """Switch the on-line feed-forward on; ``laws`` per axis as in ``feedforward.Law``, facts as its interlocks.
+
+        ``disarms`` as for ``arm``.
+        """
         laws = {axis: dict(law) for axis, law in laws.items()}
-        return self.ask({"request": "feedforward", "token": token, "laws": laws, "facts": dict(facts)})
+        request = {"request": "feedforward", "token": token, "laws": laws, "facts": dict(facts)}
+        return self.ask(_as_of(disarms, request))
 
     def disarm(self) -> dict[str, Any]:
         """Ramp to zero; the answer comes at once, ``status`` shows when the state is OFF."""
@@ -163,3 +176,8 @@ class GuardClient:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _as_of(disarms: int | None, request: dict[str, Any]) -> dict[str, Any]:
+    """Return a request that holds only until the next disarm."""
+    return request if disarms is None else {**request, "disarms": disarms}

@@ -62,6 +62,11 @@ class GuardLink:
         return str(self._status["state"])
 
     @property
+    def disarms(self) -> int | None:
+        """How often the guard had been disarmed when it was asked last; None where it does not say."""
+        return self._status.get("disarms")
+
+    @property
     def row(self) -> int:
         """The row of the path where the machine is, 0 before it has begun."""
         return int(self._status.get("row") or 0)
@@ -114,11 +119,13 @@ class GuardLink:
             except DeviceError:
                 self._status = {**self._status, "text": "the connection is lost"}
 
-    def arm(self, armament: Armament, token: str, given_up: Callable[[], bool]) -> Mapping[str, Any]:
+    def arm(
+        self, armament: Armament, token: str, given_up: Callable[[], bool], disarms: int | None
+    ) -> Mapping[str, Any]:
         """Load the table and arm (blocking), unless it is ``given_up`` by then; return the guard's answer.
 
-        A disarm that was answered while this waited for its turn was the operator's last word. DeviceError when there
-        is no guard.
+        A disarm that was answered while this waited for its turn was the operator's last word; so is one that the guard
+        counted after the first ``disarms``, whoever asked for it. DeviceError when there is no guard.
         """
         with self._asked(arming=True) as client:
             if given_up():
@@ -127,7 +134,7 @@ class GuardLink:
             if not answer["ok"]:
                 return answer
             digest, facts = armament.stream.program_digest, armament.facts
-            return self._ask(client, lambda: client.arm(token, digest, facts), given_up)
+            return self._ask(client, lambda: client.arm(token, digest, facts, disarms), given_up)
 
     @staticmethod
     def _load(client: GuardClient, armament: Armament, piece: Piece, renew: bool = False) -> Mapping[str, Any]:
@@ -144,10 +151,13 @@ class GuardLink:
         with self._asked() as client:
             return self._load(client, armament, piece, renew=True)
 
-    def feed_forward(self, feeding: Feeding, token: str, given_up: Callable[[], bool]) -> Mapping[str, Any]:
+    def feed_forward(
+        self, feeding: Feeding, token: str, given_up: Callable[[], bool], disarms: int | None
+    ) -> Mapping[str, Any]:
         """Switch the on-line feed-forward on (blocking), as ``arm`` does. DeviceError without a guard."""
         with self._asked(arming=True) as client:
-            return self._ask(client, lambda: client.feed_forward(token, feeding.laws, feeding.facts), given_up)
+            laws, facts = feeding.laws, feeding.facts
+            return self._ask(client, lambda: client.feed_forward(token, laws, facts, disarms), given_up)
 
     @staticmethod
     def _ask(

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from fdhil.identification.loops import better_loops
 from fdhil.records import LoopEstimate, Notice, Outcome, ParameterSet, Skill, Temperature
-from fdhil.store.rows import Revision
+from fdhil.store.rows import Revision, since_boot_ns
 
 SKILL_MOVES = 3  # FAULTS E19: the last three recorded moves
 
@@ -49,7 +48,7 @@ class Knowledge:
         """Start from what the history knows."""
         for name, revision in newest.items():
             axis = self._axes[name]
-            axis.published, axis.published_s = revision.set, time.monotonic() - revision.stamp.age_s()
+            axis.published, axis.published_s = revision.set, since_boot_ns() * 1e-9 - revision.stamp.age_s()
         self.note(skills)
 
     def note(self, outcomes: Sequence[Outcome | LoopEstimate]) -> None:
@@ -57,7 +56,7 @@ class Knowledge:
         for outcome in outcomes:
             if isinstance(outcome, ParameterSet):
                 axis = self._axes[outcome.axis]
-                axis.published, axis.published_s, axis.load_changed = outcome, time.monotonic(), False
+                axis.published, axis.published_s, axis.load_changed = outcome, since_boot_ns() * 1e-9, False
             elif isinstance(outcome, Skill):
                 self._axes[outcome.axis].skills.append(outcome)
             elif isinstance(outcome, LoopEstimate):
@@ -76,7 +75,7 @@ class Knowledge:
 
     def now(self) -> dict[str, AxisKnowledge]:
         """Return what is known of every axis now."""
-        now_s = time.monotonic()
+        now_s = since_boot_ns() * 1e-9
         return {
             name: AxisKnowledge(
                 axis.published,

@@ -14,13 +14,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import select
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from fdhil.arming.answers import Answer, refusal
+from fdhil.arming.answers import ABANDONED, Answer, refusal
 from fdhil.config import Access
 from fdhil.daemon.peers import Peer, listen, peer_of
 from fdhil.errors import ConnectError, DeviceTimeout, FdhilError
@@ -134,6 +135,8 @@ class ControlServer:
             request = json.loads(line)
         except (ValueError, RecursionError):
             return refusal("BadRequest", "the request is no JSON", "send one JSON object per line")
+        if isinstance(request, dict) and request.get("request") == "arm" and _hung_up(writer):
+            return ABANDONED  # it waited while this process slept: nobody is there who wants it by now
         answering = asyncio.ensure_future(self._answer(request, peer))
         wanted = isinstance(request, dict) and request.get("progress") is True
         try:
@@ -155,6 +158,13 @@ class ControlServer:
             return await self._handle(request, peer)
         except FdhilError as error:
             return refusal(type(error).__name__, str(error))
+
+
+def _hung_up(writer: asyncio.StreamWriter) -> bool:
+    """Whether the other end is closed altogether, unlike one that only sends no more."""
+    poll = select.poll()
+    poll.register(writer.get_extra_info("socket"), 0)
+    return bool(poll.poll(0))
 
 
 async def _in_time(doing: Awaitable[Done]) -> Done:

@@ -57,6 +57,7 @@ class Guard:
         self._listener = Listener(settings)
         self._entries = [axis.offset.entries for axis in settings.axes]
         self._requests: deque[tuple[Client | None, Document, Request]] = deque()
+        self._disarms = 0
         self._owner: Client | None = None
         self._withdrawn: tuple[Alarm, ...] = ()
         self._transmitted = True
@@ -318,7 +319,15 @@ class Guard:
             client.reply(document, ok=False, code="BadRequest", text=told, advice=f"use one of {', '.join(DECIDED)}")
 
     def _queue(self, client: Client, document: Document, request: Request) -> None:
-        """Have a step decide; one request of a client waits at a time, but a disarm takes the place of another."""
+        """Have a step decide; one request of a client waits at a time, but a disarm takes the place of another.
+
+        A request that names another number of ``disarms`` was made before the last of them, and slept since.
+        """
+        if request.kind == "disarm":
+            self._disarms += 1
+        elif document.get("disarms", self._disarms) != self._disarms:
+            self._answer(client, document, (Alarm("DisarmedSince"),))
+            return
         waiting = next((waits for waits in self._requests if waits[0] is client), None)
         if waiting is not None and (request.kind != "disarm" or waiting[2].kind == "disarm"):
             self._answer(client, document, (Alarm("GuardBusy"),))
@@ -367,5 +376,6 @@ class Guard:
             "shadow_um": None if shadow is None else status.in_um(shadow, self.settings),
             "emergencies": self._listener.emergencies,
             "journal_dropped": self._journal.dropped,
+            "disarms": self._disarms,
             "events": list(self._journal.recent),
         }

@@ -28,7 +28,7 @@ from fdhil.records import (
 
 @dataclass(frozen=True, slots=True)
 class Stamp:
-    """When a row was written: wall clock (s since 1970, may be wrong), boot identifier, monotonic clock."""
+    """When a row was written: wall clock (s since 1970, may be wrong), boot identifier, time since the boot."""
 
     wall_s: float
     boot: str
@@ -37,7 +37,7 @@ class Stamp:
     @staticmethod
     def now() -> Stamp:
         """Return the stamp of this moment."""
-        return Stamp(time.time(), _boot_id(), time.monotonic_ns())
+        return Stamp(time.time(), _boot_id(), since_boot_ns())
 
     def age_s(self) -> float:
         """Return how long ago that was; below 0 where a wall clock was set back, which is not to be believed."""
@@ -47,8 +47,13 @@ class Stamp:
         return now.wall_s - self.wall_s
 
 
+def since_boot_ns() -> int:
+    """Return the time since the computer was started; the time in which it was suspended counts, a machine may age."""
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+
 def _boot_id() -> str:
-    """Return the kernel's identifier of this boot; monotonic times compare only within one."""
+    """Return the kernel's identifier of this boot; times since the boot compare only within one."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
     except OSError:

@@ -25,6 +25,7 @@ class Guard:
     def __init__(self, folder: Path) -> None:
         self.says: Says = lambda _kind: FINE
         self.heard: list[str] = []
+        self.requests: list[Mapping[str, Any]] = []
         self.descriptor: int | None = None
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._listener.bind(str(folder / "guard.sock"))
@@ -68,6 +69,7 @@ class Guard:
 
     def _take(self, peer: socket.socket, request: Mapping[str, Any]) -> None:
         self.heard.append(request["request"])
+        self.requests.append(request)
         answer = self.says(request["request"]) if "id" in request else None
         if answer is not None:
             peer.sendall(json.dumps({**answer, "id": request["id"]}).encode() + b"\n")

@@ -156,3 +156,25 @@ async def test_a_disarm_that_is_answered_before_the_guard_is_asked_to_arm_is_the
     assert (await arming)["code"] == "Abandoned"
     assert "feedforward" not in guard.heard
     desk.guard.close()
+
+
+async def test_the_guard_is_told_as_of_which_disarm_it_is_asked(
+    config: MachineConfig, guard: Guard, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While all is planned the status says of one disarm more, which this daemon has not asked for."""
+    desk = ArmingDesk(config, OutcomeStore(config), folder)
+    desk.begin({}, [])
+    disarms, of_its_time = 4, SimpleNamespace(laws={}, facts={}, summary=dict, progress=dict)
+
+    def planned(*_: object) -> Any:
+        nonlocal disarms
+        disarms += 1
+        desk.guard.look()
+        return of_its_time
+
+    monkeypatch.setattr("fdhil.arming.desk.prepare_feeding", planned)
+    guard.says = lambda _kind: {**FINE, "state": "OFF", "disarms": disarms}
+    await desk.arm({"request": "arm", "method": "flatness", "token": read_token(folder)})
+    asked = next(request for request in guard.requests if request["request"] == "feedforward")
+    assert asked["disarms"] == 4
+    desk.guard.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -237,6 +238,15 @@ def test_a_changed_load_is_remembered_until_new_parameters_come(config: MachineC
     assert desk.knowledge.now()["X"].load_changed
     desk.knowledge.note([replace(published(2), config_digest=config.digest)])
     assert not desk.knowledge.now()["X"].load_changed
+
+
+def test_a_model_ages_while_the_computer_is_suspended(config: MachineConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    knowledge, stamp, awake_ns = Knowledge(config.axis), Stamp.now(), time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+    knowledge.note([published()])
+    # this clock alone counts the night in which the others stood still
+    monkeypatch.setattr(time, "clock_gettime_ns", {time.CLOCK_BOOTTIME: awake_ns + 10**9 * 36_000}.get)
+    assert stamp.age_s() == pytest.approx(36_000, abs=1000)
+    assert knowledge.now()["X"].age_s == pytest.approx(36_000, abs=1000)
 
 
 def test_loops_that_were_identified_and_are_believed_are_planned_with(config: MachineConfig, program: Path) -> None:

@@ -139,7 +139,7 @@ def test_a_guard_that_is_lost_while_it_arms_may_have_armed(guard: Guard, folder:
 
     guard.says = dies
     with pytest.raises(DeviceError):
-        link.feed_forward(Law(), "token", lambda: False)  # type: ignore[arg-type]
+        link.feed_forward(Law(), "token", lambda: False, None)  # type: ignore[arg-type]
     assert str(link.standing) == "an unknown offset on axis X, Y may still be applied"
     link.close()
 

@@ -88,6 +88,27 @@ async def test_what_takes_its_time_tells_its_progress_and_ends_when_nobody_waits
         await asyncio.wait_for(abandoned.wait(), 300.0)
 
 
+async def test_who_left_before_the_daemon_came_to_it_arms_nothing(tmp_path: Path) -> None:
+    """As when the daemon's computer was asleep: what stops is done all the same, and who sends no more still waits."""
+    heard: list[str] = []
+
+    async def handle(request: Mapping[str, Any], peer: Peer) -> Mapping[str, Any]:
+        heard.append(f"{request['request']} {request['of']}")
+        return {"ok": True}
+
+    async with ControlServer(handle, dict, lambda: None, Access()).serving(tmp_path / "c"):
+        for kind in ("arm", "disarm", "stop"):
+            with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:  # the server has no turn meanwhile
+                client.connect(str(tmp_path / "c"))
+                client.sendall(json.dumps({"request": kind, "of": "one who left"}).encode() + b"\n")
+        reader, writer = await asyncio.open_unix_connection(str(tmp_path / "c"))
+        writer.write(b'{"request": "arm", "of": "one who stays"}\n')
+        writer.write_eof()
+        assert json.loads(await reader.readline()) == {"ok": True}
+        writer.close()
+    assert heard == ["disarm one who left", "stop one who left", "arm one who stays"]
+
+
 async def test_idle_connections_make_room_and_those_that_wait_leave_some_for_disarm(tmp_path: Path) -> None:
     """Three times as many connections as there are places, idle ones and such that wait for an answer."""
     free, waiting = asyncio.Event(), asyncio.Semaphore(0)

@@ -272,7 +272,7 @@ HOLDS = {"SyncJitter", "FeedbackGap", "TargetLost", "Misaligned", "OverrideChang
 REFUSES = {"PdoMapping", "StaleOffset", "SoftwareLimit", "CorruptFile", "TableBusy", "ProgramMismatch"}
 REFUSES |= {"NotCommissioned", "RecordVoid", "FeedforwardUnknown", "FeedforwardOff", "ModelNotValidated"}
 REFUSES |= {"HarmPredicted", "WatchdogNotArmed", "LimitBeyondWindow", "AuthRequired"}
-REFUSES |= {"NotOff", "NotSettled", "GuardBusy"}
+REFUSES |= {"NotOff", "NotSettled", "GuardBusy", "DisarmedSince"}
 
 
 def test_what_cannot_be_ramped_freezes_what_may_pass_is_held_and_all_else_that_goes_wrong_ramps_down() -> None:

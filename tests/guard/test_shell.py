@@ -346,6 +346,22 @@ def test_one_decision_of_a_client_waits_but_a_disarm_takes_its_place(make: Make)
     assert shop.answer(client)["ok"]
 
 
+def test_a_request_that_was_made_before_the_last_disarm_arms_nothing(make: Make) -> None:
+    """As of a daemon that slept between loading and arming, while somebody else disarmed."""
+    shop = make()
+    client, other = shop.connect(), shop.connect()
+    shop.run(10)
+    known = shop.ask(client, {"request": "status"})["disarms"]
+    assert shop.ask(other, {"request": "disarm"})["ok"]
+    for kind in ("arm", "feedforward"):
+        answer = shop.ask(client, {"request": kind, "disarms": known})
+        assert [refused["code"] for refused in answer["refused"]] == ["DisarmedSince"]
+    newer = shop.ask(client, {"request": "status"})["disarms"]
+    for request in ({"request": "arm", "disarms": newer}, {"request": "arm"}):
+        answer = shop.ask(client, request)
+        assert "AuthRequired" in {refused["code"] for refused in answer["refused"]}
+
+
 def test_a_table_waits_for_the_one_before_and_a_long_one_for_the_end(make: Make) -> None:
     shop = make()
     client, other = shop.into_the_cut(), shop.connect()
