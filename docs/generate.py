@@ -57,7 +57,9 @@ def error_reference() -> str:
     lines = [
         "# Errors",
         "",
-        "Generated from `fdhil/errors.py`.",
+        "Generated from `fdhil/errors.py`. Beside these a command ends with 0 when it did what was asked and the",
+        "answer is a yes, with 1 when the answer is a no, and with 3 when a yes reached nobody: its output was",
+        "closed, as in `fdhil disarm CONFIG | true`.",
         "",
         "| class | exit code | meaning |",
         "|---|---|---|",
