@@ -31,7 +31,7 @@ OWN_URI = "urn:fdhil:test"
 
 
 def config_of(**keys: Any) -> MachineConfig:
-    return machine(g0={"source": "opcua"}, nc_source={"opcua": {"timeout_s": 2.0, "period_s": 0.02, **keys}})
+    return machine(g0={"source": "opcua"}, nc_source={"opcua": {"timeout_s": 60.0, "period_s": 0.02, **keys}})
 
 
 async def once(config: MachineConfig) -> NcState:
@@ -125,7 +125,7 @@ async def test_a_user_a_certificate_and_encryption(tmp_path: Path) -> None:
     theirs = await certificates(tmp_path, "nc", "urn:nc")
     password = tmp_path / "password"
     async with OpcUaPeer(secure=theirs, users=_Users()) as peer:
-        keys = {**peer.settings, "timeout_s": 2.0, "user": "fdhil", "password_file": str(password)}
+        keys = {**peer.settings, "user": "fdhil", "password_file": str(password)}
         keys |= {"certificate": str(as_pem(ours[0])), "private_key": str(ours[1])}
         with pytest.raises(ConnectError, match=r"password_file.*cannot be read"):
             await once(config_of(**keys))
