@@ -139,7 +139,7 @@ def test_a_foreign_drive_without_the_profiles_tpdos_is_told_and_loses_nothing(
             out = []
             for k in range(300):
                 master.send(can.Message(arbitration_id=0x80, data=[k % 240 + 1], is_extended_id=False))
-                while (message := master.recv(5.0)) is not None and message.arbitration_id != 0x280 + NODE:
+                while (message := master.recv(100.0)) is not None and message.arbitration_id != 0x280 + NODE:
                     pass  # the drive has answered this SYNC
                 assert message is not None
             while source.counters()["frames"] < 901:
