@@ -16,6 +16,7 @@ from fdhil import tables
 
 ROOT = Path(__file__).parents[1]
 SECTIONS = (ROOT / "docs/how-to/extend.md").read_text("utf-8").split("\n## ")[1:]
+HALF_WRITTEN = shutil.ignore_patterns("*.pyc.*", "*.tmp.*")  # what another process compiles just now
 TABLES = ("DRIVE_PROFILES", "VOLTAGE_SOURCES", "ESTIMATORS", "CORRECTIONS", "EVENT_SOURCES")
 
 
@@ -30,7 +31,7 @@ def found(pattern: str, section: str) -> tuple[str, ...]:
 def copy(tmp_path: Path) -> Path:
     """A copy of the package and of its tests, as a user has them."""
     for folder in ("fdhil", "tests", "studies", "configs"):
-        shutil.copytree(ROOT / folder, tmp_path / folder)
+        shutil.copytree(ROOT / folder, tmp_path / folder, ignore=HALF_WRITTEN)
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     return tmp_path
 

@@ -20,6 +20,7 @@ def test_a_master_made_with_canopen_moves_a_drive(feed_drive_bench):
     network.connect(**bench.bus_arguments)
     try:
         node = network.add_node(bench.drive()["node_id"], bench.drive()["eds"])
+        node.sdo.RESPONSE_TIMEOUT = 60.0  # of a computer that is busy
         node.nmt.state = "OPERATIONAL"
         node.sdo[0x6060].raw = 1  # profile position
         for word in (0x06, 0x07, 0x0F):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -12,7 +12,7 @@ import pytest
 
 from fdhil.commissioning.config_check import check_machine
 from fdhil.commissioning.finding import Finding
-from fdhil.commissioning.scan import read_descriptions, scan_bus
+from fdhil.commissioning.scan import BusScanner, read_descriptions, scan_bus
 from fdhil.commissioning.steps import commission
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, DriveFault
@@ -25,15 +25,27 @@ EVERY = pytest.mark.parametrize("outfit", OUTFITS, ids=lambda outfit: outfit.nam
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shorter waits than on a real machine; the simulated drive settles sooner."""
+    """Shorter waits than on a real machine where nothing comes, longer ones for a drive that a thread here plays."""
     monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 0.15)
     monkeypatch.setattr("fdhil.commissioning.scan.LISTEN_S", 0.15)
+    monkeypatch.setattr("fdhil.commissioning.scan.ANSWER_S", 0.1)
+    monkeypatch.setattr(BusScanner, "answering", until_it_answers)
     monkeypatch.setattr("fdhil.commissioning.config_check.LISTEN_S", 0.15)
     monkeypatch.setattr("fdhil.drivers.can.sdo.QUIET_S", 0.1)
-    monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 60.0)
+    monkeypatch.setattr("fdhil.drivers.can.sdo.DEADLINE_S", 60.0)
     monkeypatch.setattr("fdhil.commissioning.cycle.LOCKSTEP_WAIT_S", 1.0)
+    monkeypatch.setattr("fdhil.commissioning.steps.ENABLE_TIMEOUT_S", 60.0)
+    monkeypatch.setattr("fdhil.commissioning.watchdog.STARVE_TIMEOUT_S", 60.0)
     monkeypatch.setattr("fdhil.commissioning.steps.SETTLE_CYCLES", 120)
     monkeypatch.setattr("fdhil.commissioning.steps.AVERAGE_CYCLES", 60)
+
+
+def until_it_answers(scanner: BusScanner, answering: Callable[[BusScanner], set[int]] = BusScanner.answering) -> set[int]:
+    """Ask all nodes until the drive has answered, which is on the bus for certain."""
+    while not (found := answering(scanner)):
+        pass
+    return found
 
 
 @contextmanager
@@ -46,6 +58,7 @@ def on_a_bus(outfit: Outfit, folder: Path) -> Iterator[tuple[DrivePeer, MachineC
         network.connect(interface="virtual", channel=channel)
         try:
             node = network.add_node(config.node_id("X"), str(folder / f"{outfit.sheet}.eds"))
+            node.sdo.RESPONSE_TIMEOUT = 60.0
 
             def write(index: int, sub: int, value: int, size: int) -> None:
                 node.sdo.download(index, sub, value.to_bytes(size, "little"))

@@ -82,6 +82,8 @@ static int rtu_unit(const char *device, int unit, float volts) {
 static int master(modbus_t *bus, int address) {
     uint16_t words[2];
     if (!bus) return fail("open");
+    modbus_set_response_timeout(bus, 60, 0); /* of a computer that is busy, as are those below */
+    modbus_set_byte_timeout(bus, 60, 0);
     if (modbus_read_input_registers(bus, address, 2, words) != 2) return fail("read");
     printf("%.4f\n", modbus_get_float_abcd(words));
     return 0;

@@ -8,14 +8,22 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import selectors
 import struct
 import time
 import tty
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from functools import wraps
+from typing import Any
+from unittest.mock import patch
 
 from pymodbus.framer import FramerRTU
 
+from fdhil.drivers.modbus import rtu_line
+from fdhil.drivers.serial import port
+
+LOOK_S = 0.01
 Spoil = Callable[[bytes], list[bytes]]
 """What really comes on the line instead of an answer: pieces, one after the other."""
 
@@ -33,6 +41,46 @@ async def until(condition: Callable[[], object]) -> None:
             return
         await asyncio.sleep(0.005)
     raise TimeoutError
+
+
+class PatientLoop(asyncio.SelectorEventLoop):
+    """A loop in whose time a computer that is held up loses none: from one look to the next it is at most 20 ms."""
+
+    def __init__(self) -> None:
+        super().__init__(_OftenLooking())
+        self._now_s, self._seen_s = 0.0, time.monotonic()
+
+    def time(self) -> float:
+        """The loop's time, s."""
+        seen_s = time.monotonic()
+        self._now_s += min(seen_s - self._seen_s, 2 * LOOK_S)
+        self._seen_s = seen_s
+        return self._now_s
+
+    def monotonic_ns(self) -> int:
+        """Stand in for ``time.monotonic_ns``."""
+        return round(self.time() * 1e9)
+
+
+class _OftenLooking(selectors.DefaultSelector):
+    def select(self, timeout: float | None = None) -> Any:
+        return super().select(None if timeout is None else min(timeout, LOOK_S))
+
+
+def patiently(test: Callable[..., Awaitable[None]]) -> Callable[..., None]:
+    """Run a test, and the serial line in it, by the time of a patient loop: what is silent is still given up soon."""
+
+    @wraps(test)
+    def run(*given: Any, **named: Any) -> None:
+        loop = PatientLoop()
+        with (
+            patch.object(rtu_line, "time", loop),
+            patch.object(port, "time", loop),
+            asyncio.Runner(loop_factory=lambda: loop) as runner,
+        ):
+            runner.run(test(*given, **named))
+
+    return run
 
 
 class SerialPeer:

@@ -24,6 +24,7 @@ from tests.drivers.test_meters import shop
 from tests.drivers.wire import machine
 
 pytestmark = pytest.mark.debian
+PATIENT = {"timeout_s": 60.0}  # another process answers
 SOURCE = Path(__file__).with_name("libmodbus_peer.c")
 READ_AS: tuple[dict[str, Any], ...] = (
     {"type": "float32"},
@@ -99,7 +100,7 @@ async def read(config: MachineConfig) -> list[float]:
 @pytest.mark.parametrize("read_as", READ_AS, ids=lambda keys: keys.get("type", "little"))
 async def test_its_units_over_tcp(program: Path, read_as: dict[str, Any]) -> None:
     with peer(program, "tcp-unit") as port:
-        volts = await read(machine(voltage={"source": "modbus", "port": int(port), **read_as}))
+        volts = await read(machine(voltage={"source": "modbus", "port": int(port), **PATIENT, **read_as}))
     assert volts
     np.testing.assert_allclose(volts, -12.34, atol=0.011)
 
@@ -108,7 +109,7 @@ async def test_its_units_over_tcp(program: Path, read_as: dict[str, Any]) -> Non
 async def test_its_units_on_a_serial_line(program: Path, read_as: dict[str, Any]) -> None:
     async with units_on_a_line(program, u7=-12.34) as device:
         line = {"source": "modbus", "device": device, "parity": "none", "baud_rate": 115200, "unit": 7}
-        volts = await read(machine(voltage={**line, **read_as}))
+        volts = await read(machine(voltage={**line, **PATIENT, **read_as}))
     assert volts
     np.testing.assert_allclose(volts, -12.34, atol=0.011)
 
@@ -116,7 +117,8 @@ async def test_its_units_on_a_serial_line(program: Path, read_as: dict[str, Any]
 async def test_two_of_its_units_on_one_line(program: Path) -> None:
     async with units_on_a_line(program, u1=10.0, u2=-20.0) as device:
         line = {"source": "modbus", "type": "float32", "device": device, "parity": "none", "baud_rate": 115200}
-        settings = [machine(voltage={**line, "unit": unit}).axis["X"].voltage for unit in (1, 2, 3)]
+        units = ({"unit": 1, **PATIENT}, {"unit": 2, **PATIENT}, {"unit": 3})  # nobody is unit 3
+        settings = [machine(voltage={**line, **unit}).axis["X"].voltage for unit in units]
         links = [ModbusLink(f"unit {place.unit}", place) for place in settings]
         for link in links:
             await link.connect()

@@ -24,10 +24,11 @@ from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
 from fdhil.records import Notice, Temperature, TickTimes, VoltageSamples
 from tests.drivers.modbus_peer import VOLTS_PER_COUNT, SensorPeer, sensor_peer
 from tests.drivers.wire import machine
+from tests.held_port import held_port
 
 
 def config(port: int, **voltage: Any) -> MachineConfig:
-    return machine(voltage={"source": "modbus", "port": port, "timeout_s": 0.2, **voltage})
+    return machine(voltage={"source": "modbus", "port": port, "timeout_s": 60.0, **voltage})
 
 
 async def test_blocks_follow_each_other_without_a_hole() -> None:
@@ -89,7 +90,7 @@ async def test_a_sensor_that_stands_still_is_noticed_once() -> None:
 )
 async def test_each_misbehaviour_is_one_error(mode: str, error: type[DeviceError], says: str) -> None:
     async with sensor_peer() as peer:
-        sensor = ModbusVoltage("X", config(peer.port))
+        sensor = ModbusVoltage("X", config(peer.port, timeout_s=0.2 if mode in ("silent", "hang up") else 60.0))
         await sensor.link.connect()
         peer.mode = mode
         with pytest.raises(error, match="voltage sensor X") as caught:
@@ -112,10 +113,8 @@ async def test_a_source_that_is_stopped_just_as_the_answer_comes_ends() -> None:
 
 
 async def test_nobody_there_is_said() -> None:
-    async with sensor_peer() as peer:
-        port = peer.port
-    with pytest.raises(ConnectError, match="cannot be reached"):
-        await ModbusLink("voltage sensor X", ModbusPlace(port=port, timeout_s=0.2)).connect()
+    with held_port() as port, pytest.raises(ConnectError, match="cannot be reached"):
+        await ModbusLink("voltage sensor X", ModbusPlace(port=port)).connect()
 
 
 @pytest.mark.fault("B1", "B2", "B8")
@@ -132,7 +131,7 @@ async def test_a_source_survives_and_tells_both_edges(monkeypatch: pytest.Monkey
                     codes.append((record.code, record.severity))
 
     async with sensor_peer() as peer:
-        source = SensorSource(ModbusVoltage("X", config(peer.port)), TickClock(0.001))
+        source = SensorSource(ModbusVoltage("X", config(peer.port, timeout_s=0.2)), TickClock(0.001))
         task = asyncio.create_task(source.run(out.put_nowait))
         for mode, code in (("silent", "ModbusTimeout"), ("exception", "ModbusException"), ("nan", "ModbusShape")):
             peer.mode = mode

@@ -21,6 +21,7 @@ from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, FrameRing
 from fdhil.drivers.can.ports import PORTS
 from fdhil.drivers.can.socketcand import HubClock, SocketcandPort
 from fdhil.errors import ConnectError
+from tests.held_port import held_port
 
 
 class MiniHub:
@@ -49,7 +50,7 @@ class MiniHub:
 
     def heard(self) -> bytes:
         assert self.client is not None
-        self.client.settimeout(2)
+        self.client.settimeout(100)
         return self.client.recv(4096)
 
     def hang_up(self) -> None:
@@ -131,9 +132,7 @@ def test_what_is_no_hub_is_said(greetings: tuple[bytes, ...]) -> None:
 
 
 def test_nobody_there_is_said() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = int(server.getsockname()[1])
-    with pytest.raises(ConnectError, match="cannot be reached"):
+    with held_port() as port, pytest.raises(ConnectError, match="cannot be reached"):
         CanBus("can0", settings_of(port))
 
 
@@ -163,7 +162,7 @@ def test_virtual_bus_gives_what_it_got() -> None:
             wait_for(lambda: bus.counters()["frames"] == 1)
             (frame,) = bus.drain()
             bus.send(0x601, b"\x40")
-        message = other.recv(2)
+        message = other.recv(100)
     assert (int(frame["id"]), int(frame["data"])) == (0x181, 0x0201)
     assert message is not None
     assert message.arbitration_id == 0x601

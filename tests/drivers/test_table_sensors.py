@@ -155,7 +155,8 @@ def test_the_line_under_way_at_the_start_is_left_out_and_other_text_is_told() ->
         streamed().accept([TextLine("booting", 0), TextLine("hello world", MS)], clock())
 
 
-async def test_it_is_read_from_a_serial_device(tmp_path: Path) -> None:
+async def test_it_is_read_from_a_serial_device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fdhil.drivers.table.accelerometer.SILENCE_NS", 60_000_000_000)
     ours, theirs = os.openpty()
     tty.setraw(theirs)
     device = tmp_path / "accelerometer"
@@ -189,10 +190,9 @@ async def test_silence_and_a_missing_device_are_told(tmp_path: Path, monkeypatch
 
 async def test_a_module_on_modbus_is_placed_between_question_and_answer() -> None:
     async with sensor_peer() as peer:  # 21.5 as a float32 from register 8 on
-        settings = TableEncoder(
-            source="modbus", port=peer.port, address=8, type="float32", scale=2.0, offset=1.0, period_s=0.001
-        )
-        encoder = ModbusEncoder("X", settings)
+        value = {"address": 8, "type": "float32", "scale": 2.0, "offset": 1.0}
+        asked = {"source": "modbus", "port": peer.port, "period_s": 0.001, "timeout_s": 60.0}
+        encoder = ModbusEncoder("X", TableEncoder.model_validate(value | asked))
         await encoder.link.connect()
         assert await encoder.poll(TickClock(1e-3)) == []  # without SYNC there is no place on its count
         ticks = TickClock(1e-3)
@@ -228,6 +228,7 @@ async def test_the_simulated_module_on_a_serial_line_is_read(tmp_path: Path) -> 
         "type": "int32",
         "word_order": "little",
         "scale": 1e-4,
+        "timeout_s": 60.0,
     }
     document["axis"]["X"]["table"] = keys | {"function": 3, "address": 30}
     config = machine_config.parse(document)

@@ -12,8 +12,8 @@ from fdhil.records import Temperature
 from tests.drivers.modbus_peer import sensor_peer
 
 
-def thermometer(port: int, address: int = 8) -> SlidewayThermometer:
-    return SlidewayThermometer("X", Thermometer(port=port, address=address, period_s=0.01, timeout_s=0.2))
+def thermometer(port: int, address: int = 8, timeout_s: float = 60.0) -> SlidewayThermometer:
+    return SlidewayThermometer("X", Thermometer(port=port, address=address, period_s=0.01, timeout_s=timeout_s))
 
 
 async def test_it_reads_degrees() -> None:
@@ -38,7 +38,7 @@ async def test_a_register_that_holds_something_else_is_told() -> None:
 
 async def test_a_silent_one_is_a_timeout() -> None:
     async with sensor_peer() as peer:
-        sensor = thermometer(peer.port)
+        sensor = thermometer(peer.port, timeout_s=0.2)
         await sensor.link.connect()
         peer.mode = "silent"
         with pytest.raises(DeviceTimeout):

@@ -23,6 +23,7 @@ from fdhil.records import VoltageSamples
 from tests.drivers.modbus_peer import SensorPeer, sensor_peer
 from tests.drivers.serial_peer import SerialPeer
 from tests.drivers.wire import machine
+from tests.held_port import held_port
 
 TEXT = {"serial"}
 SEPARATE = [name for name in tables.VOLTAGE_SOURCES if name != tables.DRIVE_VOLTAGE]
@@ -30,7 +31,7 @@ SEPARATE = [name for name in tables.VOLTAGE_SOURCES if name != tables.DRIVE_VOLT
 
 def config_of(name: str, port: int = 1, device: str = "/dev/fdhil-none") -> MachineConfig:
     where = {"device": device, "parity": "none"} if name in TEXT else {"port": port}
-    return machine(voltage={"source": name, "timeout_s": 0.2, **where})
+    return machine(voltage={"source": name, "timeout_s": 60.0, **where})
 
 
 @asynccontextmanager
@@ -111,13 +112,14 @@ async def test_a_sensor_is_polled_and_read(name: str) -> None:
 
 @pytest.mark.parametrize("name", SEPARATE)
 async def test_a_sensor_that_is_not_there_is_told_with_its_place(name: str) -> None:
-    async with peer_of(name) as (_, config):
+    with held_port() as port:
+        config = config_of(name, port)
         where = config.axis["X"].voltage
-    sensor = sensors_of("X", config)["voltage"]
-    assert sensor.axis == "X"
-    assert (where.device or str(where.port)) in sensor.link.place
-    with pytest.raises(ConnectError, match=sensor.name):
-        await sensor.link.connect()
+        sensor = sensors_of("X", config)["voltage"]
+        assert sensor.axis == "X"
+        assert (where.device or str(where.port)) in sensor.link.place
+        with pytest.raises(ConnectError, match=sensor.name):
+            await sensor.link.connect()
 
 
 @pytest.mark.parametrize("name", SEPARATE)

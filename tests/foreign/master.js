@@ -32,12 +32,12 @@ async function main() {
     await join(settings.bus, device);
     device.start();
     const read = (index, dataType, blockTransfer = false) =>
-        device.sdo.upload({ deviceId: drive, index, dataType, blockTransfer, timeout: 5000 });
+        device.sdo.upload({ deviceId: drive, index, dataType, blockTransfer, timeout: 60000 });
     tell('identity', {
         device_type: await read(0x1000, DataType.UNSIGNED32), name: await read(0x1008, DataType.VISIBLE_STRING),
         by_block: await read(0x1008, DataType.VISIBLE_STRING, true),
     });
-    await device.sdo.download({ deviceId: drive, index: 0x6060, data: 8, dataType: DataType.INTEGER8, timeout: 5000 });
+    await device.sdo.download({ deviceId: drive, index: 0x6060, data: 8, dataType: DataType.INTEGER8, timeout: 60000 });
     position = await read(0x6064, DataType.INTEGER32);
     device.nmt.startNode(drive);
     const raw = device.receive.bind(device);

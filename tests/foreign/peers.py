@@ -45,7 +45,7 @@ class ForeignProcess:
         assert self._process.stdin is not None
         self._process.stdin.close()
         try:
-            self._process.wait(timeout=20)
+            self._process.wait(timeout=300)
         finally:
             self._process.kill()
             for stream in (self._process.stdout, self._process.stderr):

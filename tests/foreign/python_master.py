@@ -30,7 +30,7 @@ def main() -> None:
     dictionary: Any = canopen.ObjectDictionary
     drive: Any = canopen.RemoteNode(node, dictionary())
     network.add_node(drive)
-    drive.sdo.RESPONSE_TIMEOUT = 10.0
+    drive.sdo.RESPONSE_TIMEOUT = 60.0
     device_type = int.from_bytes(drive.sdo.upload(0x1000, 0), "little")
     tell("identity", device_type=device_type, name=drive.sdo.upload(0x1008, 0).decode())
     drive.sdo.download(0x6060, 0, bytes([8]))

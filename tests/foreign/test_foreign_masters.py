@@ -67,8 +67,9 @@ async def test_a_drive_that_a_foreign_master_runs_is_sampled(make: str, twin: tu
 
 @pytest.mark.parametrize("make", MAKES)
 def test_beside_a_foreign_master_nothing_is_asked(
-    make: str, twin: tuple[TwinProcess, Path], capsys: pytest.CaptureFixture[str]
+    make: str, twin: tuple[TwinProcess, Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 60.0)  # it ends with the master's first frame
     process, path = twin
     with master(make, process) as nc, process.join() as bus:
         nc.event("enabled")

@@ -51,10 +51,14 @@ MAKES = [pytest.param("slave.js", marks=pytest.mark.debian), "python_slave.py"]
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shorter waits than on a real machine."""
+    """Shorter waits than on a real machine where nothing comes, longer ones where something does."""
     monkeypatch.setattr("fdhil.commissioning.scan.LISTEN_S", 0.4)
     monkeypatch.setattr("fdhil.commissioning.config_check.LISTEN_S", 0.4)
     monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 0.4)
+    # the slave is a process of its own, on a computer that is busy
+    monkeypatch.setattr("fdhil.commissioning.scan.ANSWER_S", 2.0)
+    monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 60.0)
+    monkeypatch.setattr("fdhil.drivers.can.sdo.DEADLINE_S", 60.0)
 
 
 @pytest.fixture
@@ -139,7 +143,7 @@ def test_a_foreign_drive_without_the_profiles_tpdos_is_told_and_loses_nothing(
             out = []
             for k in range(300):
                 master.send(can.Message(arbitration_id=0x80, data=[k % 240 + 1], is_extended_id=False))
-                while (message := master.recv(5.0)) is not None and message.arbitration_id != 0x280 + NODE:
+                while (message := master.recv(100.0)) is not None and message.arbitration_id != 0x280 + NODE:
                     pass  # the drive has answered this SYNC
                 assert message is not None
             while source.counters()["frames"] < 901:

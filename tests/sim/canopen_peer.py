@@ -69,8 +69,10 @@ def over_virtual_bus(drive: Drive) -> Iterator[Any]:
     thread.start()
     network = canopen.Network()
     network.connect(interface="virtual", channel=channel)
+    node = network.add_node(drive.node_id, dictionary(drive))
+    node.sdo.RESPONSE_TIMEOUT = 60.0  # of a computer that is busy
     try:
-        yield network.add_node(drive.node_id, dictionary(drive))
+        yield node
     finally:
         network.disconnect()
         running.clear()

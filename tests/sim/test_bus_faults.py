@@ -9,6 +9,7 @@ from pathlib import Path
 
 import can
 import pytest
+from can.interfaces.socketcand import socketcand
 
 from fdhil.config import CanBus, parse
 from fdhil.drivers.can import bus
@@ -75,8 +76,9 @@ def test_what_another_sends_is_spoilt_for_the_drives_and_for_all_others_but_not_
     bench.fault("bus_late", None, can_id=STRANGER + 1, value=0.05)
     for _ in range(2):
         bench.wait_for("fault")
-    for can_id in (STRANGER, STRANGER + 1, STRANGER + 2):
-        sender.send(message(can_id, b"\1\2"))
+    together = [message(can_id, b"\1\2") for can_id in (STRANGER, STRANGER + 1, STRANGER + 2)]
+    assert isinstance(sender, socketcand.SocketCanDaemonBus)
+    sender._tcp_send("".join(map(socketcand.convert_can_message_to_ascii_message, together)))
     heard = until(other, STRANGER + 1)
     told = [(each.arbitration_id, bytes(each.data)) for each in heard if each.arbitration_id < 0x700]
     assert told == [(STRANGER, b"\1"), (STRANGER + 2, b"\1\2"), (STRANGER + 1, b"\1\2")]

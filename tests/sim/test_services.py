@@ -271,7 +271,7 @@ def test_the_library_guards_over_a_bus() -> None:
     rig = Rig()
     with over_virtual_bus(rig.drive) as node:
         node.nmt.start_node_guarding(0.01)
-        assert node.nmt.wait_for_heartbeat(5) == "PRE-OPERATIONAL"
+        assert node.nmt.wait_for_heartbeat(60) == "PRE-OPERATIONAL"
         node.nmt.stop_node_guarding()
 
 

@@ -166,8 +166,7 @@ def test_rows_and_commands_come_by_standard_input(tmp_path: Path) -> None:
     with TwinProcess(path, "--demand", "-") as twin:
         twin.send_line(HEAD)
         twin.command("trace", file=str(tmp_path / "trace.csv"))
-        for line in lines_of(rows):
-            twin.send_line(line)
+        twin.send_line("\n".join(lines_of(rows)))  # all at once: a hole would not be waited for long
         twin.send_line("0,0,0")
         assert "follows that of" in twin.event("error")["text"]
         twin.close_panel()

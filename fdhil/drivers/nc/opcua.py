@@ -11,7 +11,7 @@ import contextlib
 import logging
 import struct
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import AsyncIterator, Mapping, Sequence
 from types import TracebackType
 from typing import Any, Self
 
@@ -52,7 +52,7 @@ class OpcUa:
         self._client = client = Client(self._settings.url, timeout=self._settings.timeout_s)
         try:
             await secure(client, self._settings, self.name)
-            async with asyncio.timeout(4 * self._settings.timeout_s):
+            async with _within(4 * self._settings.timeout_s):
                 await client.connect()
                 self._nodes = await self._find(client)
         except TimeoutError:
@@ -81,7 +81,7 @@ class OpcUa:
         client, self._client = self._client, None
         if client is not None:
             with contextlib.suppress(*LOST, *NONSENSE, TimeoutError):
-                async with asyncio.timeout(self._settings.timeout_s):
+                async with _within(self._settings.timeout_s):
                     await client.disconnect()
 
     async def _find(self, client: Client) -> Mapping[str, ua.NodeId]:
@@ -114,7 +114,7 @@ class OpcUa:
     async def _values(self) -> list[ua.DataValue]:
         assert self._client is not None
         try:
-            async with asyncio.timeout(self._settings.timeout_s):
+            async with _within(self._settings.timeout_s):
                 values = await self._client.uaclient.read_attributes(list(self._nodes.values()), ua.AttributeIds.Value)
         except TimeoutError:
             text = f"did not answer within {self._settings.timeout_s:g} s; is the server still running?"
@@ -126,6 +126,19 @@ class OpcUa:
         if len(values) != len(self._nodes):
             raise ProtocolError(self.name, f"answers {len(values)} values for {len(self._nodes)} that were asked for")
         return values
+
+
+@contextlib.asynccontextmanager
+async def _within(seconds: float) -> AsyncIterator[None]:
+    """Limit the time as asyncio.timeout does, also where the end comes together with an answer.
+
+    asyncua is cancelled by a class of its own then, which Python 3.11 takes for somebody else's cancellation.
+    """
+    async with asyncio.timeout(seconds):
+        try:
+            yield
+        except asyncio.CancelledError:
+            raise asyncio.CancelledError from None
 
 
 def _shown(value: ua.DataValue) -> Shown:

@@ -31,7 +31,7 @@ class ModbusPeer:
     @property
     def settings(self) -> Mapping[str, Any]:
         coils = {kind.value: str(place) for kind, place in COILS.items()}
-        return {"port": self._port, "period_s": 0.005, **coils, **REGISTERS}
+        return {"port": self._port, "period_s": 0.005, "timeout_s": 60.0, **coils, **REGISTERS}
 
     async def _access(
         self, function: int, start: int, address: int, count: int, current: list[int], values: object

@@ -69,7 +69,7 @@ class OpcUaPeer:
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        return {"url": f"opc.tcp://127.0.0.1:{self.port}", "profile": "siemens", "period_s": 0.02, "timeout_s": 0.5}
+        return {"url": f"opc.tcp://127.0.0.1:{self.port}", "profile": "siemens", "period_s": 0.02, "timeout_s": 60.0}
 
     async def __aenter__(self) -> Self:
         self.server = Server(iserver=_QuickServer(self._users))

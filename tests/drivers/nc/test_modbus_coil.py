@@ -23,7 +23,7 @@ from tests.drivers.wire import machine
 
 
 def config_of(**keys: Any) -> MachineConfig:
-    return machine(g0={"source": "modbus_coil"}, nc_source={"modbus_coil": keys})
+    return machine(g0={"source": "modbus_coil"}, nc_source={"modbus_coil": {"timeout_s": 60.0, **keys}})
 
 
 async def once(config: MachineConfig) -> NcState:

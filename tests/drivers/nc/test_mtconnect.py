@@ -27,7 +27,7 @@ def config_of(**keys: Any) -> MachineConfig:
 async def heard(source: MtConnect, count: int) -> list[NcState]:
     """Read until so many states have come."""
     states: list[NcState] = []
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(300):
         while len(states) < count:
             states += await source.read()
     return states

@@ -22,7 +22,7 @@ from fdhil import tables
 from fdhil.config import MachineConfig
 from fdhil.drivers.nc import load_nc_source
 from fdhil.drivers.nc.opcua import OpcUa
-from fdhil.errors import ConfigError, ConnectError, DeviceError, ProtocolError
+from fdhil.errors import ConfigError, ConnectError, DeviceError, DeviceTimeout, ProtocolError
 from fdhil.records import MoveKind, NcState
 from tests.drivers.nc.opcua_peer import OpcUaPeer
 from tests.drivers.wire import machine
@@ -31,7 +31,7 @@ OWN_URI = "urn:fdhil:test"
 
 
 def config_of(**keys: Any) -> MachineConfig:
-    return machine(g0={"source": "opcua"}, nc_source={"opcua": {"timeout_s": 2.0, "period_s": 0.02, **keys}})
+    return machine(g0={"source": "opcua"}, nc_source={"opcua": {"timeout_s": 60.0, "period_s": 0.02, **keys}})
 
 
 async def once(config: MachineConfig) -> NcState:
@@ -51,6 +51,34 @@ async def test_a_value_that_is_not_good_is_none_and_decides_nothing() -> None:
                 await node.write_attribute(ua.AttributeIds.Value, bad)
             with pytest.raises(ProtocolError, match="shows no value"):
                 await source.read()
+
+
+class _CancelledWithAnswer(asyncio.CancelledError):
+    """As asyncua's wait ends that is cancelled just as the answer comes."""
+
+
+async def test_a_time_out_that_meets_the_answer_is_a_time_out_and_a_cancellation_is_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def answer_when_cancelled(*_: object) -> None:
+        waiting.set()
+        try:
+            await asyncio.Event().wait()
+        except asyncio.CancelledError:
+            raise _CancelledWithAnswer from None
+
+    async with OpcUaPeer() as peer, OpcUa(config_of(**peer.settings)) as source:
+        waiting = asyncio.Event()
+        assert source._client is not None
+        monkeypatch.setattr(source._client.uaclient, "read_attributes", answer_when_cancelled)
+        asking = asyncio.create_task(source._values())
+        await waiting.wait()
+        asking.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await asking
+        source._settings.__dict__["timeout_s"] = 0.05
+        with pytest.raises(DeviceTimeout, match="did not answer"):
+            await source._values()
 
 
 async def test_a_node_that_lacks_is_named_and_an_optional_one_is_not_missed(tmp_path: Path) -> None:
@@ -125,7 +153,7 @@ async def test_a_user_a_certificate_and_encryption(tmp_path: Path) -> None:
     theirs = await certificates(tmp_path, "nc", "urn:nc")
     password = tmp_path / "password"
     async with OpcUaPeer(secure=theirs, users=_Users()) as peer:
-        keys = {**peer.settings, "timeout_s": 2.0, "user": "fdhil", "password_file": str(password)}
+        keys = {**peer.settings, "user": "fdhil", "password_file": str(password)}
         keys |= {"certificate": str(as_pem(ours[0])), "private_key": str(ours[1])}
         with pytest.raises(ConnectError, match=r"password_file.*cannot be read"):
             await once(config_of(**keys))
