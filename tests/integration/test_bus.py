@@ -10,6 +10,8 @@ import can
 import canopen
 import pytest
 
+from fdhil.sim.drive.modes import CYCLIC_POSITION
+from fdhil.sim.nc.drive_link import Wiring
 from tests.integration.conftest import Bench
 
 PATIENCE_S = 10.0
@@ -69,6 +71,29 @@ def test_a_reset_node_boots_and_can_be_started(bus: can.BusABC) -> None:
     send(bus, 0x080)
     assert len(received(bus, 0x181)) == 8
     assert len(received(bus, 0x281)) >= 6
+
+
+def test_the_nc_s_takeover_is_whole_when_another_thread_orders_it(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The machine goes on while the order is given: half a takeover would leave the drives without their mode."""
+    of_axis = bench.service.machine.nc._wiring
+
+    def slow(axis: str) -> Wiring:
+        time.sleep(0.1)
+        return of_axis(axis)
+
+    monkeypatch.setattr(bench.service.machine.nc, "_wiring", slow)
+    bench.command('{"command": "nc", "on": true}')
+    bench.event("nc")
+    modes = [unit.drive.dictionary.number(0x6060) for unit in bench.service.machine.units.values()]
+    assert modes == [CYCLIC_POSITION] * 2
+
+
+def test_a_command_to_a_machine_that_has_ended_returns(bench: Bench) -> None:
+    bench.service.stop()
+    bench.command('{"command": "nc", "on": true}')
+    assert bench.events.empty()
 
 
 def test_another_master_enables_a_drive_and_its_set_point_acts_two_cycles_late(bus: can.BusABC) -> None:
