@@ -41,7 +41,7 @@ def sections() -> dict[str, Any]:
     return {
         "sim": {"pace": "lockstep", "modbus": False},
         "guard": {"clock": "sync"},
-        "play": {"heartbeat_s": 0.5},
+        "play": {"heartbeat_s": 1.0},
         "axis": axes,
     }
 
