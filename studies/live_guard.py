@@ -46,6 +46,7 @@ IDLE_S = 0.005
 ALIVE_S = 0.5  # on a busy host SYNC is slower than the clock; more often, and words would wait in front of the end
 PATIENCE_S = 300.0
 QUIET_S = {"socketcand": 0.02, "socketcan": 0.3}  # a kernel with CAN is often an emulated machine
+TRIES = 20
 LATE_S = 9.0  # less than the ten seconds after which the guard takes the bus for dead
 Tamper = Callable[[int, Frame], list[Frame]]
 Column = list[int]
@@ -394,11 +395,28 @@ class LiveGuard:
         self.playing = True
 
     def into_the_cut(self) -> None:
-        """Armed, and at any place of the program where an offset is applied."""
-        self.arm()
-        self.play()
-        self.until(lambda: any(self.offsets), "an offset")
-        self.run(int(self.rng.integers(0, ROWS - 2 * RESTING - 40)))
+        """Armed, and at any place of the program where an offset is applied.
+
+        A guard that was held up and lost frames ends a correction before it begins, as it should: it is armed again.
+        """
+        for _ in range(TRIES):
+            seen = len(self.events)
+            self.arm()
+            self.play()
+            self.until(lambda seen=seen: any(self.offsets) or self.was("OFF FROZEN", seen), "an offset")  # type: ignore[misc]
+            if any(self.offsets):
+                self.run(int(self.rng.integers(0, ROWS - 2 * RESTING - 40)))
+                return
+            self._give_up()
+        raise RuntimeError(f"no program began in {TRIES} tries; {self.events[-5:]}")
+
+    def _give_up(self) -> None:
+        """End the daemon whose correction the guard has ended, and a guard that is frozen."""
+        if self.daemon is not None:
+            self.daemon.kill()
+        if self.events[-1].get("state") == "FROZEN":
+            self.kill_guard()
+            self.start_guard()
 
     def close(self) -> None:
         """End what still runs."""

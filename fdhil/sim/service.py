@@ -11,7 +11,9 @@ from __future__ import annotations
 import os
 import select
 import tempfile
+import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
@@ -106,6 +108,8 @@ class SimService:
         self._drive_time_s = 0.0
         self._wall_s = self._told_s = 0.0
         self._loads: list[tuple[Path, Future[Trajectory]]] = []
+        self._given: deque[tuple[str, threading.Event]] = deque()
+        self._closed = False
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="ThreadPoolExecutor-sim")
         self._pipe = WakePipe()
         self._left = 0
@@ -212,6 +216,7 @@ class SimService:
         if self._folder is not None:
             self._folder.cleanup()
         self._pipe.close()
+        self._closed = True
 
     # -- the loop
 
@@ -279,6 +284,7 @@ class SimService:
         if self._pipe in ready:
             self._pipe.clear()
             self._take_loads()
+            self._take_given()
         if self._panel_fd is not None and self._panel_fd in ready:
             self._serve_panel()
         for name, bus in self._buses.items():
@@ -340,7 +346,7 @@ class SimService:
         if not chunk or len(self._line) > MAX_LINE:
             lines, self._line = [*lines, self._line], b""
         for line in lines:
-            self.command(line.decode("utf-8", "replace"))
+            self._obey(line.decode("utf-8", "replace"))
         if self._stream is not None:
             self._serve_stream(self._stream)
 
@@ -358,7 +364,25 @@ class SimService:
             self._emit({"event": "error", "text": "standard input ended before a row of the demand came"})
 
     def command(self, line: str) -> None:
-        """Obey one command of the panel, or take a row of the stream; what is wrong with it becomes an event."""
+        """Have the loop obey one command of the panel; returns when it has, or has ended. For other threads.
+
+        What is wrong with a command becomes an event.
+        """
+        obeyed = threading.Event()
+        self._given.append((line, obeyed))
+        self._pipe.wake()
+        while not obeyed.wait(_MAX_WAIT_S) and not self._closed:
+            pass
+
+    def _take_given(self) -> None:
+        """Obey what other threads gave: between two turns the machine is whole."""
+        while self._given:
+            line, obeyed = self._given.popleft()
+            self._obey(line)
+            obeyed.set()
+
+    def _obey(self, line: str) -> None:
+        """Obey a command, or take a row of the stream."""
         try:
             if self._stream is None or line.startswith("{"):
                 self._panel.obey(line)

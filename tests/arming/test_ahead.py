@@ -174,11 +174,19 @@ async def _is_not_abandoned_by_another(shop: Shop, program: Path) -> None:
     assert shop.desk.checking is not None
 
 
+def stop(pid: int) -> None:
+    """Stop a process, and return when it stands."""
+    os.kill(pid, signal.SIGSTOP)
+    os.waitid(os.P_PID, pid, os.WSTOPPED | os.WNOWAIT)
+
+
 async def _starves_with_a_word(shop: Shop) -> None:
     """A check that stands still is told before the rows end; when it goes on, so do they."""
-    os.kill(shop.process, signal.SIGSTOP)
+    stop(shop.process)
     try:
-        await asyncio.sleep(0.5)  # what it had said is read
+        await asyncio.sleep(0.5)
+        for _ in range(100):  # turns of the loop: what it had said is read
+            await asyncio.sleep(0)
         end = shop.checked.rows
         await shop.walk(end - 9_000, end)
         assert len(shop.mill.rows) == end

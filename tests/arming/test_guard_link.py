@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,6 +14,7 @@ import pytest
 
 from fdhil.arming.checked_program import Piece
 from fdhil.arming.desk import ALIVE_S, ArmingDesk
+from fdhil.arming.guard_client import GuardClient
 from fdhil.arming.guard_link import TRIPPED, GuardLink
 from fdhil.arming.token import read_token
 from fdhil.config import MachineConfig
@@ -79,9 +81,10 @@ def test_a_guard_that_does_not_answer_is_let_go(guard: Guard, folder: Path) -> N
 
 
 async def test_a_slow_guard_still_hears_that_the_daemon_lives(
-    config: MachineConfig, guard: Guard, folder: Path
+    config: MachineConfig, guard: Guard, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its answers are not waited for, not even while something is armed."""
+    monkeypatch.setattr("fdhil.arming.guard_link.GuardClient", partial(GuardClient, timeout_s=100.0))
     guard.says = lambda _kind: None
     desk = ArmingDesk(config, OutcomeStore(config), folder)
     attending = asyncio.create_task(desk.attend(lambda _told: None))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -35,7 +36,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fdhil.commissioning.scan.LISTEN_S", 0.25)
     monkeypatch.setattr("fdhil.commissioning.config_check.LISTEN_S", 0.25)
     monkeypatch.setattr("fdhil.drivers.can.sdo.QUIET_S", 0.1)
-    monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 5.0)  # it answers at once, on a host that has time
 
 
 @pytest.fixture
@@ -132,7 +133,10 @@ def test_a_drives_text_cannot_steer_a_terminal(text: bytes) -> None:
     assert len(printable(text)) <= 80
 
 
-def test_a_node_that_lacks_objects_is_listed_all_the_same(peer: tuple[DrivePeer, MachineConfig]) -> None:
+def test_a_node_that_lacks_objects_is_listed_all_the_same(
+    peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fdhil.commissioning.scan.ANSWER_S", 2.0)
     _, settings = peer
     exact = Description(Path("b.eds"), 0x46444849, 0x402, 0x10000)
     other = Description(Path("a.eds"), 0x46444849, 0x402, 7)
@@ -145,6 +149,7 @@ def test_a_node_that_lacks_objects_is_listed_all_the_same(peer: tuple[DrivePeer,
     assert answers.is_drive
     with BusScanner("can0", settings.bus["can0"]) as bus:
         assert bus.read(1, 0x5FFF) is None
+        monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.01)  # nothing ever comes
         assert bus.read(9, 0x1000) is None
 
 
@@ -155,11 +160,14 @@ def test_nothing_is_asked_once_a_master_is_heard(peer: tuple[DrivePeer, MachineC
         BusScanner("can0", settings.bus["can0"]) as bus,
     ):
         nc.send(can.Message(arbitration_id=0x80, is_extended_id=False))
-        bus.listen(0.1)
+        while bus.traffic.master is None:
+            bus.listen(0.1)
         with pytest.raises(ProtocolError, match=r"an NC came on the bus \(SYNC\)"):
             bus.answering()
         with pytest.raises(ProtocolError, match="start again"):
             bus.read(1, 0x1000)
+    while not drive.heard:
+        time.sleep(0.01)
     assert drive.heard == [0x80]
 
 
@@ -292,7 +300,9 @@ def test_a_drive_says_so_itself_or_as_the_first_of_several_devices(
     assert finding.ok is ok
 
 
-def test_a_bus_of_another_bit_rate_is_not_asked() -> None:
+def test_a_bus_of_another_bit_rate_is_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    for where in ("scan", "config_check"):
+        monkeypatch.setattr(f"fdhil.commissioning.{where}.LISTEN_S", 2.0)
     settings = machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex})
     with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as loud:
         stop = threading.Event()

@@ -35,8 +35,8 @@ pytestmark = pytest.mark.usefixtures("quick_commissioning")
 
 
 def config(**sections: Any) -> MachineConfig:
-    """The drive shares a busy computer: it is waited for, as any simulated one."""
-    sections = {"guard": {"clock": "sync"}, **sections}
+    """The drive shares a busy computer: it is waited for, as any simulated one, and bears a late heartbeat."""
+    sections = {"guard": {"clock": "sync", "heartbeat_s": 0.1}, **sections}
     return machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex}, **sections)
 
 
@@ -247,7 +247,7 @@ class LateCycle(Cycle):
 @pytest.fixture
 def fed(peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch) -> Iterator[LateCycle]:
     """A master that feeds the drive for a short time; afterwards the drive watches nobody any more, and is off."""
-    monkeypatch.setattr("fdhil.commissioning.watchdog.FEEDING_S", 0.15)
+    monkeypatch.setattr("fdhil.commissioning.watchdog.FEEDING_S", 0.6)
     drive, settings = peer
     cycle = LateCycle(settings, settings.bus)
     cycle.master = Master(settings, "X", cycle)
@@ -342,13 +342,18 @@ def test_full_heartbeat_consumers_are_refused(peer: tuple[DrivePeer, MachineConf
 @pytest.mark.parametrize(
     ("can_id", "shown"), [(0x080, "SYNC or set-points"), (0x302, "SYNC or set-points"), (0x605, "SDO requests")]
 )
-def test_an_nc_on_the_bus_is_left_alone(can_id: int, shown: str, peer: tuple[DrivePeer, MachineConfig]) -> None:
+def test_an_nc_on_the_bus_is_left_alone(
+    can_id: int, shown: str, peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Whatever it is that only a master sends, also to another drive: its SDO channels are its own."""
+    monkeypatch.setattr(survey, "LISTEN_S", 60.0)  # until it is heard
     drive, settings = peer
     with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as nc, Master(settings, "X") as master:
         nc.send(can.Message(arbitration_id=can_id, is_extended_id=False))
         with pytest.raises(ProtocolError, match=f"an NC is sending {shown}"):
             survey.listen(master)
+    while not drive.heard:
+        time.sleep(0.01)
     assert drive.heard == [can_id]  # the NC's own
 
 
@@ -366,7 +371,8 @@ def test_on_a_silent_bus_the_drive_alone_is_asked_what_it_is(monkeypatch: pytest
 
 
 @pytest.mark.fault("A29")
-def test_a_bus_of_another_bit_rate_gets_no_frame() -> None:
+def test_a_bus_of_another_bit_rate_gets_no_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(survey, "LISTEN_S", 2.0)
     settings = config()
     with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as other:
         with Master(settings, "X") as master:

@@ -152,7 +152,7 @@ async def test_idle_connections_make_room_and_those_that_wait_leave_some_for_dis
 @pytest.mark.parametrize("abstract", [False, True])
 def test_notify_speaks_the_protocol(abstract: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
-        name = f"@fdhil-test-{tmp_path.name}" if abstract else str(tmp_path / "notify")
+        name = f"@fdhil-test-{tmp_path.name}-{os.getpid()}" if abstract else str(tmp_path / "notify")
         manager.bind(name.replace("@", "\0", 1) if abstract else name)
         monkeypatch.setenv("NOTIFY_SOCKET", name)
         assert notify("READY=1\nSTATUS=x")

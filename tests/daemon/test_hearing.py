@@ -30,6 +30,7 @@ from tests.drivers.wire import Wire
 
 WRONG = {"SyncPeriodSuspect", "NodeNeverHeard"}
 STEP_S = 0.002  # of the SYNC on the wire, where the config says 1 ms
+WIRED = 30_000  # SYNCs: a minute, so that a busy host's daemon still hears them when it begins to listen
 
 
 class Line:
@@ -55,7 +56,7 @@ class Line:
 
     def _send(self, peer: socket.socket) -> None:
         begun_s, sent = time.time(), 0
-        rows = Wire(4000, period_ns=round(STEP_S * 1e9), start_ns=0).rows()
+        rows = Wire(WIRED, period_ns=round(STEP_S * 1e9), start_ns=0).rows()
         while not self._cut.is_set() and sent < len(rows):
             text = b""
             while sent < len(rows) and rows[sent][0] * 1e-9 <= time.time() - begun_s:

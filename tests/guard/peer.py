@@ -15,11 +15,9 @@ from fdhil.guard.transmit_socket import connect_bus, greet
 from tests.bench import bench_toml
 from tests.guard.machine import DEMAND_AT_REST, Drive, Frame
 
-ANSWER_S = 0.3
+ANSWER_S = 8.0  # a guard takes ten seconds without SYNC for a bus that is dead
 NEVER = 1 << 30
 SLOW_S = 0.02
-SETTLED_S = 0.5
-HOLDING_ANSWER_S = 8.0
 
 
 def open_bus(name: str, bus: CanBus) -> socket.socket:
@@ -38,8 +36,8 @@ class Peer(threading.Thread):
     """One client is the guard; ``sent`` lists (SYNC count, COB-ID, data) of everything it put on the bus.
 
     Each cycle: SYNC, the drives' TPDOs, then the NC's targets; while ``lockstep`` the next SYNC waits for the offset
-    frames of a guard that sent some in the cycle before: briefly after a zero, long while an offset is in force, and no
-    longer once a test says that they are not ``expected``. ``row`` runs over ``demand`` while ``playing``, slowly from
+    frames of a guard that sent some in the cycle before, and no longer once a test says that they are not ``expected``.
+    ``turns`` counts the turns of the thread. ``row`` runs over ``demand`` while ``playing``, slowly from
     ``slow_from``, so that a test on a busy host still meets the path where it wants to. ``at_row`` are frames of
     another node that come once, with the TPDOs of that row; ``rows_at`` tells the row of each SYNC.
     """
@@ -50,11 +48,10 @@ class Peer(threading.Thread):
         self.drives = [Drive(k + 1) for k in range(len(demand))]
         self.sent: list[tuple[int, int, bytes]] = []
         self.latched: list[tuple[int, tuple[int, ...], tuple[int, ...]]] = []
-        self.tick = self.row = 0
+        self.tick = self.row = self.turns = 0
         self.playing = False
         self.at_row: dict[int, Frame] = {}
         self.rows_at: dict[int, int] = {}
-        self.pause_s = 0.0
         self.slow_from = NEVER
         self.lockstep = self.syncing = self.expected = True
         self.ended = threading.Event()
@@ -70,6 +67,7 @@ class Peer(threading.Thread):
     def run(self) -> None:
         self._server.settimeout(0.05)
         while not self.ended.is_set():
+            self.turns += 1
             self.standing = not self.syncing
             if self._client is None:
                 self._accept()
@@ -80,6 +78,11 @@ class Peer(threading.Thread):
         for each in (self._client, self._server):
             if each is not None:
                 each.close()
+
+    @property
+    def hung_up(self) -> bool:
+        """Whether no guard is there any more, and what it had sent is read."""
+        return self._client is None
 
     def _accept(self) -> None:
         try:
@@ -114,7 +117,7 @@ class Peer(threading.Thread):
             self._client.sendall(encode(list(frames)))
 
     def _cycle(self) -> None:
-        time.sleep(max(self.pause_s, SLOW_S if self.row >= self.slow_from else 0.0))
+        time.sleep(SLOW_S if self.row >= self.slow_from else 0.0)
         self.tick += 1
         waits = self.lockstep and self._offset_frames > self._frames_before
         self._frames_before = before = self._offset_frames
@@ -132,8 +135,7 @@ class Peer(threading.Thread):
         self.row += self.playing
         sync = (0x080, bytes([(self.tick - 1) % 240 + 1]))
         self._transmit(encode([sync, *sampled, *streamed]))
-        answer_s = HOLDING_ANSWER_S if any(drive.offset for drive in self.drives) else ANSWER_S
-        deadline_s = time.monotonic() + (answer_s if waits else self.period_s)
+        deadline_s = time.monotonic() + (ANSWER_S if waits else self.period_s)
         while time.monotonic() < deadline_s and not self.ended.is_set() and self._client is not None:
             if waits and (not self.expected or self._offset_frames - before >= len(self.drives)):
                 break
@@ -171,14 +173,18 @@ class Peer(threading.Thread):
                     self._offset_frames += 1
                     drive.received_offset = int.from_bytes(data, "little", signed=True)
 
-    def settle(self) -> None:
-        """Stand until the guard has answered what it heard: it ran ahead until the first offsets came."""
+    def stand(self) -> None:
+        """Send no SYNC any more, from the return on."""
         self.syncing = False
         self.wait(lambda: self.standing, "a standstill")
-        frames = -1
-        while frames != (frames := self._offset_frames):
-            time.sleep(SETTLED_S)
-        self.syncing = True
+
+    def read_out(self) -> None:
+        """Return when all that the guard has sent by now is in ``sent``."""
+        client = self._client
+        assert client is not None
+        self.wait(lambda: not select.select([client], [], [], 0)[0], "an empty socket")
+        turns = self.turns
+        self.wait(lambda: self.turns > turns + 1, "the end of the turn that emptied it")
 
     def offsets_sent(self, node: int = 1) -> list[tuple[int, int]]:
         """(SYNC count, increments) of the offset frames to one node."""

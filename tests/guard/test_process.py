@@ -29,6 +29,7 @@ from tests.listening import tcp_ports
 
 DEMAND, OFFSET = smooth_path(rows=800)
 TOKEN = "the operator's"
+ENDS_S = 100.0  # a process that ends or answers does so at once, on a host that has time for it
 
 
 class Rig:
@@ -74,7 +75,7 @@ class Rig:
 
     def connect(self) -> GuardClient:
         self.peer.wait(lambda: any(e["event"] == "ready" for e in self.events()), "the guard")
-        self.client = GuardClient(self.run_directory, timeout_s=20.0)
+        self.client = GuardClient(self.run_directory, timeout_s=ENDS_S)
         self.alive.set()
         self._keeper.start()
         return self.client
@@ -98,6 +99,15 @@ class Rig:
         answer = client.arm(TOKEN, DIGEST, FACTS_GIVEN)
         assert answer["ok"], answer
         self.peer.wait(lambda: len(self.peer.offsets_sent()) > 30, "zeros")
+
+    def settle(self) -> None:
+        """Stand until the guard has answered all SYNC: they ran ahead of it until its first offsets came."""
+        client = self.client
+        assert client is not None
+        self.peer.stand()
+        self.peer.wait(lambda: client.status()["tick"] == self.peer.tick, "the last SYNC")
+        self.peer.read_out()
+        self.peer.syncing = True
 
     def state(self) -> str:
         assert self.client is not None
@@ -173,6 +183,7 @@ def test_mute_by_default_then_aligned_to_the_cycle_then_off(rig: Rig) -> None:
     assert [o for _, o in moving] == [(OFFSET[0][rows[t[0]]], OFFSET[1][rows[t[0]]]) for t, _ in moving]
     check_limits(rig)
     assert client.status()["cause"]["code"] == "Finished", "\n".join(map(str, rig.events()))
+    rig.peer.expected = False
     count = len(rig.peer.sent)
     ticks = rig.peer.tick
     rig.peer.wait(lambda: rig.peer.tick > ticks + 50, "SYNC")
@@ -195,7 +206,7 @@ def test_disarm_ramps_down(rig: Rig) -> None:
 def test_sigterm_ramps_down_and_exits_0(rig: Rig) -> None:
     rig.into_the_cut()
     rig.process.send_signal(signal.SIGTERM)
-    assert rig.process.wait(20) == 0
+    assert rig.process.wait(ENDS_S) == 0
     assert rig.peer.offsets_sent()[-1][1] == 0
     check_limits(rig)
     last = rig.events()[-1]
@@ -223,9 +234,11 @@ def test_lost_sync_freezes_and_adopting_brings_it_to_zero(rig: Rig, capsys: pyte
     """Out of FROZEN as the operator goes: ``fdhil adopt``, and 0 only when zero was read back."""
     rig.into_the_cut()
     assert rig.client is not None
-    rig.peer.playing = rig.peer.syncing = rig.peer.expected = False
+    rig.peer.playing = rig.peer.expected = False
+    rig.peer.stand()
     (rig.run_directory / impatient.BUS).touch()
     rig.peer.wait(lambda: rig.state() == "FROZEN", "frozen")
+    rig.peer.read_out()
     count = len(rig.peer.sent)
     held = rig.peer.offsets_sent()[-1][1]
     time.sleep(0.1)
@@ -252,7 +265,7 @@ def test_stopped_process_sends_nothing(rig: Rig) -> None:
     rig.process.send_signal(signal.SIGSTOP)
     os.waitid(os.P_PID, rig.process.pid, os.WSTOPPED | os.WNOWAIT)
     rig.peer.expected = False
-    time.sleep(0.02)
+    rig.peer.read_out()  # what it had sent
     count, tick = len(rig.peer.sent), rig.peer.tick
     rig.peer.wait(lambda: rig.peer.tick > tick + 200, "SYNC")
     assert len(rig.peer.sent) == count
@@ -269,18 +282,20 @@ def test_killed_guard_leaves_a_value_that_the_next_one_adopts(rig: Rig) -> None:
     rig.process.kill()
     rig.process.wait()
     rig.peer.playing = False
-    held = rig.peer.drives[0].offset
+    rig.peer.wait(lambda: rig.peer.hung_up, "all that it had sent")
+    drive = rig.peer.drives[0]
+    held = drive.offset if drive.received_offset is None else drive.received_offset
     assert held != 0
     count = len(rig.peer.offsets_sent())
     again = rig.start()
     try:
-        rig.peer.wait(lambda: len(rig.peer.offsets_sent()) > count and rig.peer.drives[0].offset == 0, "adoption")
+        rig.peer.wait(lambda: len(rig.peer.offsets_sent()) > count and drive.offset == 0, "adoption")
         values = [offset for _, offset in rig.peer.offsets_sent()[count:]]
         assert abs(values[0] - held) <= LIMITS.rate
         check_limits(rig)
     finally:
         again.terminate()
-        assert again.wait(20) == 0
+        assert again.wait(ENDS_S) == 0
         again.communicate()
 
 
@@ -322,7 +337,7 @@ def test_what_is_forged_foreign_or_silent_makes_no_step(rig: Rig) -> None:
         peer.wait(lambda: [event["event"] for event in rig.events()].count("ready") == 2, "the next guard")
         tick = peer.tick
         peer.wait(lambda: peer.tick > tick + 300, "SYNC")
-        with GuardClient(rig.run_directory, timeout_s=20.0) as other:
+        with GuardClient(rig.run_directory, timeout_s=ENDS_S) as other:
             refused = other.arm(TOKEN, DIGEST, FACTS_GIVEN)["refused"]
             assert "ReadBackStale" in {told["code"] for told in refused}
             assert not other.adopt(TOKEN)["ok"]

@@ -584,13 +584,14 @@ def test_one_full_queue_does_not_silence_the_watchdog(tmp_path: Path) -> None:
     again.close()
 
 
-def test_outside_a_unit_and_in_the_abstract_namespace() -> None:
+def test_outside_a_unit_and_in_the_abstract_namespace(tmp_path: Path) -> None:
+    name = f"fdhil-test-{tmp_path.name}-{os.getpid()}"
     silent = Notifier(None)
     silent.alive(10.0)
     silent.close()
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
-        systemd.bind("\0fdhil-test-notify")
-        notifier = Notifier("@fdhil-test-notify")
+        systemd.bind(f"\0{name}")
+        notifier = Notifier(f"@{name}")
         notifier.tell("STATUS=\ud800")
         assert systemd.recv(100) == b"STATUS=?"
         notifier.close()

@@ -45,10 +45,11 @@ def test_a_peer_that_is_no_hub(greeting: bytes, error: type[Exception]) -> None:
 
 
 def test_a_hub_that_is_not_there() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-    with pytest.raises(ConnectError, match=f"no hub answers at 127.0.0.1 port {port} .*start the hub first"):
-        open_bus("can0", CanBus(port=port))
+    with socket.socket() as nobody:  # has the port and does not listen there
+        nobody.bind(("127.0.0.1", 0))
+        port = nobody.getsockname()[1]
+        with pytest.raises(ConnectError, match=f"no hub answers at 127.0.0.1 port {port} .*start the hub first"):
+            open_bus("can0", CanBus(port=port))
 
 
 class RawSocket:

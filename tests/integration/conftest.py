@@ -21,7 +21,7 @@ from fdhil.config import MachineConfig
 from fdhil.pipeline import AxisPipeline
 from fdhil.program import load_trajectory
 from fdhil.records import Notice, Outcome
-from fdhil.sim.service import SimService
+from fdhil.sim.service import LOCKSTEP_HOLDING_WAIT_S, SimService
 from tests.bench import bench_document
 
 PATIENCE_S = 500.0
@@ -120,6 +120,7 @@ def settling_soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 0.3)
     monkeypatch.setattr("fdhil.commissioning.steps.SETTLE_CYCLES", 150)
     monkeypatch.setattr("fdhil.commissioning.steps.AVERAGE_CYCLES", 80)
+    monkeypatch.setattr("fdhil.commissioning.watchdog.STARVE_TIMEOUT_S", 15.0)  # a slow host's drives live slower
 
 
 @pytest.fixture
@@ -129,8 +130,9 @@ def sections() -> dict[str, Any]:
 
 
 @pytest.fixture
-def bench(transport: str, sections: dict[str, Any], tmp_path: Path) -> Iterator[Bench]:
-    """Serve the bench's twin on the transport."""
+def bench(transport: str, sections: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    """Serve the bench's twin on the transport; it waits for a guard that is held up with a zero, too."""
+    monkeypatch.setattr("fdhil.sim.service.LOCKSTEP_WAIT_S", LOCKSTEP_HOLDING_WAIT_S)
     document = bench_document() | sections
     TRANSPORTS[transport](document)
     events: queue.Queue[dict[str, Any]] = queue.Queue()

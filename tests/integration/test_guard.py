@@ -77,6 +77,15 @@ def arm(client: GuardClient, token: str) -> dict[str, Any]:
     raise AssertionError(answer)
 
 
+def missed_until_it_is_waited_for(client: GuardClient) -> int:
+    """Return the SYNCs that the guard had missed when it has caught up with those from before its first zero."""
+    first = client.status()["tick"]
+    while (status := client.status())["tick"] < first + 50:
+        client.alive()
+        time.sleep(0.02)
+    return int(status["missed_cycles"])
+
+
 def test_every_offset_is_applied_in_its_own_cycle(bench: Bench, client: GuardClient, tmp_path: Path) -> None:
     every_offset_is_applied_in_its_own_cycle(bench, client, tmp_path)
 
@@ -97,6 +106,7 @@ def every_offset_is_applied_in_its_own_cycle(bench: Bench, client: GuardClient, 
     run = bench.config.store.run_directory
     assert run is not None
     assert arm(client, read_token(run))["state"] == "ARMED"
+    missed = missed_until_it_is_waited_for(client)
     trace = tmp_path / "trace.csv"
     bench.command(json.dumps({"command": "trace", "file": str(trace)}))
     bench.command(json.dumps({"command": "play", "file": str(demand)}))
@@ -105,7 +115,7 @@ def every_offset_is_applied_in_its_own_cycle(bench: Bench, client: GuardClient, 
         time.sleep(0.05)
     late = bench.event("finished")["late_rpdo"]
     # a host that halts the guard for a cycle is counted; whatever is not counted must be right
-    missed = client.status()["missed_cycles"]
+    missed = client.status()["missed_cycles"] - missed
     assert missed <= len(way) // 100
     assert max(late.values()) <= missed
     applied = np.genfromtxt(trace, delimiter=",", names=True)["X_offset_um"][: way.size] * 65536 / 20e3

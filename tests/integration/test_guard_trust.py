@@ -24,7 +24,6 @@ from tests.guard import impatient
 from tests.integration.conftest import PATIENCE_S, Bench, sign_off
 from tests.integration.test_guard import toml
 
-pytestmark = pytest.mark.timeout(240)
 WINDOW = 0x6065
 
 

@@ -41,7 +41,7 @@ def sections() -> dict[str, Any]:
     return {
         "sim": {"pace": "lockstep", "modbus": False},
         "guard": {"clock": "sync"},
-        "play": {"heartbeat_s": 0.5},
+        "play": {"heartbeat_s": 1.0},
         "axis": axes,
     }
 
@@ -75,6 +75,7 @@ def test_a_correction_works_beside_it(bench: Bench, tmp_path: Path) -> None:
                 assert play.stdin is not None
                 play.stdin.write("\n")
                 play.stdin.flush()
+                bus.set_filters([{"can_id": 0x301, "can_mask": 0x7FF, "extended": False}])
                 offsets = []
                 while play.poll() is None:
                     guard.alive()

@@ -100,5 +100,6 @@ class WakePipe:
 
     def close(self) -> None:
         """Close both ends."""
-        for end in self._ends:
+        ends, self._ends = self._ends, (-1, -1)  # what is opened next has their numbers: a late wake is not for it
+        for end in ends:
             os.close(end)
