@@ -6,17 +6,15 @@ import contextlib
 import socket
 import threading
 
-from tests.fleet.servers import free_port
-
 
 class Network:
     """Carries each connection to ``port`` of this computer to another; while it is ``cut`` all is dropped."""
 
     def __init__(self, to_port: int) -> None:
-        self.port = free_port()
         self.cut = False
         self._to_port = to_port
-        self._door = socket.create_server(("127.0.0.1", self.port))
+        self._door = socket.create_server(("127.0.0.1", 0))
+        self.port = self._door.getsockname()[1]
         threading.Thread(target=self._answer, daemon=True).start()
 
     def close(self) -> None:

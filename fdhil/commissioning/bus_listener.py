@@ -76,31 +76,40 @@ class Traffic:
                 self.beats.setdefault(node, []).append(stamp)
 
     @property
+    def ids(self) -> tuple[int, ...]:
+        """COB-IDs that were heard so far; another thread may take frames meanwhile."""
+        return tuple(self.count)
+
+    @property
     def master(self) -> str | None:
         """What shows that a master runs the bus, None when nothing does."""
-        signs = [shows_master(can_id) for can_id in (*self.count, *self.requests)]
+        signs = [shows_master(can_id) for can_id in (*self.ids, *self.requests)]
         return "SYNC" if self.sync_ns else next((sign for sign in signs if sign), None)
 
     @property
     def nodes(self) -> set[int]:
         """Node-IDs that were heard to send."""
-        return {i & 0x7F for i in self.count if i & 0x780 in _NODE_FUNCTIONS and i & 0x7F}
+        return {i & 0x7F for i in self.ids if i & 0x780 in _NODE_FUNCTIONS and i & 0x7F}
 
     @property
     def sync_period_s(self) -> float | None:
-        """Median period of SYNC, None before the second one: a producer or a stamp that was late once says nothing."""
-        return statistics.median(later - t for t, later in pairwise(self.sync_ns)) * 1e-9 if self.sync_ns[1:] else None
+        """Median period of SYNC, None before the second one."""
+        return _period_s(self.sync_ns)
 
     def heartbeat_s(self, node_id: int) -> float | None:
-        """Mean period of a node's heartbeat, None before the second one."""
-        beats = self.beats.get(node_id, [])
-        return (beats[-1] - beats[0]) / (len(beats) - 1) * 1e-9 if len(beats) > 1 else None
+        """Median period of a node's heartbeat, None before the second one."""
+        return _period_s(self.beats.get(node_id, []))
 
     def nmt(self, node_id: int) -> str | None:
         """The NMT state of a node's newest heartbeat, None without one."""
         data = self.data.get(COB_HEARTBEAT + node_id)
         known = {int(state): state.name.lower().replace("_", "-") for state in Nmt}
         return None if data is None else known.get(data & 0x7F, f"unknown ({data & 0x7F:02X})")
+
+
+def _period_s(stamps_ns: list[int]) -> float | None:
+    """Median of what lies between stamps, None of a single one: a producer or a stamp late once says nothing."""
+    return statistics.median(later - t for t, later in pairwise(stamps_ns)) * 1e-9 if stamps_ns[1:] else None
 
 
 class BusListener:

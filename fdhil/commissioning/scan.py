@@ -59,7 +59,7 @@ class BusScanner(BusListener):
                 raise ConnectError(f"bus {self.name}", text) from None
             time.sleep(PACE_S)
         self.listen(ANSWER_S)
-        return {can_id & 0x7F for can_id in self.traffic.count if can_id & 0x780 == COB_SDO_RESPONSE}
+        return {can_id & 0x7F for can_id in self.traffic.ids if can_id & 0x780 == COB_SDO_RESPONSE}
 
     def require_alone(self) -> None:
         """ProtocolError when a master came on the bus: it alone may use SDO then."""

@@ -19,14 +19,16 @@ import can
 import pytest
 
 from fdhil.cli.main import cli, run_safely
+from fdhil.commissioning.bus_listener import LISTEN_S
 from fdhil.commissioning.record import load_record
 from fdhil.sim.wire.hub import Hub
 from tests.sim.hub_thread import HubThread
 from tests.sim.twin_process import TwinProcess, write_config
 
-# shorter waits than on a real machine: module, name, value
+# other waits than on a real machine: module, name, value
 WAITS: tuple[tuple[str, str, float], ...] = (
     ("commissioning.scan", "LISTEN_S", 0.3),
+    ("commissioning.scan", "ANSWER_S", 1.0),
     ("commissioning.config_check", "LISTEN_S", 0.3),
     ("commissioning.survey", "LISTEN_S", 0.3),
     ("commissioning.steps", "SETTLE_CYCLES", 120),
@@ -311,7 +313,8 @@ def test_a_drive_that_must_not_be_used_is_refused(fdhil: Said, bench: Bench) -> 
 
 
 def test_a_stopped_commissioning_leaves_the_drive_off(fdhil: Said, bench: Bench) -> None:
-    command = [sys.executable, "-c", QUICK, "commission", str(bench.config("stopped.toml")), "--axis", "X", "--yes"]
+    lasting = QUICK.replace("'AVERAGE_CYCLES', 60", "'AVERAGE_CYCLES', 1_000_000")  # a sign test without an end
+    command = [sys.executable, "-c", lasting, "commission", str(bench.config("stopped.toml")), "--axis", "X", "--yes"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         for line in process.stdout:
@@ -367,8 +370,10 @@ def test_help_tells_what_is_sent(fdhil: Said, command: str) -> None:
 
 
 @pytest.fixture
-def cut(bench: Bench) -> Iterator[Bench]:
-    """The machine while its NC runs the bus."""
+def cut(fdhil: Said, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    """The machine while its NC runs the bus, which is listened to as long as on a real machine."""
+    for module in ("scan", "config_check", "survey"):
+        monkeypatch.setattr(f"fdhil.commissioning.{module}.LISTEN_S", LISTEN_S)
     bench.twin.command("nc", on=True)
     assert bench.twin.event("nc")["on"]
     yield bench

@@ -119,7 +119,7 @@ def test_it_becomes_the_guard_owns_its_bus_and_stops_cleanly(
         finally:
             process.send_signal(signal.SIGTERM)
         told = [json.loads(line) for line in process.stdout]
-        assert process.wait(20) == 0
+        assert process.wait(300) == 0
         assert told[-1]["event"] == "stopped"
     assert (ready["event"], ready["axes"]) == ("ready", ["X", "Y"])
     assert [code for code, _ in seconds] == [3, 3]
@@ -133,7 +133,7 @@ def test_a_guard_whose_output_is_closed_says_nothing_on_the_bus(closed: str, tmp
     config = write_config(tmp_path, peer.port)
     command = f"exec {sys.executable} -m fdhil.cli.guard {config} {closed}"
     with subprocess.Popen(["bash", "-c", command], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        deadline_s = time.monotonic() + 60
+        deadline_s = time.monotonic() + 300
         while not (tmp_path / "fdhil-data" / "run" / "guard.sock").exists():
             assert process.poll() is None, process.communicate()
             assert time.monotonic() < deadline_s

@@ -38,6 +38,7 @@ def fdhil(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -
     """Run a command in this process, ``said`` on its standard input: exit code, stdout and stderr."""
     monkeypatch.setattr("fdhil.cli.init.INTERFACES", Path("no interfaces"))
     monkeypatch.setattr("fdhil.commissioning.scan.LISTEN_S", 0.2)
+    monkeypatch.setattr("fdhil.commissioning.scan.ANSWER_S", 1.0)
     monkeypatch.setattr("fdhil.drivers.can.sdo.QUIET_S", 0.1)
     monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.2)
 

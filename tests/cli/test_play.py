@@ -81,7 +81,7 @@ class Shop:
 
     def config(self, port: int) -> Path:
         path = write_config(self.folder, bus=f'interface = "socketcand"\nport = {port}')
-        path.write_text(path.read_text() + SETPOINTS + '[guard]\nclock = "sync"\n[play]\nheartbeat_s = 0.1\n')
+        path.write_text(path.read_text() + SETPOINTS + '[guard]\nclock = "sync"\n[play]\nheartbeat_s = 1.0\n')
         return path
 
     def playing(self, port: int) -> subprocess.Popen[str]:

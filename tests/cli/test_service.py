@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -144,15 +145,18 @@ def test_a_refusal_exits_1_with_class_cause_and_next_action(machine: Path, tmp_p
     assert (code, json.loads(out)) == (1, answer)
 
 
-@pytest.mark.parametrize("how", ["--json", "2>&1 >/dev/null"])
+@pytest.mark.parametrize("how", ["--json", "in words"])
 def test_a_no_that_nobody_took_is_no_yes(how: str, machine: Path) -> None:
     """What may still be applied is then known to nobody; exit code 0 would say that nothing is."""
     refused = {"ok": False, "code": "OffsetStands", "text": "30 um may still be applied", "advice": "hold the feed"}
-    command = f"sleep 0.5; exec {sys.executable} -m fdhil disarm {machine}"
+    command = [sys.executable, "-m", "fdhil", "disarm", str(machine), *(["--json"] if how == "--json" else [])]
+    read, write = os.pipe()
+    os.close(read)  # whoever read it has gone
+    out, err = (write, subprocess.PIPE) if how == "--json" else (subprocess.DEVNULL, write)
     with answering(machine, refused):
-        script = f"set -o pipefail; ({command} {how}) | true"
-        done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=100)
-    assert (done.returncode, done.stdout, done.stderr) == (3, "", "")
+        done = subprocess.run(command, stdout=out, stderr=err, text=True, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr or "") == (3, "")
 
 
 def test_arm_shows_how_far_the_check_of_a_long_program_is(machine: Path, capsys: Any) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import can
@@ -89,6 +91,21 @@ def test_nodes_states_and_heartbeats_are_heard() -> None:
 def test_a_sync_that_was_late_once_does_not_change_the_period() -> None:
     stamps = [k * 1_000_000 + (9_000_000 if k == 20 else 0) for k in range(21)]
     assert traffic(*((t, 0x80, b"") for t in stamps)).sync_period_s == pytest.approx(1e-3)
+    assert traffic(*((t, 0x703, b"\x7f") for t in stamps)).heartbeat_s(3) == pytest.approx(1e-3)
+
+
+def test_a_node_that_comes_while_it_is_looked_who_is_there_disturbs_nobody(request: pytest.FixtureRequest) -> None:
+    request.addfinalizer(partial(sys.setswitchinterval, sys.getswitchinterval()))
+    sys.setswitchinterval(1e-6)  # threads take turns as often as they can
+    ids = range(0x181, 0x1FF)
+    for _ in range(30):
+        heard = Traffic()
+        coming = threading.Thread(target=heard.take, args=(frames_of([(0, can_id, bytes(8)) for can_id in ids]),))
+        coming.start()
+        while coming.is_alive():
+            assert len(heard.nodes) <= len(ids)
+        coming.join()
+        assert len(heard.nodes) == len(ids)
     assert traffic((0, 0x80, b"")).sync_period_s is None
 
 

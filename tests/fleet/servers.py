@@ -44,16 +44,26 @@ def listens(port: int) -> bool:
         return caller.connect_ex(("127.0.0.1", port)) == 0
 
 
+def inside(folder: str) -> list[Path]:
+    """Return what is in a folder of /proc; nothing where its process has ended."""
+    with suppress(OSError):
+        return list(Path(folder).iterdir())
+    return []
+
+
 def children(pid: int) -> list[int]:
     """Return the processes that a process has started, and theirs."""
-    own = [int(text) for task in Path(f"/proc/{pid}/task").glob("*/children") for text in task.read_text().split()]
+    own: list[int] = []
+    for task in inside(f"/proc/{pid}/task"):
+        with suppress(OSError):  # ended in between
+            own += map(int, (task / "children").read_text().split())
     return own + [grandchild for child in own for grandchild in children(child)]
 
 
 def listening(*pids: int) -> set[str]:
     """Return the addresses that processes listen at, by IPv4 and IPv6."""
     sockets = set()
-    for file in (file for pid in pids for file in Path(f"/proc/{pid}/fd").iterdir()):
+    for file in (file for pid in pids for file in inside(f"/proc/{pid}/fd")):
         with suppress(OSError):  # closed in between
             sockets.add(os.fspath(file.readlink()))
     found = set()
@@ -103,7 +113,7 @@ class Postgres:
         self.folder = Path(tempfile.mkdtemp(prefix="fdhil-pg-"))
         if os.getuid() == 0:
             os.chown(self.folder, 65534, 65534)
-        self.connection = f"host={self.folder} user=fleet dbname=postgres connect_timeout=5"
+        self.connection = f"host={self.folder} user=fleet dbname=postgres connect_timeout=120"
         data = self.folder / "data"
         made: list[str | Path] = [
             POSTGRES / "initdb",

@@ -34,7 +34,7 @@ async def leader(url: str) -> str:
     client = Client()
     await client.connect(url)
     try:
-        answer = await client.request("$JS.API.STREAM.INFO.fdhil", b"", timeout=5)
+        answer = await client.request("$JS.API.STREAM.INFO.fdhil", b"", timeout=60)
         return str(json.loads(answer.data)["cluster"]["leader"])
     finally:
         await client.close()

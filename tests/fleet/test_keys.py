@@ -77,6 +77,7 @@ async def told_and_refused(server: Server, known: NatsServer, foreign: NatsServe
         assert client.last_error is None
         with pytest.raises(nats.errors.Error):
             await client.request("fdhil.v1.mill-2.records", b"", timeout=1.0)
+        await client.flush(60)  # what the server said against it has come by then
         assert "it refuses us" in transport.cause_of(
             cast(BaseException, client.last_error)
         )  # a timeout alone would not be it

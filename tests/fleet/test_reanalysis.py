@@ -27,7 +27,7 @@ from fdhil.pipeline import analyse
 from fdhil.records import Reason, WindowOutcome
 from tests.daemon.shop import fdhil
 from tests.fleet.machine import Machine, written
-from tests.fleet.servers import Postgres, children, free_port, until
+from tests.fleet.servers import Postgres, children, free_port, listens, until
 from tests.fleet.works import fleet_of, gather, told_by
 from tests.identification.recorded import windows
 
@@ -150,8 +150,10 @@ slowly({str(works)!r})
     process.send_signal(signal.SIGKILL)
     process.wait()
     until(lambda: not any(map(runs, helpers)), "its workers have ended with it")
+    held = "SELECT 1 FROM pg_locks WHERE locktype = 'advisory'"
+    until(lambda: database.ask(held) == [], "the database has seen that it is gone")
     done = len(database.ask(ROWS))
-    assert 4 <= done < 12
+    assert done == 4
     told: list[tuple[int, int]] = []
     with workers(None, 0, per_task=1) as crew:
         resumed(works, crew, lambda *far: told.append(far))
@@ -180,6 +182,7 @@ def cluster() -> Iterator[tuple[str, subprocess.Popen[bytes], subprocess.Popen[b
     dask = [sys.executable, "-m", "dask"]
     processes = [subprocess.Popen([*dask, *told], stderr=subprocess.DEVNULL) for told in words]
     try:
+        until(lambda: listens(int(words[0][2])), "the scheduler listens")
         yield address, processes[0], processes[1]
     finally:
         for process in processes:
@@ -207,9 +210,9 @@ def test_on_a_cluster_that_is_there_and_goes_away(
 
 
 def slowly(file: str) -> None:
-    """Reanalyse with two workers, a window a task and a pause behind each, as a process that will be killed."""
+    """Reanalyse with two workers, a window a task, as a process that will be killed: there is no end of the fourth."""
     with workers(None, 2, per_task=1) as crew:
-        resumed(Path(file), crew, lambda done, total: time.sleep(0.5))
+        resumed(Path(file), crew, lambda done, total: time.sleep(600 if done == 4 else 0))
 
 
 def resumed(file: Path, crew: WindowCrew, progress: reanalysis.Progress) -> None:

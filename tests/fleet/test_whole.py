@@ -15,7 +15,7 @@ import pytest
 from fdhil.store.windows import read_window
 from studies.fleet_cut import Network
 from tests.fleet.machine import Machine, written
-from tests.fleet.servers import NatsServer, Postgres, nats, until
+from tests.fleet.servers import PATIENCE_S, NatsServer, Postgres, nats, until
 from tests.store.made import same, window
 
 pytestmark = pytest.mark.debian
@@ -58,7 +58,7 @@ class Process:
         """End it, once it runs, and return its exit code."""
         until(lambda: self._log.stat().st_size > self._before, "it runs")
         self._process.send_signal(how)
-        return self._process.wait(30)
+        return self._process.wait(PATIENCE_S)
 
     @property
     def said(self) -> str:

@@ -75,7 +75,7 @@ class Listening:
 @asynccontextmanager
 async def host_application(port: int, **more: object) -> AsyncIterator[Listening]:
     """Listen to everything that is Sparkplug's until the block is left."""
-    async with aiomqtt.Client("127.0.0.1", port, **more) as client:  # type: ignore[arg-type]
+    async with aiomqtt.Client("127.0.0.1", port, timeout=120.0, **more) as client:  # type: ignore[arg-type]
         await client.subscribe("spBv1.0/#", qos=1)
         yield Listening(client)
 

@@ -31,6 +31,7 @@ from tests.drivers.nc.test_opcua import certificates
 from tests.shopfloor.made import NOW_MS, VALUES, notice, publishing, said, status, trouble
 
 pytestmark = pytest.mark.asyncio(loop_scope="module")
+PATIENCE_S = 120.0
 PASSWORD = "canary-of-the-shop-floor"
 MACHINE_TOOL = "http://opcfoundation.org/UA/MachineTool/"
 
@@ -58,7 +59,7 @@ async def stage(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Stage
 @pytest_asyncio.fixture(loop_scope="module")
 async def client(stage: Stage) -> AsyncIterator[Client]:
     await stage.say(status())
-    async with Client(stage.url) as connected:
+    async with Client(stage.url, PATIENCE_S) as connected:
         yield connected
 
 
@@ -86,7 +87,7 @@ class Heard:
 
 
 async def until(done: Callable[[], bool]) -> None:
-    async with asyncio.timeout(120.0):
+    async with asyncio.timeout(PATIENCE_S):
         while True:
             if done():
                 return
@@ -245,7 +246,7 @@ async def test_nonsense_on_the_wire_ends_its_own_connection_alone(stage: Stage, 
         reader, writer = await asyncio.open_connection("127.0.0.1", stage.served.port)
         writer.write(nonsense)
         writer.write_eof()
-        async with asyncio.timeout(120.0):
+        async with asyncio.timeout(PATIENCE_S):
             await reader.read()
         writer.close()
     assert await (await own(client, "state")).read_value() == "ACTIVE"
@@ -267,7 +268,7 @@ async def entered(url: str, folder: Path, name: str, user: str | None, password:
     """Enter by a certificate of this name, read the state, and return its quality."""
     ours = await certificates(folder, name, f"urn:{name}") if not (folder / f"{name}.der").exists() else None
     certificate, key = ours or (folder / f"{name}.der", folder / f"{name}.pem")
-    client = Client(url)
+    client = Client(url, PATIENCE_S)
     client.application_uri = f"urn:{name}"
     await client.set_security(SecurityPolicyBasic256Sha256, str(certificate), str(key))
     if user is not None:
@@ -298,7 +299,7 @@ async def test_who_enters_is_known_by_certificate_and_password(
         assert await refused(entered(url, tmp_path, "scada", "nobody", PASSWORD)) == BadUserAccessDenied.__name__
         assert await refused(entered(url, tmp_path, "scada", None)) == BadIdentityTokenRejected.__name__
         assert await refused(entered(url, tmp_path, "stranger", "scada", PASSWORD)) != "let in"
-        plain = Client(url)
+        plain = Client(url, PATIENCE_S)
         plain.set_user("scada")
         plain.set_password(PASSWORD)
         assert await refused(plain.connect()) != "let in"
@@ -323,7 +324,7 @@ async def test_a_real_daemon_is_read_and_its_end_is_seen(tmp_path: Path, capsys:
         patch.setattr("fdhil.daemon.service.warm", lambda config, method: None)
         async with publishing("opcua", config) as task:
             address = (await said(task, capsys, "opc.tcp://")).rsplit(" ", 1)[1]
-            async with Client(address) as client:
+            async with Client(address, PATIENCE_S) as client:
                 state = await own(client, "state")
                 async with daemon_serving(config, Machine()):
                     await read_when(state, "OFF(SHADOW)")
@@ -332,7 +333,7 @@ async def test_a_real_daemon_is_read_and_its_end_is_seen(tmp_path: Path, capsys:
 
 async def read_when(node: Node, value: Any) -> None:
     """Read until it is so."""
-    async with asyncio.timeout(120.0):
+    async with asyncio.timeout(PATIENCE_S):
         while True:
             if (await told_of(node)).Value.Value == value:
                 return

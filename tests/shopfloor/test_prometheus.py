@@ -30,6 +30,7 @@ from tests.shopfloor.mosquitto import certify
 CONFIGS = Path(__file__).parents[2] / "configs"
 ALERTS, DASHBOARD = CONFIGS / "prometheus" / "fdhil-alerts.yml", CONFIGS / "grafana" / "fdhil.json"
 LOCAL = {"host": "localhost"}
+PATIENCE_S = 300.0
 
 
 def news_of(config: MachineConfig, *answers: dict[str, Any] | None) -> News:
@@ -151,7 +152,7 @@ async def test_a_real_daemon_is_read_over_http(
 ) -> None:
     monkeypatch.setattr("fdhil.daemon.service.warm", lambda config, method: None)
     config = config_of(tmp_path, publish={"prometheus": {"port": 0, "period_s": 0.1}})
-    async with publishing("prometheus", config) as task, httpx.AsyncClient() as client:
+    async with publishing("prometheus", config) as task, httpx.AsyncClient(timeout=PATIENCE_S) as client:
         address = (await said(task, capsys, "/metrics")).rsplit(" ", 1)[1]
         await _nonsense_is_answered(httpx.URL(address), caplog)
         assert ("fdhil_up", ()) in samples((await client.get(address)).text)
@@ -172,10 +173,10 @@ async def test_a_stranger_without_a_certificate_reads_nothing(
     known.load_cert_chain(tmp_path / "client.pem", tmp_path / "client.key")
     async with publishing("prometheus", config_of(tmp_path, publish={"prometheus": keys})) as task:
         address = (await said(task, capsys, "/metrics")).rsplit(" ", 1)[1].replace("0.0.0.0", "127.0.0.1")
-        async with httpx.AsyncClient(verify=known) as client:
+        async with httpx.AsyncClient(verify=known, timeout=PATIENCE_S) as client:
             assert ("fdhil_up", ()) in samples((await client.get(address)).text)
         for context, at in ((stranger, address), (known, address.replace("https", "http"))):
-            async with httpx.AsyncClient(verify=context) as client:
+            async with httpx.AsyncClient(verify=context, timeout=PATIENCE_S) as client:
                 with pytest.raises(httpx.TransportError):
                     await client.get(at)
 
@@ -255,7 +256,7 @@ def test_promtool_agrees_with_the_rules_and_their_tests(tmp_path: Path) -> None:
         ["check", "config", "prometheus.yml"],
         ["test", "rules", "alerts.test.yml", "alerts-of-weeks.test.yml"],
     ):
-        done = subprocess.run(["promtool", *words], cwd=tmp_path, capture_output=True, text=True, timeout=120)
+        done = subprocess.run(["promtool", *words], cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S)
         assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -286,7 +287,7 @@ async def test_a_real_prometheus_scrapes_and_an_alert_comes(tmp_path: Path, caps
 
 async def alerts_of(address: str, prometheus: asyncio.subprocess.Process) -> set[str]:
     """Ask a Prometheus until an alert fires."""
-    deadline_s = time.monotonic() + 120.0
+    deadline_s = time.monotonic() + PATIENCE_S
     async with httpx.AsyncClient() as client:
         while time.monotonic() < deadline_s and prometheus.returncode is None:
             try:

@@ -57,10 +57,11 @@ def test_a_file_that_ends_its_reader_is_refused_and_the_next_one_read(name: str,
     ],
 )
 def test_a_reader_that_goes_astray_is_ended(does: str, told: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    if does == "sleep":
-        monkeypatch.setattr(reading_process, "LONGEST_S", 0.3)
-    with pytest.raises(RecordingError, match=f"^r is no such file .*{told}.*; export it again$"):
-        _asked(does.encode(), "r")
+    with monkeypatch.context() as patch:
+        if does == "sleep":
+            patch.setattr(reading_process, "LONGEST_S", 0.3)
+        with pytest.raises(RecordingError, match=f"^r is no such file .*{told}.*; export it again$"):
+            _asked(does.encode(), "r")
     assert _asked(b"", "the next") == "the next"
 
 

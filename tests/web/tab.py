@@ -49,7 +49,7 @@ WIDER = """() => {
 
 def started(playwright: Playwright) -> Browser:
     """Start Debian's chromium."""
-    return playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+    return playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"], timeout=PATIENCE_MS)
 
 
 @dataclass

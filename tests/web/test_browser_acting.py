@@ -68,6 +68,7 @@ def test_a_whole_arm_and_disarm_by_the_keyboard_alone(stage: Stage, tab: Tab) ->
     assert tab.page.evaluate("document.activeElement.id") == "skip"
     log_in_by_keyboard(tab, "operator", PASSWORDS["operator"])
     tab.says("#standing", tab.word("state", state="OFF"))
+    tab.ready()
     stage.settled()
     tab.tab_to(tab.word("arm.open"))
     tab.page.keyboard.press("Enter")
@@ -79,6 +80,7 @@ def test_a_whole_arm_and_disarm_by_the_keyboard_alone(stage: Stage, tab: Tab) ->
     armed = stage.status_when(lambda told: told["state"] == "ARMED")
     assert armed["armed"]["program"] == str(stage.program)
     tab.says("#standing", tab.word("state", state="ARMED"))
+    tab.page.get_by_role("dialog").wait_for(state="detached")  # it has a button of that name too
     tab.tab_to(tab.word("disarm"))
     tab.page.keyboard.press("Enter")
     stage.status_when(lambda told: told["state"] == "OFF" and told["armed"] is None)

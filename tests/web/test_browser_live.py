@@ -32,9 +32,9 @@ def test_it_is_frozen_enlarged_and_read_off_by_the_keyboard(phone: Tab) -> None:
     phone.says(STATE, phone.word("live.running").partition("{")[0])
     assert phone.page.locator("tbody tr").count() == 1  # the axis of the link alone
     chart = phone.page.locator(f"{CURRENT} .plot")
-    chart.focus()
-    phone.page.keyboard.press("ArrowLeft")  # the cursor stands near the newest, and what is enlarged is there
     reading = phone.page.locator(f"{CURRENT} output")
+    while not reading.text_content():  # what has come is drawn a little later
+        chart.press("ArrowLeft")  # the cursor stands near the newest, and what is enlarged is there
     place_s = float((reading.text_content() or "").partition(" s")[0])
     for _ in range(5):
         phone.page.keyboard.press("+")
@@ -61,7 +61,7 @@ def test_what_is_chosen_is_in_the_address(phone: Tab) -> None:
     phone.page.get_by_label(phone.word("live.seconds")).select_option("5")
     phone.page.get_by_label("Y", exact=True).uncheck()
     phone.says(STATE, phone.word("live.running").partition("{")[0])
-    assert phone.page.url.endswith("/live?axis=X&seconds=5")
+    phone.page.wait_for_url("**/live?axis=X&seconds=5")
     phone.page.reload()
     phone.ready()
     phone.says(STATE, phone.word("live.running").partition("{")[0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
@@ -27,6 +28,7 @@ from tests.daemon.test_live import block
 from tests.web.test_live_ring import decoded
 
 BLOCK = 50
+WAIT_S = 60.0
 PASSWORD = "a password of tests"
 
 
@@ -74,7 +76,8 @@ async def pages(config: MachineConfig) -> AsyncIterator[str]:
 
 def stream_of(place: str, query: str = "seconds=1&columns=100", **more: Any) -> connect:
     """Return the socket of the stream."""
-    return connect(f"ws://{place}/api/live/stream?{query}", **{"subprotocols": ["fdhil"], **more})
+    given = {"subprotocols": ["fdhil"], "open_timeout": WAIT_S, **more}
+    return connect(f"ws://{place}/api/live/stream?{query}", **given)
 
 
 class Browser:
@@ -88,7 +91,7 @@ class Browser:
     async def until(self, ready: Callable[[], bool], draw: bool = True) -> None:
         """Take messages until something is so."""
         while not ready():
-            message = await asyncio.wait_for(self.socket.recv(), 60.0)
+            message = await asyncio.wait_for(self.socket.recv(), WAIT_S)
             assert isinstance(message, bytes)
             self.header, low = decoded(message)
             self.parts += zip(self.header["parts"], low, strict=True)
@@ -108,12 +111,12 @@ class Browser:
 async def heard_out(socket: ClientConnection) -> None:
     """Take messages until the server closes; ConnectionClosed."""
     while True:
-        await asyncio.wait_for(socket.recv(), 60.0)
+        await asyncio.wait_for(socket.recv(), WAIT_S)
 
 
 async def begun(socket: ClientConnection) -> tuple[dict[str, Any], Browser]:
     """Return the first message, and a browser once the daemon's stream is open."""
-    begin = json.loads(await asyncio.wait_for(socket.recv(), 60.0))
+    begin = json.loads(await asyncio.wait_for(socket.recv(), WAIT_S))
     browser = Browser(socket)
     await browser.until(lambda: browser.header.get("trouble") == "")
     return begin, browser
@@ -151,7 +154,7 @@ async def test_what_passes_is_told_as_columns_and_kept_as_samples_over_a_daemon_
             feed(stream, 0, 8)
             await browser.until(lambda: browser.told >= 770)
             assert browser.parts[-1][0]["first_tick"] > end
-        async with httpx.AsyncClient() as client:
+        async with httpx.AsyncClient(timeout=WAIT_S) as client:
             query = {"first_tick": end - 20, "end_tick": end, "columns": 100}
             told = (await client.get(f"http://{place}/api/live/samples", params=query)).json()
     signal = told["axes"]["X"]["current_a"]
@@ -161,10 +164,13 @@ async def test_what_passes_is_told_as_columns_and_kept_as_samples_over_a_daemon_
     assert told["axes"]["X"]["temperature_c"]["low"] == [None] * 20
 
 
-async def test_a_browser_that_does_not_draw_is_waited_for_and_then_told_in_wider_columns(tmp_path: Path) -> None:
+async def test_a_browser_that_does_not_draw_is_waited_for_and_then_told_in_wider_columns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     config = config_of(tmp_path)
     async with daemon(config) as stream, pages(config) as place, stream_of(place, "seconds=5&columns=500") as socket:
         _, browser = await begun(socket)
+        monkeypatch.setattr(page, "ALIVE_S", math.inf)  # a word of life would be one of the two that are not drawn
         feed(stream, 0, 2)
         await browser.until(lambda: browser.told >= 90, draw=False)
         feed(stream, 100, 2)
@@ -224,12 +230,12 @@ async def test_so_many_may_look_on_and_no_more(tmp_path: Path, monkeypatch: pyte
             await socket.recv()
         async with stream_of(place) as third:
             with pytest.raises(ConnectionClosed, match="1013"):
-                await asyncio.wait_for(third.recv(), 60.0)
+                await asyncio.wait_for(third.recv(), WAIT_S)
         await first.close()
         while True:  # its place is free when the server has seen it leave
             async with stream_of(place) as fourth:
                 try:
-                    await asyncio.wait_for(fourth.recv(), 60.0)
+                    await asyncio.wait_for(fourth.recv(), WAIT_S)
                     break
                 except ConnectionClosed:
                     continue
@@ -243,7 +249,7 @@ async def test_a_stranger_is_told_nothing_and_a_login_that_ends_ends_the_stream(
     config = config_of(tmp_path, web={"users_file": "users.json"})
     async with (
         pages(config) as place,
-        httpx.AsyncClient(base_url=f"http://{place}", headers={"X-Fdhil": "1"}) as client,
+        httpx.AsyncClient(base_url=f"http://{place}", headers={"X-Fdhil": "1"}, timeout=WAIT_S) as client,
     ):
         token = (await client.post("/api/session", json={"name": "ann", "password": PASSWORD})).json()["token"]
         mine: list[Any] = ["fdhil", f"bearer.{token}"]
@@ -261,7 +267,7 @@ async def test_a_stranger_is_told_nothing_and_a_login_that_ends_ends_the_stream(
         assert (await client.get("/api/live/samples", params=query)).status_code == 401
         async with stream_of(place, subprotocols=mine) as socket:
             assert socket.subprotocol == "fdhil"  # the token is not said back
-            await asyncio.wait_for(socket.recv(), 60.0)
+            await asyncio.wait_for(socket.recv(), WAIT_S)
             await client.delete("/api/session", headers={"Authorization": f"Bearer {token}"})
             with pytest.raises(ConnectionClosed, match="the login has ended"):
                 await heard_out(socket)

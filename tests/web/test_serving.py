@@ -134,7 +134,7 @@ def test_served_by_tls_it_tells_no_secret_and_ends_in_order(
     with Process("web", ["fdhil", "web", str(path), "--json"], log) as web:
         url = web.event("ready")["url"]
         assert url.startswith("https://127.0.0.1:")
-        with httpx.Client(base_url=url, verify=trusting, headers=OWN) as client:
+        with httpx.Client(base_url=url, verify=trusting, headers=OWN, timeout=60.0) as client:
             said = [client.get(page) for page in ("/", "/api/session", "/api/machine", "/static/app.js")]
             login = client.post("/api/session", json={"name": "op", "password": password})
             client.headers["Authorization"] = f"Bearer {login.json()['token']}"

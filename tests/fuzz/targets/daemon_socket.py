@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import socket
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -50,7 +51,13 @@ _SERVER = _LOOP.run_until_complete(_server())
 
 
 class _Client:
-    """Stands for the writer of a connection."""
+    """Stands for the writer of a connection, which stands."""
+
+    HERE, THERE = socket.socketpair()
+
+    def get_extra_info(self, name: str) -> socket.socket:
+        assert name == "socket"
+        return self.HERE
 
     def write(self, data: bytes) -> None:
         json.loads(data)
