@@ -19,8 +19,9 @@ def test_a_notebook_runs_to_its_end_and_shows_what_it_promises(path: Path) -> No
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert all(not cell.outputs and cell.execution_count is None for cell in cells), "is kept without outputs"
     alone = Config({"KernelManager": {"transport": "ipc"}})  # TCP ports that were chosen free may be another's by then
-    patience = {"timeout": 300, "startup_timeout": 300, "iopub_timeout": 300}
-    NotebookClient(notebook, **patience, kernel_name="python3", config=alone).execute()
+    client = NotebookClient(notebook, timeout=300, startup_timeout=300, kernel_name="python3", config=alone)
+    client.iopub_timeout = 300
+    client.execute()
     outputs = [output for cell in cells for output in cell.outputs]
     assert [output for output in outputs if output.output_type == "error"] == []
     assert [output.text for output in outputs if output.get("name") == "stderr"] == []

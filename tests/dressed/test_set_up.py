@@ -41,7 +41,9 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fdhil.commissioning.steps.AVERAGE_CYCLES", 60)
 
 
-def until_it_answers(scanner: BusScanner, answering: Callable[[BusScanner], set[int]] = BusScanner.answering) -> set[int]:
+def until_it_answers(
+    scanner: BusScanner, answering: Callable[[BusScanner], set[int]] = BusScanner.answering
+) -> set[int]:
     """Ask all nodes until the drive has answered, which is on the bus for certain."""
     while not (found := answering(scanner)):
         pass

@@ -12,7 +12,7 @@ import selectors
 import struct
 import time
 import tty
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from functools import wraps
 from typing import Any
@@ -67,7 +67,7 @@ class _OftenLooking(selectors.DefaultSelector):
         return super().select(None if timeout is None else min(timeout, LOOK_S))
 
 
-def patiently(test: Callable[..., Awaitable[None]]) -> Callable[..., None]:
+def patiently(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
     """Run a test, and the serial line in it, by the time of a patient loop: what is silent is still given up soon."""
 
     @wraps(test)
