@@ -156,9 +156,8 @@ class FeedDriveBench:
         One that the machine refuses fails the test.
         """
         assert self._service is not None
-        self._service.command(json.dumps({"command": command, **more}))
-        for told in [*self._events.queue]:
-            _fail_for(told)
+        if wrong := self._service.command(json.dumps({"command": command, **more})):
+            pytest.fail(f"the feed drive bench cannot: {wrong}")
 
     def fault(self, name: str, axis: str | None = "X", **more: Any) -> None:
         """Let a fault happen, as of docs/reference/faults.md: ``fault("load_torque", value=5.0, duration_s=0.3)``."""
@@ -185,14 +184,10 @@ class FeedDriveBench:
                 told = self._events.get(timeout=self._patience_s)
             except queue.Empty:
                 pytest.fail(f"the feed drive bench said no {event!r} within {self._patience_s:g} s")
-            _fail_for(told)
+            if told["event"] == "error":
+                pytest.fail(f"the feed drive bench cannot: {told['text']}")
             if told["event"] == event:
                 return told
-
-
-def _fail_for(told: Mapping[str, Any]) -> None:
-    if told["event"] == "error":
-        pytest.fail(f"the feed drive bench cannot: {told['text']}")
 
 
 def _document(axes: str, bus: str) -> dict[str, Any]:

@@ -11,11 +11,10 @@ from __future__ import annotations
 import os
 import select
 import tempfile
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -108,7 +107,7 @@ class SimService:
         self._drive_time_s = 0.0
         self._wall_s = self._told_s = 0.0
         self._loads: list[tuple[Path, Future[Trajectory]]] = []
-        self._given: deque[tuple[str, threading.Event]] = deque()
+        self._given: deque[tuple[str, Future[str]]] = deque()
         self._closed = False
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="ThreadPoolExecutor-sim")
         self._pipe = WakePipe()
@@ -363,26 +362,26 @@ class SimService:
         elif stream.ended:
             self._emit({"event": "error", "text": "standard input ended before a row of the demand came"})
 
-    def command(self, line: str) -> None:
+    def command(self, line: str) -> str:
         """Have the loop obey one command of the panel; returns when it has, or has ended. For other threads.
 
-        What is wrong with a command becomes an event.
+        What is wrong with a command is returned, and is an event too; empty when nothing is.
         """
-        obeyed = threading.Event()
+        obeyed: Future[str] = Future()
         self._given.append((line, obeyed))
         self._pipe.wake()
-        while not obeyed.wait(_MAX_WAIT_S) and not self._closed:
-            pass
+        while not obeyed.done() and not self._closed:
+            wait([obeyed], _MAX_WAIT_S)
+        return obeyed.result() if obeyed.done() else ""
 
     def _take_given(self) -> None:
         """Obey what other threads gave: between two turns the machine is whole."""
         while self._given:
             line, obeyed = self._given.popleft()
-            self._obey(line)
-            obeyed.set()
+            obeyed.set_result(self._obey(line))
 
-    def _obey(self, line: str) -> None:
-        """Obey a command, or take a row of the stream."""
+    def _obey(self, line: str) -> str:
+        """Obey a command, or take a row of the stream; return what is wrong with it."""
         try:
             if self._stream is None or line.startswith("{"):
                 self._panel.obey(line)
@@ -390,6 +389,8 @@ class SimService:
                 self._stream.take(line)
         except (CommandError, StreamError) as error:
             self._emit({"event": "error", "text": str(error)})
+            return str(error)
+        return ""
 
     def _play(self, file: Path) -> None:
         """Load a file aside, so that the SYNC goes on meanwhile, then play it."""
