@@ -39,6 +39,7 @@ G1 X5 F2000
 G1 X0
 M2
 """
+STROKE_MM = 450.0
 RAPIDS = """G21 G90
 G0 X450
 G4 P0.6
@@ -90,13 +91,13 @@ class Heard:
                 self.came.clear()
                 await self.came.wait()
 
-    async def rest(self, rapids: int) -> None:
-        """Wait until the bus has caught up: so many rapids of X were told, and it stands for long where the NC does."""
+    async def rest(self, strokes: int) -> None:
+        """Wait until the bus has caught up: so many strokes of X are over, and it stands for long where the NC does."""
 
         def stands() -> bool:
             if self.state.motion is not MoveKind.REST:
                 return False
-            if len([event for event in self.events("X") if event.kind is MoveKind.RAPID]) < rapids:
+            if np.count_nonzero(np.diff(self.of("X")[1] > STROKE_MM / 2)) < strokes:
                 return False
             return self.stands(1500)
 
@@ -208,7 +209,7 @@ async def test_overrides_and_holds_are_told_and_their_rapids_refused(tmp_path: P
                 await heard.until(lambda: heard.state.motion is MoveKind.HOLD and heard.stands(300))
                 await asyncio.to_thread(nc.order, "resume")
                 await asyncio.to_thread(nc.order, "rest")
-                await heard.rest(9)  # after a hold that the bus has shown, what is left is a rapid of its own
+                await heard.rest(8)
     outcomes = windows_of(heard, config)
     texts = [str(o.verdict.reasons[0]) for o in outcomes if not o.verdict.accepted]
     accepted = [o.window.nc for o in outcomes if o.verdict.accepted]
