@@ -1,26 +1,29 @@
 """Long life: a week of work at speed-up, and real hours with faults (``python -m studies.soak``).
 
-The real daemon, guard, pages, publisher and simulated machine run as processes; after each round of rapids it is noted
-what each of them uses. The samples are kept below ``--folder`` as they come, one JSON object a line. With ``--rapids 0
---hours 0`` nothing is run: the page is made of what is there so far. ``--add`` keeps the figures of earlier runs: the
-real hours are the sum, and the week is the last that was run.
+The real daemon, guard, pages, publisher and simulated machine run as processes; after each round of rapids, and in the
+rest after it, it is noted what each of them uses. The samples are kept below ``--folder`` as they come, one JSON object
+a line. Real hours may be those of several shops at a time (``--shops``), each with processes of its own. With
+``--rapids 0 --hours 0`` nothing is run: the page is made of what is there so far. ``--add`` keeps the figures of
+earlier runs: the real hours are the sum, and the week is the last that was run.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
+import shutil
 import signal
 import sys
 import tempfile
-import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from studies import pages
-from studies.soak_life import EVENTS, RAPIDS, RESTARTS, Life
+from studies.soak_life import EVENTS, NOTE_S, RAPIDS, RESTARTS, Life
 from studies.soak_shop import KEPT_WINDOWS, STORE_MB, Shop, document_of
 from studies.usage import Slope, slope
 
@@ -30,7 +33,9 @@ WEEK_H, REAL_H = 168.0, 8.0  # what the goal asks for
 MOST_MB_A_DAY = 1.0
 EMERGENCIES = 1_000_000
 RESTARTING = 0.15  # of the rounds, at the beginning, in which daemon and guard are restarted
-WARM = 0.5  # of a process' life, before anything is concluded: the pages read the newest 2,000 rapids of an axis
+WARM = 0.5  # of a process' life, before anything is concluded
+SEEN = 2000  # rapids of each axis that the pages hold: a shop that works in real time has had as many before
+BY_CLOCK = 4  # rapids in a round by the clock
 OURS = ("daemon", "guard", "pages", "publisher")
 FLAT = ("descriptors", "threads", "children")
 
@@ -38,22 +43,74 @@ FLAT = ("descriptors", "threads", "children")
 # -- running
 
 
-def work(folder: Path, seed: int, rounds: int, hours: float, rest_s: float) -> None:
-    """Let a shop work for so many rounds, or, with ``hours``, in real time for so long with rests between."""
+def at_speed_up(folder: Path, seed: int, rounds: int) -> None:
+    """Let a shop work for so many rounds at speed-up."""
+    _provenance(folder, f"--rapids {rounds * RAPIDS} --hours 0", seed)
+    shop = Shop(folder, document_of(folder, PERIOD_S, lockstep=True))
+    with _open(shop):
+        life = Life(shop, folder / "samples.jsonl", seed)
+        while life.rounds < rounds:
+            life.round({**EVENTS, **RESTARTS} if life.rounds < RESTARTING * rounds else EVENTS)
+
+
+def fill(folder: Path, seed: int) -> Path:
+    """Return a store that a shop has filled at speed-up, so far that the pages hold no more by another rapid."""
+    shop = Shop(folder, document_of(folder, PERIOD_S, lockstep=True))
+    kept = folder / "kept"
+    if not kept.exists():
+        with _open(shop):
+            life = Life(shop, folder / "samples.jsonl", seed)
+            while life.rounds * RAPIDS < SEEN * len(shop.config.axis):
+                life.round({})
+            for name in OURS:
+                shop.processes.pop(name).stop()
+            shutil.copytree(shop.store, kept)
+    return kept
+
+
+def by_the_clock(folder: Path, seed: int, hours: float, rest_s: float, filled: Path, command: str) -> None:
+    """Let a shop with a filled store work by the clock for so long, with a rest after each round."""
+    _provenance(folder, command, seed)
+    shop = Shop(folder, document_of(folder, PERIOD_S, lockstep=False), filled)
+    with _open(shop):
+        life = Life(shop, folder / "samples.jsonl", seed, BY_CLOCK)
+        while (at_s := life.at_s) < 3600 * hours:
+            life.round({**EVENTS, **RESTARTS} if at_s < RESTARTING * 3600 * hours else EVENTS)
+            life.rest(rest_s)
+
+
+def real(folder: Path, options: argparse.Namespace) -> None:
+    """Let so many shops work by the clock at the same time."""
+    command = f"--rapids 0 --hours {options.hours:g} --rest {options.rest:g} --shops {options.shops}"
+    filled = fill(folder / "filled", options.seed)
+    common = options.hours, options.rest, filled, command
+    shops = [
+        multiprocessing.Process(target=by_the_clock, args=(folder / f"hours{k}", options.seed + k, *common))
+        for k in range(options.shops)
+    ]
+    try:
+        for shop in shops:
+            shop.start()
+        for shop in shops:
+            shop.join()
+    finally:
+        for shop in shops:
+            shop.terminate()
+
+
+def _provenance(folder: Path, what: str, seed: int) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    what = f"--rapids 0 --hours {hours:g} --rest {rest_s:g}" if hours else f"--rapids {rounds * RAPIDS} --hours 0"
     run = pages.provenance(f"python -m studies.soak {what}") | {"seeds": str(seed)}
     (folder / "run.json").write_text(json.dumps(run), "utf-8")
-    shop = Shop(folder, document_of(folder, PERIOD_S, lockstep=not hours), not hours)
-    began_s, restarting_s = time.monotonic(), RESTARTING * hours * 3600
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # all that was started is ended
+
+
+@contextmanager
+def _open(shop: Shop) -> Iterator[None]:
+    """Keep a shop open for the time of a with block; a termination ends all that was started."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     try:
         shop.open()
-        life = Life(shop, folder / "samples.jsonl", seed)
-        while time.monotonic() - began_s < 3600 * hours if hours else life.rounds < rounds:
-            early = time.monotonic() - began_s < restarting_s if hours else life.rounds < RESTARTING * rounds
-            life.round({**EVENTS, **RESTARTS} if early else EVENTS)
-            time.sleep(rest_s)
+        yield
     finally:
         shop.close()
 
@@ -93,7 +150,7 @@ def figures_of(folder: Path, per_day: bool) -> dict[str, Any]:
     return {
         "run": json.loads((folder / "run.json").read_text("utf-8")),
         "rounds": last["round"],
-        "rapids": last["round"] * RAPIDS,
+        "rapids": last["round"] * (BY_CLOCK if per_day else RAPIDS),
         "hours": last["at_s"] / 3600,
         "processes": processes,
         "store_mb": {name: [samples[0]["store_mb"][name], last["store_mb"][name]] for name in last["store_mb"]},
@@ -157,13 +214,13 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="fdhil-soak-") as temporary:
         folder = options.folder or Path(temporary)
         if options.rapids:
-            work(folder / "week", options.seed, -(-options.rapids // RAPIDS), 0.0, 0.0)
+            at_speed_up(folder / "week", options.seed, -(-options.rapids // RAPIDS))
         if options.hours:
-            work(folder / "hours", options.seed, 0, options.hours, options.rest)
-        week = figures_of(folder / "week", per_day=False) or before.get("week", {})
-        newest = figures_of(folder / "hours", per_day=True)
-        hours = [*before.get("hours", []), *([newest] if newest else [])]
-    return {"week": week, "hours": hours, "goals": {"R13": goal(week, hours)}}
+            real(folder, options)
+        worked = figures_of(folder / "week", per_day=False) or before.get("week", {})
+        newest = [figures_of(shop, per_day=True) for shop in sorted(folder.glob("hours*"))]
+        by_clock = [*before.get("hours", []), *filter(None, newest)]
+    return {"week": worked, "hours": by_clock, "goals": {"R13": goal(worked, by_clock)}}
 
 
 # -- the page
@@ -180,10 +237,10 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
     )
     lines += pages.paragraph(
         f"""The daemon, the guard, the pages, a publisher and the simulated machine of two axes (SYNC every
-        {PERIOD_S * 1e3:g} ms) run as processes. After each round of {RAPIDS} rapids it is noted what each
-        of them uses. In the first {RESTARTING:.0%} of a run daemon and guard are restarted and killed; growth is that
-        of the process that lived longest, in the second half of its life, as a straight line with its 95 %
-        interval. The store is a disk of {STORE_MB} MB in memory, so that it can be full, and keeps {KEPT_WINDOWS}
+        {PERIOD_S * 1e3:g} ms) run as processes. After each round of rapids, and every {NOTE_S:.0f} s of a rest, it is
+        noted what each of them uses. In the first {RESTARTING:.0%} of a run daemon and guard are restarted and killed;
+        growth is that of the process that lived longest, in the second half of its life, as a straight line with its
+        95 % interval. The store is a disk of {STORE_MB} MB in memory, so that it can be full, and keeps {KEPT_WINDOWS}
         recordings instead of 10,000, so that it is full early."""
     )
     if figures["week"]:
@@ -191,9 +248,11 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
     if figures["hours"]:
         lines += ["## Real hours", ""]
         lines += pages.paragraph(
-            """A session of some hours tells a growth per day to some 10 MB, no better: what grows with each rapid is
-            seen in the week, what grows by the clock alone is seen here. The pages read the newest 2,000 rapids of each
-            axis: what they use follows the history until it has as many, and no further."""
+            f"""What grows with each rapid is seen in the week, what grows by the clock alone is seen here: a round of
+            {BY_CLOCK} rapids, then a rest, about as many as a machine makes in a day. Some hours tell a growth per day
+            no better than the intervals say, so the goal here is that nothing grows for certain. The pages hold the
+            newest {SEEN:,} rapids of each axis, and the store of these shops has had as many at speed-up before. Each
+            run is a shop with processes of its own; those of one command worked at the same time."""
         )
     for k, run in enumerate(figures["hours"], 1):
         lines += [f"### Run {k}", "", *_hours_words(run), *_tables(run, "a day")]
@@ -257,7 +316,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rapids", type=int, default=7 * A_DAY, help="of both axes together, at speed-up; 0: none")
     parser.add_argument("--hours", type=float, default=REAL_H, help="by the clock; 0: none")
-    parser.add_argument("--rest", type=float, default=20.0, help="seconds between two rounds by the clock")
+    parser.add_argument("--rest", type=float, default=230.0, help="seconds between two rounds by the clock")
+    parser.add_argument("--shops", type=int, default=1, help="that work by the clock at the same time")
     parser.add_argument("--add", action="store_true", help="to the figures that are there")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--folder", type=Path, help="where samples, logs and sockets are kept; left out: nowhere")

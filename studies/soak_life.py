@@ -26,7 +26,8 @@ from studies.soak_shop import Shop
 from studies.usage import size_mb, used
 
 RAPIDS = 40  # in a round, of both axes together
-ROUND = "G21 G17 G90 G94\n" + "G0 X160 Y160\nG4 P0.2\nG0 X0 Y0\nG4 P0.2\n" * (RAPIDS // 4) + "M2\n"
+THERE_AND_BACK = "G0 X160 Y160\nG4 P0.2\nG0 X0 Y0\nG4 P0.2\n"  # four rapids
+NOTE_S = 30.0  # between two notes in a rest
 CORNER = "G21 G90 G94\nG4 P0.3\nG1 X60 F8000\nG1 Y40\nG4 P0.2\nG1 X0 Y0\nG4 P0.2\nM2\n"
 FLOOD = 50_000  # emergencies at a time
 SETTLED_LOOKS = 3
@@ -40,6 +41,7 @@ class Life:
     shop: Shop
     samples: Path
     seed: int
+    rapids: int = RAPIDS
     began_s: float = field(default_factory=time.monotonic)
     rounds: int = 0
     happened: Counter[str] = field(default_factory=Counter)
@@ -49,7 +51,8 @@ class Life:
 
     def __post_init__(self) -> None:
         self.rng = random.Random(self.seed)
-        for name, text in (("round.ngc", ROUND), ("corner.ngc", CORNER)):
+        round_ = "G21 G17 G90 G94\n" + THERE_AND_BACK * (self.rapids // 4) + "M2\n"
+        for name, text in (("round.ngc", round_), ("corner.ngc", CORNER)):
             (self.shop.folder / name).write_text(text, "utf-8")
 
     def round(self, events: Mapping[str, Event]) -> None:
@@ -70,6 +73,18 @@ class Life:
             if name not in during:
                 self.happen(name, events[name])
         self.note()
+
+    @property
+    def at_s(self) -> float:
+        """How long it has gone on."""
+        return time.monotonic() - self.began_s
+
+    def rest(self, seconds: float) -> None:
+        """Let nothing happen for so long, and note now and then what everybody uses."""
+        until_s = self.at_s + seconds
+        while (left_s := until_s - self.at_s) > 0:
+            time.sleep(min(left_s, NOTE_S))
+            self.note()
 
     def happen(self, name: str, event: Event) -> None:
         """Let one thing happen; what it asked for and did not get is counted."""
@@ -103,7 +118,7 @@ class Life:
                 continue
         axes = status.get("axes", {})
         told = {
-            "at_s": time.monotonic() - self.began_s,
+            "at_s": self.at_s,
             "round": self.rounds,
             "rapids": {name: [axis["accepted"], axis["refused"]] for name, axis in axes.items()},
             "frames": status.get("frames", {}),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -60,11 +61,14 @@ def document_of(folder: Path, period_s: float, lockstep: bool) -> dict[str, Any]
 
 @dataclass
 class Shop:
-    """All processes of one machine below ``folder``. ``restarts`` counts who ended by itself and was started again."""
+    """All processes of one machine below ``folder``, whose store begins as ``filled`` is.
+
+    ``restarts`` counts who ended by itself and was started again.
+    """
 
     folder: Path
     document: dict[str, Any]
-    lockstep: bool
+    filled: Path | None = None
     config: MachineConfig = field(init=False)
     twin: Twin = field(init=False)
     processes: dict[str, Process] = field(default_factory=dict)
@@ -98,7 +102,10 @@ class Shop:
         for path in (self.folder / "store", self.logs):
             path.mkdir(parents=True, exist_ok=True)
         self._mount()
-        self.store.mkdir(parents=True, exist_ok=True)
+        if self.filled is None:
+            self.store.mkdir(parents=True, exist_ok=True)
+        else:
+            shutil.copytree(self.filled, self.store)
         self.start_twin()
         for axis in self.config.axis:
             save_record(commission(self.config, axis), self.store, self.config.store.commissioning_key)
