@@ -48,9 +48,12 @@ def corrected_bus(machine: MachineConfig, source: str) -> str:
 
 
 def settings_of(machine: MachineConfig, bus: str, run_directory: Path, token_sha256: str) -> Settings:
-    """Return what the guard needs of the config and the drives' profiles; ConfigError when a profile cannot do it."""
+    """Return what the guard needs of the config and the drives' profiles.
+
+    ConfigError when a profile cannot do it, or when a drive that is not corrected has a COB-ID of the guard's.
+    """
     axes = [_axis(machine, name, axis) for name, axis in machine.axis.items() if axis.correction is not None]
-    return Settings(
+    settings = Settings(
         bus=bus,
         transport="can_raw" if machine.bus[bus].interface == "socketcan" else "socketcand",
         sync_period_s=machine.machine.sync_period_s,
@@ -63,6 +66,24 @@ def settings_of(machine: MachineConfig, bus: str, run_directory: Path, token_sha
         daemon_uid=_user_id(machine.guard.daemon_user),
         watching=tuple(_known_ids((*machine.access.watch, *machine.access.operate))),
     )
+    for key, cob_id in _taken_ids(machine, bus):
+        if cob_id in settings.sent_ids:
+            text = f"COB-ID {cob_id:03X} is the guard's, which sends offsets to a corrected axis with it"
+            raise ConfigError("config", [ConfigFault(key, text, "give one of them another COB-ID")])
+    return settings
+
+
+def _taken_ids(machine: MachineConfig, bus: str) -> Iterator[tuple[str, int]]:
+    """Yield the COB-IDs of the drives on a bus that are not corrected, and of the encoders at the tables."""
+    for name, axis in machine.axis.items():
+        if axis.drive.bus != bus:
+            continue
+        if axis.correction is None:
+            profile = load_profile(axis.drive)
+            for spec in (*profile.rpdos, *profile.tpdos):
+                yield f"axis.{name}.drive.profile", spec.cob_base + machine.node_id(name)
+        if axis.table is not None and axis.table.cob_id is not None:
+            yield f"axis.{name}.table.cob_id", axis.table.cob_id
 
 
 def _user_id(name: str | None) -> int | None:

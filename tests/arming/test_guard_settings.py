@@ -5,11 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from fdhil import config as machine_config
 from fdhil.arming.guard_settings import heartbeat_timeout_s, limits_of, settings_of
 from fdhil.commissioning.record import CommissioningRecord, axis_digest, save_record
 from fdhil.commissioning.void import void_record
-from fdhil.config import CorrectionLimits
+from fdhil.config import CorrectionLimits, Drive, TableEncoder
+from fdhil.drivers.cia402.profile import DriveProfile
+from fdhil.drivers.cia402.profile_file import load_profile
+from fdhil.errors import ConfigError
 from fdhil.guard.limits import OffsetLimits
 from fdhil.guard.settings import from_json, to_json
 from tests.guard.peer import write_config
@@ -70,3 +75,32 @@ def test_the_guard_knows_the_record_and_whether_it_holds(tmp_path: Path) -> None
     assert known() == [(signed.fingerprint, True), ("", False)]
     made = settings_of(config, "can0", tmp_path, "")
     assert from_json(to_json(made)) == made
+
+
+def test_what_the_guard_sends_is_nobody_elses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An offset that another drive takes for its set-point would move an axis that nobody corrects."""
+    config = machine_config.load(write_config(tmp_path, 1))
+    drives = {"X": config.axis["X"], "Y": config.axis["Y"].model_copy(update={"correction": None})}
+    (sent,) = (
+        axis.offset.cob_id
+        for axis in settings_of(config.model_copy(update={"axis": drives}), "can0", tmp_path, "").axes
+    )
+
+    encoder = TableEncoder(source="canopen", cob_id=sent)
+    with_encoder = drives | {"Y": drives["Y"].model_copy(update={"table": encoder})}
+    with pytest.raises(ConfigError, match=rf"axis.Y.table.cob_id: COB-ID {sent:03X} is the guard's"):
+        settings_of(config.model_copy(update={"axis": with_encoder}), "can0", tmp_path, "")
+
+    def other(drive: Drive) -> DriveProfile:
+        """A drive with node-ID 2 that takes its set-points from the next PDO of node-ID 1."""
+        profile = load_profile(drive)
+        if drive != drives["Y"].drive:
+            return profile
+        first, *more = profile.rpdos
+        return replace(profile, rpdos=(replace(first, cob_base=sent - 2), *more))
+
+    elsewhere = drives["Y"].drive.model_copy(update={"node_id": 2})
+    drives["Y"] = drives["Y"].model_copy(update={"drive": elsewhere})
+    monkeypatch.setattr("fdhil.arming.guard_settings.load_profile", other)
+    with pytest.raises(ConfigError, match=r"axis.Y.drive.profile: COB-ID"):
+        settings_of(config.model_copy(update={"axis": drives}), "can0", tmp_path, "")

@@ -37,11 +37,13 @@ async def recorded(bench: Bench, program: Path) -> tuple[list[Any], dict[str, in
     async with open_machine(bench.config) as source:
         bench.command('{"command": "nc", "on": true}')
         await asyncio.to_thread(bench.event, "nc")
-        bench.command(json.dumps({"command": "play", "file": str(program)}))
-        finished = asyncio.create_task(asyncio.to_thread(bench.event, "finished"))
         running = asyncio.create_task(source.run(records.append))
         async with asyncio.timeout(4 * PATIENCE_S):
-            await finished
+            # a sensor that is first asked when a rapid has begun has no voltage of its beginning
+            while not all(n for name, n in source.counters().items() if name.endswith(".samples")):
+                await asyncio.sleep(0.02)
+            bench.command(json.dumps({"command": "play", "file": str(program)}))
+            await asyncio.to_thread(bench.event, "finished")
             while not all(settled(records, axis, rapids) for axis in bench.config.axis):  # noqa: ASYNC110 - no event
                 await asyncio.sleep(0.02)
         running.cancel()

@@ -85,7 +85,7 @@ def test_a_correction_works_beside_it(bench: Bench, tmp_path: Path) -> None:
                             offsets.append(struct.unpack("<i", frame.data)[0])
             said, err = play.communicate()
         assert play.returncode == 0, said + err
-        assert max(offsets) == 100
+        assert max(offsets) == 100, guard.status()
         assert offsets[-1] == 0
         assert guard.status()["state"] == "OFF"
         # what play wrote to the drives and gave back does not void their records
