@@ -89,7 +89,7 @@ def _history(machine: MachineConfig, axis: str) -> Iterator[tuple[Known | None, 
 
     with ExitStack() as open_:
         try:
-            open_.enter_context(sole_owner(machine.run_directory))
+            open_.enter_context(sole_owner(machine.run_directory, machine.store.directory))
         except BusLocked:
             yield None, lambda _outcomes: None
             return

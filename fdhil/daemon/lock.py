@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from fdhil.errors import DeviceError
@@ -19,24 +18,44 @@ class BusLocked(DeviceError):
 
 
 @contextmanager
-def sole_owner(run_directory: Path) -> Iterator[None]:
-    """Hold the lock of a run directory (made with mode 0700 where it is missing). BusLocked when another holds it."""
-    try:
-        run_directory.mkdir(parents=True, exist_ok=True, mode=0o700)
-        descriptor = os.open(run_directory / LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-    except OSError as error:
-        text = f"cannot be used: {error.strerror}; check [store] run_directory and its rights"
-        raise DeviceError(str(run_directory), text) from None
-    try:
+def sole_owner(run_directory: Path, store_directory: Path) -> Iterator[None]:
+    """Hold the locks of a run directory (made with mode 0700 where it is missing) and of a store.
+
+    BusLocked when another holds one of them. The store has a lock of its own: who removes the run directory of a
+    daemon has not ended it. A store that is not there or cannot be read is told of by who opens it.
+    """
+    with ExitStack() as held:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+            run_directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+            descriptor = os.open(
+                run_directory / LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600
+            )
+            held.callback(os.close, descriptor)
+            free = _locked(descriptor)
+        except OSError as error:
+            text = f"cannot be used: {error.strerror}; check [store] run_directory and its rights"
+            raise DeviceError(str(run_directory), text) from None
+        if not free:
             owner = os.pread(descriptor, 32, 0).decode("ascii", "replace").strip() or "unknown"
             text = f"BusLocked: a daemon already serves it (process {owner}); stop that one first, nothing was sent"
-            raise BusLocked(str(run_directory), text) from None
-        with contextlib.suppress(OSError):  # it is only told to another one; the lock holds without it
+            raise BusLocked(str(run_directory), text)
+        with suppress(OSError):
+            store_directory.mkdir(parents=True, exist_ok=True)
+            store = os.open(store_directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            held.callback(os.close, store)
+            if not _locked(store):
+                text = "BusLocked: another daemon writes to this store; stop that one first, nothing was sent"
+                raise BusLocked(str(store_directory), text)
+        with suppress(OSError):  # it is only told to another one; the lock holds without it
             os.ftruncate(descriptor, 0)
             os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
         yield
-    finally:
-        os.close(descriptor)
+
+
+def _locked(descriptor: int) -> bool:
+    """Lock an open file or folder for this process; False where another has locked it."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True

@@ -96,7 +96,7 @@ class Service:
     async def run(self) -> Standing:
         """Serve until a signal asks to stop; return what may still be applied. BusLocked when another one serves it."""
         loop = asyncio.get_running_loop()
-        with sole_owner(self._run_directory):
+        with sole_owner(self._run_directory, self._config.store.directory):
             stopping = [number for number in STOPPING if signal.getsignal(number) is not signal.SIG_IGN]  # as by nohup
             for number in stopping:
                 loop.add_signal_handler(number, self._stop.set)

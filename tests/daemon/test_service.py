@@ -125,6 +125,9 @@ async def test_a_second_daemon_of_one_machine_is_refused(tmp_path: Path) -> None
     async with serving(config, Machine()):
         with pytest.raises(BusLocked, match=f"process {os.getpid()}"):
             await Service(config, Machine().open).run()
+        config.run_directory.joinpath("daemon.lock").unlink()  # somebody cleans up
+        with pytest.raises(BusLocked, match="another daemon writes to this store"):
+            await Service(config, Machine().open).run()
 
 
 @pytest.mark.fault("F12", "A21")

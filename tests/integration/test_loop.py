@@ -40,7 +40,7 @@ async def recorded(bench: Bench, program: Path) -> tuple[list[Any], dict[str, in
         running = asyncio.create_task(source.run(records.append))
         async with asyncio.timeout(4 * PATIENCE_S):
             # a sensor that is first asked when a rapid has begun has no voltage of its beginning
-            while not all(n for name, n in source.counters().items() if name.endswith(".samples")):
+            while not all(n for name, n in source.counters().items() if name.endswith(".samples")):  # noqa: ASYNC110 - no event
                 await asyncio.sleep(0.02)
             bench.command(json.dumps({"command": "play", "file": str(program)}))
             await asyncio.to_thread(bench.event, "finished")
