@@ -19,7 +19,7 @@ from fdhil.config import MachineConfig
 from fdhil.errors import DeviceError
 
 LOCKSTEP_WAIT_S = 8.0
-GUARD_WAIT_S = 0.5
+GUARD_WAIT_S = 2.0
 MOST_CYCLE_US = 20_000
 STALL_CYCLES = 20
 
