@@ -224,17 +224,29 @@ def test_a_flood_of_one_class_holds_no_other_back_and_is_counted() -> None:
 
 @pytest.mark.fault("F8")
 def test_the_lock_is_free_again_when_its_owner_is_gone(tmp_path: Path) -> None:
+    run, store = tmp_path / "run", tmp_path / "store"
     for _ in range(2):
-        with sole_owner(tmp_path / "run"):
-            with pytest.raises(BusLocked, match="nothing was sent") as error, sole_owner(tmp_path / "run"):
-                pass
-            assert error.value.exit_code == 3
+        with sole_owner(run, store):
+            for other_run, other_store in ((run, tmp_path / "other"), (tmp_path / "elsewhere", store)):
+                with (
+                    pytest.raises(BusLocked, match="nothing was sent") as error,
+                    sole_owner(other_run, other_store),
+                ):
+                    pass
+                assert error.value.exit_code == 3
     assert (tmp_path / "run").stat().st_mode & 0o777 == 0o700
 
 
 def test_a_run_directory_that_cannot_be_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(DeviceError, match="run_directory"), sole_owner(tmp_path / "file" / "run"):
+    with pytest.raises(DeviceError, match="run_directory"), sole_owner(tmp_path / "file" / "run", tmp_path):
+        pass
+
+
+def test_a_store_that_cannot_be_does_not_end_the_daemon(tmp_path: Path) -> None:
+    """It records nothing then, which the store itself tells; the machine is watched all the same."""
+    (tmp_path / "file").write_text("")
+    with sole_owner(tmp_path / "run", tmp_path / "file"):
         pass
 
 
