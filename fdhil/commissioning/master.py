@@ -234,15 +234,16 @@ class Master:
             self.target = self.heard.objects[self.profile.position]
 
     def average(self, key: tuple[int, int], cycles: int) -> float:
-        """Return the mean of a mapped object over so many cycles."""
-        values, end = [], self.cycle + cycles
-        seen = self.heard.cycle.get(key, 0)
-        while self.cycle < end:
-            self.check()
-            time.sleep(self.period_s / 2)
+        """Return the mean of a mapped object over so many cycles; a computer that sleeps sees fewer of them."""
+        values, seen, end = [], self.heard.cycle.get(key, 0), self.cycle + cycles
+        over = False
+        while not over:
+            over = self.cycle >= end  # asked before the look, which sees what came in the last of them
             if self.heard.cycle.get(key, 0) > seen:
                 seen = self.heard.cycle[key]
                 values.append(self.heard.objects[key])
+            self.check()
+            time.sleep(self.period_s / 2)
         if not values:
             raise DeviceTimeout(self.device, f"0x{key[0]:04X} does not come any more; check its TPDO")
         return sum(values) / len(values)

@@ -331,6 +331,26 @@ def test_what_was_read_before_the_ramp_is_no_missing_feedforward(peer: tuple[Dri
         assert feedforward_test(master) is None
 
 
+def test_a_mean_over_cycles_that_this_computer_slept_through_is_of_what_came(
+    peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, settings = peer
+    with Master(settings, "X") as master:
+        prepare(master)
+        position = master.profile.position
+        master.wait(lambda: position in master.heard.objects, 5.0, "no position comes")
+
+        def slept(asked: Master) -> int:
+            """Return the cycle, and let twenty go by with the first that is asked for."""
+            monkeypatch.undo()
+            now = asked.cycle
+            asked.wait_cycles(20)
+            return now
+
+        monkeypatch.setattr(Master, "cycle", property(slept))
+        assert master.average(position, 10) == pytest.approx(master.heard.objects[position], abs=2.0)
+
+
 def test_full_heartbeat_consumers_are_refused(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
     for sub in (1, 2, 3, 4):
