@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 import struct
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -31,23 +33,40 @@ def settled(records: list[Any], axis: str, rapids: int, rows: int = SETTLED_ROWS
 
 
 async def recorded(bench: Bench, program: Path) -> tuple[list[Any], dict[str, int]]:
-    """Let the NC play a program, and return all records that the drivers made of it with their counters."""
+    """Let the NC play a program, and return all records that the drivers made of it with their counters.
+
+    A machine in real time does not wait for a host that is held up: what lost frames, or a sensor's samples,
+    is recorded again, twice.
+    """
+    for _ in range(3 if bench.config.sim.pace == "realtime" else 1):
+        records, counters = await _recorded(bench, program)
+        if not any(n for name, n in counters.items() if name.rpartition(".")[2] == "lost"):
+            break
+    return records, counters
+
+
+async def _recorded(bench: Bench, program: Path) -> tuple[list[Any], dict[str, int]]:
     records: list[Any] = []
     rapids = program.read_text().count("G0 ")
     async with open_machine(bench.config) as source:
         bench.command('{"command": "nc", "on": true}')
         await asyncio.to_thread(bench.event, "nc")
         running = asyncio.create_task(source.run(records.append))
+
+        async def until(condition: Callable[[], bool]) -> None:
+            """Wait while the source runs and has lost nothing: after that, moves are not counted on."""
+            while not (running.done() or source.counters()["lost"] or condition()):  # noqa: ASYNC110 - no event
+                await asyncio.sleep(0.02)
+
         async with asyncio.timeout(4 * PATIENCE_S):
             # a sensor that is first asked when a rapid has begun has no voltage of its beginning
-            while not all(n for name, n in source.counters().items() if name.endswith(".samples")):  # noqa: ASYNC110 - no event
-                await asyncio.sleep(0.02)
+            await until(lambda: all(n for name, n in source.counters().items() if name.endswith(".samples")))
             bench.command(json.dumps({"command": "play", "file": str(program)}))
             await asyncio.to_thread(bench.event, "finished")
-            while not all(settled(records, axis, rapids) for axis in bench.config.axis):  # noqa: ASYNC110 - no event
-                await asyncio.sleep(0.02)
+            await until(lambda: all(settled(records, axis, rapids) for axis in bench.config.axis))
         running.cancel()
-        await asyncio.gather(running, return_exceptions=True)
+        with suppress(asyncio.CancelledError):
+            await running
         return records, source.counters()
 
 
