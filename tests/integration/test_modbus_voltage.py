@@ -27,7 +27,7 @@ def transport(request: pytest.FixtureRequest) -> str:
 @pytest.fixture
 def sections() -> dict[str, Any]:
     """A sensor answers in wall time, so the machine runs in it too."""
-    return {"sim": {"pace": "realtime", "modbus": True}}
+    return {"machine": {"name": "bench", "sync_period_s": 0.002}, "sim": {"pace": "realtime", "modbus": True}}
 
 
 @pytest.fixture
