@@ -4,7 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 KERNELS := $(shell grep -rlE --include='*.py' 'njit|^@(compiled|inlined)' fdhil)
 # the tests marked socketcan stand in these folders; the machine in which they run has little memory for others
-VCAN   := bash tests/integration/vcan-vm.sh -t 900 -M 2048
+VCAN   := bash tests/integration/vcan-vm.sh -t 1800 -M 2048
 
 # tests against LinuxCNC stand in these folders; of it a computer runs one at a time
 LINUXCNC := tests/linuxcnc tests/program

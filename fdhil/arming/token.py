@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import secrets
 import stat
+from contextlib import suppress
 from pathlib import Path
 
 from fdhil.errors import ConnectError, DeviceError
@@ -32,12 +33,22 @@ def given_credential(name: str) -> Path | None:
 
 
 def make_directory(run_directory: Path) -> None:
-    """Make a run directory (mode 0700) where there is none; DeviceError when that fails."""
+    """Make a run directory (mode 0700) where there is none; DeviceError when that fails, or anybody may write there."""
     try:
         run_directory.mkdir(parents=True, exist_ok=True, mode=0o700)
     except OSError as error:
         text = f"cannot be made ({error.strerror}), and nothing is sent; check run_directory and its rights"
         raise DeviceError(str(run_directory), text) from None
+    check_rights(run_directory)
+
+
+def check_rights(run_directory: Path) -> None:
+    """Raise DeviceError when anybody may write in a run directory: commands would reach whoever put a socket there."""
+    with suppress(FileNotFoundError):
+        mode = stat.S_IMODE(run_directory.stat().st_mode)
+        if mode & 0o002:
+            text = f"RunDirectoryOpen: it has mode {mode:04o}, anybody may put a socket of his own there; chmod 0700 it"
+            raise DeviceError(str(run_directory), text)
 
 
 def ensure_token(run_directory: Path) -> str:

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from fdhil.arming.token import ensure_token, read_token
+from fdhil.arming.token import ensure_token, make_directory, operator_token, read_token
 from fdhil.config import Access
 from fdhil.daemon import journal
 from fdhil.daemon.control import MAX_CLIENTS, ControlServer, ask
@@ -258,6 +258,14 @@ def test_the_token_is_made_once_and_only_for_its_owner(tmp_path: Path) -> None:
     (tmp_path / "token").chmod(0o644)
     with pytest.raises(DeviceError, match="others can read it"):
         read_token(tmp_path)
+
+
+def test_no_guard_serves_a_folder_in_which_anybody_may_put_a_socket(tmp_path: Path) -> None:
+    operator_token(tmp_path / "run")
+    (tmp_path / "run").chmod(0o777)
+    for use in (operator_token, make_directory):
+        with pytest.raises(DeviceError, match=r"anybody may put a socket .* chmod 0700"):
+            use(tmp_path / "run")
 
 
 def test_an_empty_or_linked_token_is_refused(tmp_path: Path) -> None:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
-import stat
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
-from fdhil.arming.token import TOKEN_NAME, read_token
+from fdhil.arming.token import TOKEN_NAME, check_rights, read_token
 from fdhil.cli.doctor.trouble import Trouble
 from fdhil.commissioning.record import load_record
 from fdhil.commissioning.void import is_void
@@ -84,11 +82,13 @@ def _run_directory(folder: Path) -> Iterator[Trouble]:
         what = f"{path} is too long a name for a socket ({len(path)} letters, {LONGEST_SOCKET_PATH} are possible)"
         mend = "give [store] run_directory a shorter one, such as /run/fdhil"
         yield Trouble("SocketPathLong", "sockets", what, "neither daemon nor guard can be asked", mend)
-    with suppress(OSError):
-        mode = stat.S_IMODE(folder.stat().st_mode)
-        if mode & 0o002:
-            what = f"{folder} has mode {mode:04o}: anybody may put a socket of his own there"
-            yield Trouble("RunDirectoryOpen", "sockets", what, "commands may reach another than fdhil", "chmod 0700 it")
+    try:
+        check_rights(folder)
+    except DeviceError as error:
+        what, _, mend = str(error).partition("; ")
+        yield Trouble("RunDirectoryOpen", "sockets", what, "commands may reach another than fdhil", mend)
+    except OSError:
+        pass  # it cannot be looked at: who wants to use it tells why
 
 
 def _record(config: MachineConfig, axis: str) -> Iterator[Trouble]:
