@@ -11,6 +11,7 @@ import uuid
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cache
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from fdhil.daemon.journal import printable
@@ -58,6 +59,7 @@ TYPES: Mapping[str, tuple[str, str]] = {
 IN_PERCENT = {"nc_feed_override", "nc_rapid_override"}
 
 
+@cache
 def key_of(name: str, axis: str = "", bus: str = "") -> str:
     """Return the id of a data item: of letters, digits and underscores."""
     return re.sub(r"\W", "_", "_".join(filter(None, (axis or bus or "machine", name))), flags=re.ASCII)
