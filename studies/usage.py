@@ -30,6 +30,8 @@ class Used:
 def used(pid: int) -> Used:
     """Return what a process uses now; OSError when it is gone."""
     told = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text("utf-8").splitlines())
+    if "VmRSS" not in told:  # it has ended, and nobody has waited for it yet
+        raise ProcessLookupError(pid)
     resident, anonymous = (int(told[name].split()[0]) / 1024 for name in ("VmRSS", "RssAnon"))
     states = children(pid)
     return Used(

@@ -253,6 +253,30 @@ def test_a_heartbeat_that_comes_and_goes_is_one_outage() -> None:
     assert [n.severity for n in told] == ["info"]
 
 
+def test_a_boot_after_the_first_heartbeats_is_the_same_outage() -> None:
+    """A supply that comes back by turns: the daemon once ended at the boot-up."""
+    watch = NodeWatch("X", 1)
+    watch.feed(frames_of(beats([0, 100, 200, 300])), 300 * MS)
+    told = watch.feed(frames_of([]), 2000 * MS)
+    told += watch.feed(frames_of(beats([2100, 2200])), 2200 * MS)
+    told += watch.feed(frames_of(beats([2300], 0)), 2300 * MS)
+    told += [n for t in range(2400, 6000, 100) for n in watch.feed(frames_of(beats([t])), t * MS)]
+    assert [(n.code, n.severity) for n in told] == [
+        ("HeartbeatLost", "MAJOR"), ("NodeRebooted", "MAJOR"), ("HeartbeatLost", "info")
+    ]  # fmt: skip
+
+
+@given(st.lists(st.tuples(st.integers(0, 3000), st.sampled_from([0, 4, 5, 0x7F, 0x85, 0x33])), max_size=60))
+def test_whatever_a_node_says_of_itself_an_outage_has_one_beginning_and_one_end(said: list[tuple[int, int]]) -> None:
+    watch, t, told = NodeWatch("X", 1), 0, []
+    for later, state in said:
+        t += later
+        told += watch.feed(frames_of([]), t * MS)
+        told += watch.feed(frames_of(beats([t], state)), t * MS)
+    lost = [n.severity for n in told if n.code == "HeartbeatLost"]
+    assert lost == ["MAJOR", "info"] * (len(lost) // 2) + ["MAJOR"] * (len(lost) % 2)
+
+
 def test_what_each_node_sends_is_counted() -> None:
     decoder = BusDecoder("can0", machine())
     decoder.feed(frames_of(beats([0, 100])), 100 * MS)

@@ -111,7 +111,7 @@ class NodeWatch:
         notices = []
         if state == Nmt.BOOT_UP:
             self.boots += 1
-            self._beats = []
+            self._beats, self._back_since_ns = [], None  # an outage that seemed to end begins anew
             text = "booted, its offset and set-up are unknown; check its supply and commission it again."
             notices.append(self._notice("NodeRebooted", "MAJOR", text))
         elif self.nmt is Nmt.OPERATIONAL and state != Nmt.OPERATIONAL:
