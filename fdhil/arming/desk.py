@@ -72,7 +72,7 @@ class ArmingDesk:
         self._given_up = False
         self._disarms: int | None = None
         self._disarming: asyncio.Future[Answer] | None = None
-        self.guard = GuardLink(config.guard.run_directory or run_directory)
+        self.guard = GuardLink(config.guard.run_directory or run_directory, config.store.directory)
 
     def begin(self, newest: Mapping[str, Revision], skills: Sequence[Skill]) -> None:
         """Start from what the history knows; the token is made where there is none. DeviceError when it cannot be."""

@@ -14,6 +14,7 @@ from fdhil.arming.checked_program import Piece
 from fdhil.arming.guard_client import GuardClient
 from fdhil.arming.preparing import Armament, Feeding
 from fdhil.arming.standing import ABSENT, GONE, START_AND_ADOPT, Standing, landed, lost, standing
+from fdhil.arming.standing_mark import StandingMark
 from fdhil.errors import DeviceError
 from fdhil.guard.protocol import AT_REST, CHARGED
 from fdhil.records import Notice
@@ -29,14 +30,17 @@ VOIDING = {RECORD_VOID, "NodeRebooted"}
 class GuardLink:
     """At most one connection, safe from several threads.
 
-    ``state`` is the guard's; without one ``absent`` when nothing can be applied, ``lost`` when something may.
+    ``state`` is the guard's; without one ``absent`` when nothing can be applied, ``lost`` when something may: also by
+    what a daemon before this one left in the store.
     """
 
-    def __init__(self, run_directory: Path) -> None:
+    def __init__(self, run_directory: Path, store_directory: Path) -> None:
         self._run_directory = run_directory
         self._lock = threading.Lock()
         self._client: GuardClient | None = None
-        self._status: Mapping[str, Any] = ABSENT
+        self._mark = StandingMark(store_directory)
+        self._status: Mapping[str, Any] = self._mark.left or ABSENT
+        self._missed = self._mark.left is None
         self._heard_s: float | None = None
         self._untold: list[Notice] = []
 
@@ -95,15 +99,27 @@ class GuardLink:
             try:
                 if self._client is None:
                     self._client = GuardClient(self._run_directory)
+                if arming:
+                    self._mark.keep(standing(lost(before, arming)))
                 yield self._client
                 self._status, self._heard_s = self._client.status(), time.monotonic()
+                self._keep()
                 self._untold += _changes(before, self._status)
             except DeviceError as error:
                 reached = self._client is not None
                 self._drop()
                 self._status = lost(before, arming and reached)
-                self._untold += _gone(before, self._status, error)
+                if not self._missed or before["state"] not in GONE or self._status["state"] != before["state"]:
+                    self._untold.append(_gone(before, self._status, error))
+                self._missed = True
                 raise
+
+    def _keep(self) -> None:
+        stands = standing(self._status)
+        if stands.nothing:
+            self._mark.remove()
+        elif stands.known:
+            self._mark.keep(stands)
 
     def _drop(self) -> None:
         if self._client is not None:
@@ -189,15 +205,14 @@ class GuardLink:
             self._drop()
 
 
-def _gone(before: Mapping[str, Any], now: Mapping[str, Any], error: DeviceError) -> list[Notice]:
-    """Say once that the guard is gone, and what it may have left."""
-    if before["state"] in GONE and now["state"] == before["state"]:
-        return []
+def _gone(before: Mapping[str, Any], now: Mapping[str, Any], error: DeviceError) -> Notice:
+    """Say that the guard is gone, and what it may have left."""
     stands = standing(now)
-    text = f"{error}; it was in state {before['state']}; {stands}"
+    was = "" if before["state"] in GONE else f"it was in state {before['state']}; "
+    text = f"{error}; {was}{stands}"
     if stands.nothing:
-        return [Notice("GuardLost", "minor", text)]
-    return [Notice("GuardLost", "MAJOR", f"{text}; {START_AND_ADOPT}")]
+        return Notice("GuardLost", "minor", text)
+    return Notice("GuardLost", "MAJOR", f"{text}; {START_AND_ADOPT}")
 
 
 def _severity(state: str, stands: Standing) -> Literal["info", "minor", "MAJOR"]:

@@ -308,7 +308,7 @@ def pass_on(checked: CheckedProgram, end: int, after_um: float = 1.0, *, last: b
 
 def feeder_of(checked: CheckedProgram, mill: Mill, folder: Path) -> tuple[StreamFeeder, GuardLink]:
     """What feeds the mill with these rows, of which it has none yet."""
-    link = GuardLink(folder)
+    link = GuardLink(folder, folder)
     link.look()
     stream = RowStream(checked, "digest", 0.001)
     armed = Armament("long.ngc", stream, Piece(0, {}, {}, False), {}, 29.0)

@@ -55,7 +55,7 @@ class Long:
 
 
 def test_a_trip_that_another_request_saw_is_told_all_the_same(guard: Guard, folder: Path) -> None:
-    link, long = GuardLink(folder), Long()
+    link, long = GuardLink(folder, folder), Long()
     assert [notice.code for notice in link.refresh()] == ["GuardFound"]
     guard.says = lambda _kind: STARVED
     piece = Piece(0, {"X": [0]}, {"X": [0]}, False)
@@ -68,7 +68,7 @@ def test_a_trip_that_another_request_saw_is_told_all_the_same(guard: Guard, fold
 
 def test_a_guard_that_does_not_answer_is_let_go(guard: Guard, folder: Path) -> None:
     """What it may have armed by then ends with the connection: nobody was told that it is armed."""
-    link = GuardLink(folder)
+    link = GuardLink(folder, folder)
     link.refresh()
     assert link._client is not None
     link._client._timeout_s = 0.2

@@ -15,6 +15,7 @@ from fdhil import config as machine_config
 from fdhil.arming import standing
 from fdhil.arming.desk import ArmingDesk
 from fdhil.arming.guard_link import GuardLink
+from fdhil.arming.standing_mark import FILE_NAME, StandingMark
 from fdhil.arming.token import ensure_token, read_token
 from fdhil.config import MachineConfig
 from fdhil.daemon.control import ask
@@ -101,7 +102,7 @@ def test_a_guard_that_dies_in_the_cut_leaves_its_last_word_until_one_that_knows_
     guard: Guard, folder: Path
 ) -> None:
     guard.says = lambda _kind: ACTIVE
-    link = GuardLink(folder)
+    link = GuardLink(folder, folder)
     link.refresh()
     guard.close()
     told = link.refresh()
@@ -125,7 +126,7 @@ def test_a_guard_that_dies_in_the_cut_leaves_its_last_word_until_one_that_knows_
 
 
 def test_a_guard_that_is_lost_while_it_arms_may_have_armed(guard: Guard, folder: Path) -> None:
-    link = GuardLink(folder)
+    link = GuardLink(folder, folder)
     link.refresh()
 
     def dies(kind: str) -> Mapping[str, Any]:
@@ -133,15 +134,61 @@ def test_a_guard_that_is_lost_while_it_arms_may_have_armed(guard: Guard, folder:
             raise ConnectionError
         return OFF
 
-    class Law:
-        laws: Mapping[str, Any] = {}
-        facts: Mapping[str, bool] = {}
-
     guard.says = dies
     with pytest.raises(DeviceError):
         link.feed_forward(Law(), "token", lambda: False, None)  # type: ignore[arg-type]
     assert str(link.standing) == "an unknown offset on axis X, Y may still be applied"
     link.close()
+
+
+class Law:
+    """What is fed forward, as far as handing it over asks."""
+
+    laws: Mapping[str, Any] = {}
+    facts: Mapping[str, bool] = {}
+
+
+@pytest.mark.parametrize("kept", ["", "[1]", '{"X": [], "Y": NaN}', "{" * 100_000])
+def test_the_next_daemon_knows_what_the_one_before_it_left(tmp_path: Path, folder: Path, kept: str) -> None:
+    """Both are killed in the cut, guard and daemon; the next daemon finds no guard, however it reads what was kept."""
+    guard = Guard(folder)
+    guard.says = lambda kind: OFF if kind == "status" else {**OFF, "ok": True}
+    link = GuardLink(folder, tmp_path)
+    link.refresh()
+    assert not (tmp_path / FILE_NAME).exists()
+    guard.says = lambda _kind: {**ACTIVE, "ok": True}
+    assert link.feed_forward(Law(), "token", lambda: False, None)["ok"]  # type: ignore[arg-type]
+    guard.close()
+    link.close()  # as a kill does
+    (folder / "guard.sock").unlink()
+    if kept:
+        (tmp_path / FILE_NAME).write_text(kept)
+    after = GuardLink(folder, tmp_path)
+    assert (after.state, after.standing.nothing) == ("lost", False)
+    told = after.refresh()
+    assert [(n.code, n.severity, "an unknown offset" in n.text) for n in told] == [("GuardLost", "MAJOR", True)]
+    assert "start fdhil-guard, then run fdhil adopt" in told[0].text
+    assert after.refresh() == []
+    assert "an unknown offset" in after.status["text"]
+    found = Guard(folder)
+    found.says = lambda _kind: OFF
+    assert [(n.code, n.severity) for n in after.refresh()] == [("GuardFound", "info")]
+    assert after.standing.nothing
+    found.close()
+    (folder / "guard.sock").unlink()
+    assert [(n.code, n.severity) for n in after.refresh()] == [("GuardLost", "minor")]
+    assert GuardLink(folder, tmp_path).state == "absent"
+
+
+def test_what_a_frozen_guard_holds_is_known_to_the_next_daemon_by_its_size(tmp_path: Path, folder: Path) -> None:
+    guard = Guard(folder)
+    guard.says = lambda _kind: {**FROZEN, "feedforward": {"state": "ON", "applied": {"Z": [1, 0]}}}
+    link = GuardLink(folder, tmp_path)
+    link.refresh()
+    guard.close()
+    link.close()
+    stands = "-4.6 um on axis X and an unknown offset on axis Y, Z may still be applied"
+    assert str(GuardLink(folder, tmp_path).standing) == stands
 
 
 async def test_disarm_is_ok_at_zero_only(config: MachineConfig, guard: Guard, folder: Path) -> None:
@@ -234,6 +281,19 @@ def test_run_leaves_with_zero_only_when_the_guard_says_so(
     )
     assert code == 3
     assert err.splitlines()[-1].endswith(f"stopped, {STANDS}; hold the feed, then run fdhil adopt")
+
+
+def test_run_without_a_guard_does_not_leave_with_zero_what_the_run_before_left(
+    machine: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    store = machine_config.load(machine).store.directory
+    StandingMark(store).keep(standing.standing(FROZEN))
+    told: dict[str, Any] = {}
+    code, err = running(machine, monkeypatch, capsys, lambda p: told.update(status_when(p, lambda s: s["notices"])))
+    assert code == 3
+    assert (told["state"], told["may_stand"]) == ("lost", {"nothing": False, "text": STANDS})
+    assert [(n["code"], n["severity"]) for n in told["notices"]] == [("GuardLost", "MAJOR")]
+    assert err.splitlines()[-1].endswith(f"stopped, {STANDS}; hold the feed, start fdhil-guard, then run fdhil adopt")
 
 
 def test_run_after_the_guards_death_tells_what_it_left_everywhere(

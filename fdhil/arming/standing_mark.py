@@ -1,0 +1,52 @@
+"""Keeps in the store that an offset may stand in the drives: the next daemon knows it, also without a guard."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from fdhil.arming.standing import START_AND_ADOPT, Standing, standing
+from fdhil.errors import StoreError
+from fdhil.store.atomic import write_file
+
+FILE_NAME = "may_stand.json"
+
+
+class StandingMark:
+    """``left``: what the daemon before this one left, as the status of a guard that is lost; None: nothing."""
+
+    def __init__(self, store_directory: Path) -> None:
+        self._path = store_directory / FILE_NAME
+        self.left = self._read()
+        self._kept = self.left is not None
+
+    def _read(self) -> Mapping[str, Any] | None:
+        try:
+            told = json.loads(self._path.read_bytes())
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, RecursionError):
+            told = None  # that there is one is enough: what stands is unknown
+        left = {"state": "lost", "may_stand_um": told if isinstance(told, dict) else {}}
+        return {**left, "text": f"no guard was heard since; {standing(left)}; {START_AND_ADOPT}"}
+
+    def keep(self, stands: Standing) -> None:
+        """Keep what may stand: before it is sent, or as soon as it is heard.
+
+        A store that cannot be written tells so itself, and nothing can be armed then.
+        """
+        if not self._kept:
+            offset_um = {**stands.offset_um, **dict.fromkeys(stands.fed)}
+            with suppress(StoreError):
+                write_file(self._path, json.dumps(offset_um).encode())
+                self._kept = True
+
+    def remove(self) -> None:
+        """Forget it: a guard knows that nothing stands."""
+        if self._kept:
+            with suppress(OSError):
+                self._path.unlink(missing_ok=True)
+                self._kept = False
