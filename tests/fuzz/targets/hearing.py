@@ -6,8 +6,10 @@ import struct
 import time
 from collections import Counter
 
+import numpy as np
+
 from fdhil.daemon.hearing import Hearing
-from fdhil.drivers.can.frames import EXTENDED_FLAG, FrameRing, frames_of
+from fdhil.drivers.can.frames import EXTENDED_FLAG, FrameRing, Frames, frames_of
 from fdhil.drivers.can.socketcand import HubClock, SocketcandPort
 from fdhil.drivers.cia402.bus_decoder import BusDecoder
 from fdhil.drivers.moves import load_event_source
@@ -17,7 +19,9 @@ from tests.fuzz.tasting import Target
 
 CONFIG = machine(axes="X")
 FLAGS = (0, 0, 0, 0, 0, 0x20000000, 0x40000000, EXTENDED_FLAG)
-_ROW = struct.Struct("<hHBB8s")  # how much later than the one before (10 us), identifier, length, flags, data
+_ROW = struct.Struct("<hHBB8s")  # how much later than the one before, identifier, length, flags and unit, data
+SILENCES = 8
+UNITS_NS = (10_000, 10_000, 1_000_000, 30_000_000)
 
 
 def taste(data: bytes) -> None:
@@ -33,9 +37,8 @@ def taste(data: bytes) -> None:
             ring.append(*row)
     frames = ring.drain()
     now_ns = 2_000_000_000
-    half = frames.size // 2 if len(data) % 2 else 0
-    for block in (frames[:half], frames[half:]) if half else (frames,):
-        now_ns += 400_000_000
+    for block in _blocks(frames, len(data) % 2):
+        now_ns = max(now_ns + 400_000_000, int(block["t_ns"].max(initial=0)))
         for record in decoder.feed(block, now_ns):
             if isinstance(record, AxisSamples | TickTimes):
                 for source in sources:
@@ -45,6 +48,12 @@ def taste(data: bytes) -> None:
         hearing.status(now_ns * 1e-9)
         hearing.troubles({}, now_ns * 1e-9)
     decoder.counters()
+
+
+def _blocks(frames: Frames, halved: int) -> list[Frames]:
+    """Cut where the bus was silent for long, which the daemon notices by a block without a frame, or in halves."""
+    silent = np.flatnonzero(np.diff(frames["t_ns"]) > 1_000_000_000)[:SILENCES] + 1
+    return np.split(frames, np.repeat(silent, 2) if silent.size else [frames.size // 2] * halved)
 
 
 def _text(data: bytes, ring: FrameRing) -> None:
@@ -57,7 +66,7 @@ def _text(data: bytes, ring: FrameRing) -> None:
 def _rows(data: bytes) -> list[Row]:
     at_ns, found = 1_000_000_000, []
     for later, can_id, length, flags, payload in _ROW.iter_unpack(data[: len(data) // _ROW.size * _ROW.size]):
-        at_ns += 10_000 * later
+        at_ns += UNITS_NS[flags >> 3 & 3] * later
         found.append((at_ns, can_id & 0x7FF | FLAGS[flags % 8], payload[: length % 9]))
     return found
 
@@ -73,8 +82,14 @@ def target() -> Target:
         seeds.append(b"\1" + packed)
         text = "".join(f"< frame {i:03X} {t * 1e-9:.6f} {d.hex(' ')} >" for t, i, d in rows[:20])
         seeds.append(b"\0" + text.encode())
+    outage = [(2, 5), (2, 5), (2, 5), (2, 5), (200, 5), (2, 0), (2, 5), (200, 5)]  # 60 ms and 6 s, state
+    beats = b"".join(_ROW.pack(later, 0x701, 1, 3 << 3, bytes([state])) for later, state in outage)
     emergency = _ROW.pack(1, 0x81, 8, 0, bytes(8)) + _ROW.pack(1, 0x701, 1, 0, b"\0") + _ROW.pack(1, 4, 8, 5, b"\0\x30")
     assert frames_of([(0, 0x80, b"")]).size == 1
     return Target(
-        "hearing", [*seeds, b"\1" + emergency], taste, [b"< frame ", b" >", b"nan", b"inf", b"< error "], 3000
+        "hearing",
+        [*seeds, b"\1" + emergency, b"\1" + beats],
+        taste,
+        [b"< frame ", b" >", b"nan", b"inf", b"< error "],
+        3000,
     )
