@@ -127,6 +127,10 @@ def test_one_bus_by_two_names_is_refused() -> None:
     config.parse(document)
 
 
+def test_the_mark_that_an_editor_puts_before_a_text_is_no_part_of_it() -> None:
+    assert config.toml_document(b"\xef\xbb\xbf[machine]\nname = 'mill'\n", "m.toml") == {"machine": {"name": "mill"}}
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [

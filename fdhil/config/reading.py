@@ -56,7 +56,7 @@ def toml_document(raw: bytes, source: str) -> dict[str, Any]:
     try:
         if any(line.count(b".") > MOST_DOTS for line in raw.splitlines()):  # a key of n parts takes n^2 to read
             raise RecursionError
-        return tomllib.loads(raw.decode("utf-8"))
+        return tomllib.loads(raw.decode("utf-8-sig"))
     except RecursionError:
         what = "is nested deeper than any config"
     except UnicodeDecodeError as error:
