@@ -71,7 +71,7 @@ def _fuzz(options: argparse.Namespace, corpus: Path, folder: Path) -> None:
     kept = options.found / options.name  # an input that ends the process itself
     kept.mkdir(parents=True, exist_ok=True)
     flags = [f"-seed={options.seed}", f"-max_len={target.longest}", f"-dict={words}", "-verbosity=0", "-timeout=600"]
-    atheris.Setup([sys.argv[0], *flags, "-rss_limit_mb=4096", f"-artifact_prefix={kept}/", str(corpus)], search.taste)
+    atheris.Setup([sys.argv[0], *flags, "-rss_limit_mb=8192", f"-artifact_prefix={kept}/", str(corpus)], search.taste)
     atheris.Fuzz()
 
 
