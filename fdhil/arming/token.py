@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import secrets
 import stat
+import tempfile
 from contextlib import suppress
 from pathlib import Path
 
 from fdhil.errors import ConnectError, DeviceError
+from fdhil.store.atomic import sync_folder, write_all
 
 TOKEN_NAME = "token"
 MAX_BYTES = 256
@@ -52,21 +54,33 @@ def check_rights(run_directory: Path) -> None:
 
 
 def ensure_token(run_directory: Path) -> str:
-    """Return the token of a run directory; make one where there is none. DeviceError when it cannot be kept secret."""
+    """Return the token of a run directory; make one where there is none. DeviceError when it cannot be kept secret.
+
+    It is there whole or not at all, whatever ends this process; of two who make one at once the first one's is taken.
+    """
     path = run_directory / TOKEN_NAME
     try:
-        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-    except FileExistsError:
-        return read_token(run_directory)
+        if not path.is_symlink() and not path.exists():
+            _make_token(path)
     except OSError as error:
         raise DeviceError(str(path), f"cannot be written: {error.strerror}; check [store] run_directory") from None
+    return read_token(run_directory)
+
+
+def _make_token(path: Path) -> None:
+    descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)  # mode 0600
+    made = Path(name)
     try:
-        token = secrets.token_hex(32)
-        os.write(descriptor, token.encode())
-        os.fsync(descriptor)
+        try:
+            write_all(descriptor, secrets.token_hex(32).encode())
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        with suppress(FileExistsError):
+            os.link(made, path)
+            sync_folder(path.parent)
     finally:
-        os.close(descriptor)
-    return token
+        made.unlink()
 
 
 def read_token(run_directory: Path) -> str:

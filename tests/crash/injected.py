@@ -86,15 +86,12 @@ def done_by(work: Callable[[Callable[..., None]], None]) -> Told:
         return _heard(ours)
 
 
-def calls_of(trace: Path) -> Counter[str]:
-    """Return how often each call was made in a trace."""
-    return Counter(re.findall(r"^\d+ +(\w+)\(", trace.read_text("utf-8", "replace"), re.MULTILINE))
-
-
-def wakes_of(trace: Path) -> set[int]:
-    """Return which writes of a trace only wake the process's own loop, by one byte: no disk is behind them."""
-    writes = re.findall(r"^\d+ +write\((.*)$", trace.read_text("utf-8", "replace"), re.MULTILINE)
-    return {nth for nth, line in enumerate(writes, 1) if re.search(r", 1\) += 1$", line)}
+def calls_of(trace: Path) -> Sequence[Counter[str]]:
+    """Return how often each thread of a trace made each call: strace counts a thread's calls by themselves."""
+    threads: dict[str, Counter[str]] = {}
+    for thread, call in re.findall(r"^(\d+) +(\w+)\(", trace.read_text("utf-8", "replace"), re.MULTILINE):
+        threads.setdefault(thread, Counter())[call] += 1
+    return [*threads.values()]
 
 
 def was_injected(trace: Path) -> bool:

@@ -25,7 +25,6 @@ from tests.crash.injected import (
     keep_some,
     kept_under,
     looked_at,
-    wakes_of,
     was_injected,
 )
 from tests.crash.keepers import KEEPERS, Keeper
@@ -98,12 +97,12 @@ def _faults(begun: Path, kind: Kind, folder: Path, found: Found, most: int | Non
     told = kept_under(kind.work, store, None, trace)
     assert told.ended, told
     assert not told.refused, told
-    found.calls, wakes = calls_of(trace), wakes_of(trace)
+    threads = calls_of(trace)
+    found.calls = sum(threads, Counter())
     every = [
         (call, nth, fault)
-        for call, count in found.calls.items()
-        for nth in range(1, count + 1)
-        if call != "write" or nth not in wakes
+        for call in found.calls
+        for nth in range(1, max(calls[call] for calls in threads) + 1)
         for fault in faults_of(call)
     ]
     chosen = every if most is None or most >= len(every) else random.Random(1).sample(every, most)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
 import os
 import re
@@ -258,6 +259,33 @@ def test_the_token_is_made_once_and_only_for_its_owner(tmp_path: Path) -> None:
     (tmp_path / "token").chmod(0o644)
     with pytest.raises(DeviceError, match="others can read it"):
         read_token(tmp_path)
+
+
+def test_a_token_that_cannot_be_kept_leaves_none_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuses(_descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", refuses)
+        with pytest.raises(DeviceError, match=r"token: cannot be written: No space left .* check"):
+            ensure_token(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+    assert len(ensure_token(tmp_path)) == 64
+
+
+def test_of_two_who_make_a_token_at_once_both_have_the_one_that_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link = os.link
+
+    def after_another(made: str, path: Path) -> None:
+        monkeypatch.setattr(os, "link", link)
+        ensure_token(tmp_path)
+        link(made, path)
+
+    monkeypatch.setattr(os, "link", after_another)
+    assert ensure_token(tmp_path) == read_token(tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["token"]
 
 
 def test_no_guard_serves_a_folder_in_which_anybody_may_put_a_socket(tmp_path: Path) -> None:
