@@ -74,7 +74,7 @@ fuzz: setup      ## any bytes at every way in, N for each (make fuzz N=1000000);
 
 guard: setup     ## the guard's own tests, in its processes too; a branch of it that none of them takes is an error
 	@$(BIN)/python -m coverage erase
-	@$(BIN)/python -m coverage run -m pytest -q -m "not socketcan and not debian" tests/guard
+	@$(BIN)/python -m coverage run -m pytest -q -m "not socketcan and not debian" -n 2 --dist loadfile tests/guard
 	@$(BIN)/python -m coverage combine -q
 	@$(BIN)/python -m coverage report --include 'fdhil/guard/*' --show-missing --skip-covered --fail-under 100
 	@$(BIN)/python -m coverage erase

@@ -9,6 +9,7 @@ import argparse
 import json
 import subprocess
 import sys
+import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,6 +19,7 @@ from tests.fuzz import TARGETS
 from tests.fuzz.tasting import LONGEST_S, MOST_BYTES, found_inputs
 
 GOAL = 1_000_000
+PORTION = 100_000
 CORPUS = ROOT / "out" / "fuzz"
 Figures = dict[str, Any]
 
@@ -42,8 +44,13 @@ def measure(options: argparse.Namespace) -> Figures:
     before = json.loads(path.read_text("utf-8"))["figures"] if options.add and path.is_file() else {}
     parts: dict[str, Figures] = dict(before.get("targets", {}))
     for name in options.targets:
-        parts[name] = added(parts.get(name), fuzzed(name, options))
-        print(f"{name}: {parts[name]['inputs']:,} inputs", flush=True)
+        until_s = time.monotonic() + options.seconds
+        for k, inputs in enumerate(portions(options.inputs)):
+            if k and (parts[name]["found"] or time.monotonic() >= until_s):
+                break
+            now = fuzzed(name, inputs, until_s - time.monotonic(), options.seed + k)
+            parts[name] = added(parts.get(name), now)
+            print(f"{name}: {parts[name]['inputs']:,} inputs", flush=True)
     letters = before.get("slips")
     if letters is None or (not letters["all"] and (options.slips == 0 or options.slips > letters["count"])):
         letters = judged_slips(options.slips, options.seed)
@@ -52,9 +59,14 @@ def measure(options: argparse.Namespace) -> Figures:
     return {**figures, "goals": goals(figures)}
 
 
-def fuzzed(name: str, options: argparse.Namespace) -> Figures:
+def portions(inputs: int) -> list[int]:
+    """Divide the inputs among processes: atheris keeps each array that it compared for as long as it lives."""
+    return [min(PORTION, inputs - begun) for begun in range(0, inputs, PORTION)]
+
+
+def fuzzed(name: str, inputs: int, seconds: float, seed: int) -> Figures:
     """Fuzz one target in a process of its own."""
-    given = ["--inputs", options.inputs, "--seconds", options.seconds, "--seed", options.seed]
+    given = ["--inputs", inputs, "--seconds", seconds, "--seed", seed]
     command = [sys.executable, "-m", "tests.fuzz", name, *map(str, given), "--corpus", str(CORPUS / "corpus" / name)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     lines = [line for line in done.stdout.splitlines() if line.startswith("{")]
