@@ -19,7 +19,7 @@ from tests.fuzz import TARGETS
 from tests.fuzz.tasting import LONGEST_S, MOST_BYTES, found_inputs
 
 GOAL = 1_000_000
-PORTION = 100_000
+PORTION = 20_000
 CORPUS = ROOT / "out" / "fuzz"
 Figures = dict[str, Any]
 

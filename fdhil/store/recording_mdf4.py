@@ -60,6 +60,8 @@ def read(content: bytes, source: str) -> RecordingTable:
             rows = [group.channel_group.cycles_nr for group in file.groups]
             check_size(max(rows, default=0), sum(len(group.channels) for group in file.groups), source)
             return RecordingTable(_headers(str(file.header.comment)), _channels(file, rows))
+    except UnboundLocalError:  # the library's own, where a file says that it is unfinished and has no block to finish
+        raise unreadable(source, KIND, ValueError("it is unfinished, or damaged")) from None
     except (asammdf.blocks.utils.MdfException, ExpatError, *UNREADABLE) as error:
         raise unreadable(source, KIND, error) from None
 
