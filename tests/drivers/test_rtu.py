@@ -195,12 +195,12 @@ async def test_the_answer_of_another_unit_is_not_taken_and_ours_is_waited_for() 
 @patiently
 async def test_a_late_answer_is_not_taken_for_the_next() -> None:
     async with rtu_peer(u1=[7, 8]) as peer:
-        link = link_to(peer, timeout_s=0.4)
+        link = link_to(peer, timeout_s=3.0)  # a pseudo terminal of a busy computer may take half a second
         line = link.line
         assert isinstance(line, RtuLine)
         await link.connect()
         peer.spoil = [lambda frame: []]
-        with pytest.raises(DeviceTimeout, match=r"was not answered within 0\.4 s"):
+        with pytest.raises(DeviceTimeout, match=r"was not answered within 3 s"):
             await link.read_input(0, 2)
         asking = asyncio.create_task(link.read_input(0, 2))
         await asyncio.sleep(0.01)
