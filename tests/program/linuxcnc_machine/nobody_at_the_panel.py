@@ -53,12 +53,15 @@ def main() -> None:
     """Run the program of the environment and record every servo cycle of it."""
     command, status = linuxcnc.command(), linuxcnc.stat()
     prepare(command, status)
+    status.poll()
+    begin = tuple(status.position)
     with Path(os.environ["DEMAND"]).open("w") as out:
         recorder = subprocess.Popen(["halsampler", "-t"], stdout=out)
         time.sleep(0.3)
         command.program_open(os.environ["PROGRAM"])
         command.auto(linuxcnc.AUTO_RUN, 0)
-        wait_for(status, lambda: status.interp_state != linuxcnc.INTERP_IDLE)
+        # a short program may be over before a busy computer looks
+        wait_for(status, lambda: status.interp_state != linuxcnc.INTERP_IDLE or tuple(status.position) != begin)
         wait_for(status, lambda: status.interp_state == linuxcnc.INTERP_IDLE and bool(status.inpos))
         time.sleep(0.3)
         recorder.terminate()
