@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 
 from fdhil.arming import passes
-from fdhil.arming.desk import ArmingDesk
 from fdhil.arming.passes import Pass
 from fdhil.arming.preparing import Armament
 from fdhil.config import MachineConfig
 from fdhil.prediction import contour_error_um
 from fdhil.prediction.gain import Gain, plus_minus
-from fdhil.records import AxisSamples, Correction, Float, Skill, frozen, frozen_ints
+from fdhil.records import AxisSamples, Correction, Float, Notice, Skill, frozen, frozen_ints
 from tests.arming.mill import Mill
 from tests.arming.test_ahead import opened
 from tests.arming.test_preparing import save_records, whole
@@ -93,9 +92,9 @@ def test_a_pass_that_never_began_measures_nothing(
     assert running.measured() is None
 
 
-def measured(desk: ArmingDesk, count: int) -> bool:
-    """Whether so many passes were measured."""
-    return len(desk.passes) == count
+def measured(told: Sequence[Notice], count: int) -> bool:
+    """Whether so many passes were told as measured: the last thing that is done of each."""
+    return sum(notice.code == "PassMeasured" for notice in told) == count
 
 
 async def test_each_pass_is_told_beside_what_was_predicted(
@@ -119,7 +118,7 @@ async def test_each_pass_is_told_beside_what_was_predicted(
             for block in heard(reference, is_at):
                 shop.desk.hear(block)
             mill.state, mill.cause = "OFF", cause
-            await shop.until(partial(measured, shop.desk, number))
+            await shop.until(partial(measured, shop.told, number))
             told = shop.desk.passes[-1]
             notice = next(notice for notice in reversed(shop.told) if notice.code == "PassMeasured")
             assert (notice.severity, notice.text.startswith(told["text"])) == (severity, True)

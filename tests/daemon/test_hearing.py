@@ -129,7 +129,7 @@ async def test_a_wrong_period_a_node_never_heard_and_a_dead_bus_are_told(
         line.cut()
         told = await status_when(path, lambda s: s["source"]["state"] == "silent" and s["sync"]["rate_hz"] is None)
         assert told["source"]["heard_s_ago"] > 1.0
-        assert told["sync"]["heard_s_ago"] > 1.0
+        assert told["sync"]["heard_s_ago"] >= 1.0  # told in whole milliseconds
         text = shown(told, capsys)
         assert "silent for" in text
         assert "no SYNC for" in text
