@@ -129,12 +129,14 @@ async def opened(config: MachineConfig, mill: Mill) -> AsyncIterator[Shop]:
         desk.knowledge.note([replace(newest, axis=axis)])
     told: list[Notice] = []
     tasks = [asyncio.create_task(work(told.extend)) for work in (desk.attend, desk.stream)]
-    yield Shop(desk, mill, read_token(config.store.run_directory), told)
-    assert not any(task.done() for task in tasks)
-    await desk.stand_down()
-    for task in tasks:
-        task.cancel()
-    await asyncio.gather(*tasks, return_exceptions=True)
+    try:
+        yield Shop(desk, mill, read_token(config.store.run_directory), told)
+        assert not any(task.done() for task in tasks)
+    finally:
+        await desk.stand_down()
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 def written(folder: Path, text: str) -> Path:
