@@ -86,17 +86,21 @@ class Daemon:
         """The pipe on which it says that it has armed."""
         return self._told
 
-    def heard(self) -> bool:
+    def heard(self, word: bytes = b"armed") -> bool:
         """Take what it said; it has armed when it said so. RuntimeError when it said anything else."""
         text = os.read(self._told, 4096)
-        if text != b"armed":
+        if text != word:
             raise RuntimeError(f"the daemon: {text.decode() or 'has ended'}")
         self.armed = True
         return True
 
     def order(self, word: bytes) -> None:
-        """Have it ask the guard for something: ``disarm``, or the name of a fact that it no longer vouches for."""
+        """Have it ask the guard for something: ``disarm``, or the name of a fact that it no longer vouches for.
+
+        Returns when the guard's socket holds it: until then no SYNC passes, however late the daemon gets the processor.
+        """
         os.write(self._orders, word)
+        self.heard(b"asked")
 
     def kill(self) -> None:
         """Kill it, and return when it is dead."""
@@ -136,9 +140,10 @@ def _serve(folder: Path, demand: list[Column], offsets: list[Column]) -> None:
             if not word:
                 return
             if word == "disarm":
-                client.disarm()
+                client._send({"request": "disarm"})  # its answer comes with the next SYNC
             else:
                 client.alive({word: False})
+            os.write(3, b"asked")
 
 
 class LiveGuard:

@@ -37,6 +37,7 @@ def ramp(folder: Path, clock: tuple[str, str, str]) -> list[tuple[int, ...]]:
         rig = Rig(folder)
     try:
         rig.arm()
+        rig.settle()
         peer = rig.peer
         peer.slow_from = FIRST_ROW - 20
         peer.playing = True

@@ -121,8 +121,12 @@ def slcan(can_id: int, data: bytes) -> str:
     return f"t{can_id:03X}{len(data)}{data.hex().upper()}"
 
 
-def test_a_drive_is_sampled_through_it_as_through_any_bus(adapter: SerialAdapter) -> None:
+def test_a_drive_is_sampled_through_it_as_through_any_bus(
+    adapter: SerialAdapter, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Stamps in bursts cost no sample, and make no second SYNC producer of one."""
+    monkeypatch.setattr("fdhil.drivers.cia402.bus_decoder._SYNC_SILENCE_NS", 300e9)  # a host that is held up
+    monkeypatch.setattr("fdhil.drivers.bus_source.SILENCE_S", 300.0)
     wire = Wire(n=400, counter=False)
     config = machine(bus=settings_of(adapter).model_dump())
     lines = [slcan(can_id, data) for _, can_id, data in wire.rows()]

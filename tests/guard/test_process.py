@@ -174,6 +174,7 @@ def test_mute_by_default_then_aligned_to_the_cycle_then_off(rig: Rig) -> None:
     assert rig.peer.sent == []
     assert tcp_ports(rig.process.pid) == set()
     rig.arm()
+    rig.settle()
     rig.peer.playing = True
     rig.peer.wait(lambda: rig.peer.row > 780, "the path")
     rig.peer.wait(lambda: rig.state() == "OFF", "the end")
@@ -184,6 +185,7 @@ def test_mute_by_default_then_aligned_to_the_cycle_then_off(rig: Rig) -> None:
     check_limits(rig)
     assert client.status()["cause"]["code"] == "Finished", "\n".join(map(str, rig.events()))
     rig.peer.expected = False
+    rig.peer.read_out()
     count = len(rig.peer.sent)
     ticks = rig.peer.tick
     rig.peer.wait(lambda: rig.peer.tick > ticks + 50, "SYNC")
@@ -331,6 +333,7 @@ def test_what_is_forged_foreign_or_silent_makes_no_step(rig: Rig) -> None:
     rig.process.wait()
     client.close()
     peer.slow_from = NEVER
+    peer.wait(lambda: peer.hung_up, "all that it had sent")
     count = len(peer.sent)
     again = rig.start()
     try:

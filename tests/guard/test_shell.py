@@ -524,6 +524,8 @@ def test_descriptors_that_nobody_asked_for_are_closed(desk: Control) -> None:
         assert desk.clients[0].descriptor is not None
     serve(desk)
     desk._closer.end()
+    assert desk._closer._thread is not None
+    desk._closer._thread.join(60.0)  # end() waits a moment only
     assert count() == before - 2  # both ends of the client's connection
 
 

@@ -22,6 +22,12 @@ from tests.guard.peer import open_bus, write_config
 
 ROWS = 900
 TOKEN = "the operator's"
+PATIENT = """\
+from fdhil.cli.main import main
+from fdhil.sim import service
+service.LOCKSTEP_WAIT_S = service.LOCKSTEP_HOLDING_WAIT_S  # of a guard that is held up while its offset is 0, too
+main()
+"""
 
 
 def demand_mm() -> list[tuple[float, float]]:
@@ -47,7 +53,7 @@ class Twin:
         with self.config.open("a") as file:
             file.write('[sim]\npace = "lockstep"\nmodbus = false\n')
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "fdhil", "sim", str(self.config), "--json"],
+            [sys.executable, "-c", PATIENT, "sim", str(self.config), "--json"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -81,6 +87,9 @@ def play(twin: Twin, guard: GuardClient, folder: Path) -> dict[str, Any]:
         time.sleep(0.01)
     armed = guard.arm(TOKEN, "p", FACTS_GIVEN)
     assert armed["ok"], armed
+    tick = guard.status()["tick"]
+    while guard.status()["tick"] < tick + 50:  # what it is behind SYNC is over
+        time.sleep(0.01)
     file = folder / "demand.csv"
     lines = [f"{k * 1e-3:.3f},{x:.9f},{y:.9f}" for k, (x, y) in enumerate(rows)]
     file.write_text("time_s,X_mm,Y_mm\n" + "\n".join(lines) + "\n")

@@ -120,6 +120,7 @@ def settling_soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 0.3)
     monkeypatch.setattr("fdhil.commissioning.steps.SETTLE_CYCLES", 150)
     monkeypatch.setattr("fdhil.commissioning.steps.AVERAGE_CYCLES", 80)
+    monkeypatch.setattr("fdhil.commissioning.steps.MOST_RAMPS", 1000)  # a slow host sees few of them begin
     monkeypatch.setattr("fdhil.commissioning.watchdog.STARVE_TIMEOUT_S", 15.0)  # a slow host's drives live slower
 
 

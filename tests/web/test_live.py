@@ -95,7 +95,7 @@ class Browser:
             assert isinstance(message, bytes)
             self.header, low = decoded(message)
             self.parts += zip(self.header["parts"], low, strict=True)
-            if draw:
+            if draw or not self.header["parts"]:  # a word of life has nothing to draw
                 await self.draw()
 
     async def draw(self) -> None:
