@@ -41,8 +41,8 @@ class Mill:
             self.rows = []
         if path.first != len(self.rows):
             return {"ok": False, "code": "ProgramMismatch", "text": "these rows do not continue the table"}
+        self.final = path.final  # first: whoever sees the rows may move
         self.rows += list(zip(*path.demand, *path.offset, strict=True))
-        self.final = path.final
         return {"ok": True, "rows": [0, len(self.rows)]}
 
     def move(self, row: int) -> None:

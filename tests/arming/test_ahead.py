@@ -96,6 +96,10 @@ class Shop:
     def _holds(self, rows: int) -> bool:
         return len(self.mill.rows) >= rows
 
+    def tripped(self) -> bool:
+        """Whether the guard's end of a correction has been told."""
+        return any(notice.code == "GuardTripped" for notice in self.told)
+
     def major(self) -> list[Notice]:
         """What the operator must not miss."""
         return [notice for notice in self.told if notice.severity == "MAJOR" and notice.code != "GuardTripped"]
@@ -221,7 +225,7 @@ async def _dies_with_a_word(shop: Shop) -> None:
     await shop.walk(end - RESERVE_ROWS, end)
     shop.mill.move(end - RESERVE_ROWS + 1)
     assert (shop.mill.state, shop.mill.cause, len(shop.mill.rows)) == ("OFF", "TableStarved", end)
-    await shop.until(lambda: shop.desk.armed is None)
+    await shop.until(lambda: shop.desk.armed is None and shop.tripped())
     assert [notice.text for notice in shop.told if notice.code == "GuardTripped"] == ["TableStarved: "]
     assert len(shop.major()) == 2
 
@@ -248,7 +252,7 @@ async def test_a_place_that_is_refused_later_is_told_long_before_the_motion_reac
         await shop.walk(end - RESERVE_ROWS, end)
         mill.move(end - RESERVE_ROWS + 1)
         assert (mill.state, mill.cause, len(mill.rows)) == ("OFF", "TableStarved", end)
-        await shop.until(lambda: shop.desk.checking is None and shop.desk.armed is None)
+        await shop.until(lambda: shop.desk.checking is None and shop.desk.armed is None and shop.tripped())
         assert {notice.code for notice in shop.told} >= {"DemandTooHigh", "GuardTripped"}
         again = await shop.arm(tmp_path / "long.ngc", whole=True)  # now it is known, and nothing is armed
         assert (again["ok"], again["code"]) == (False, "DemandTooHigh")

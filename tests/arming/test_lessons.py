@@ -58,7 +58,7 @@ async def test_the_next_pass_carries_what_the_last_one_taught(
             for block in heard(demand, off if demand is not slower else demand):
                 shop.desk.hear(block)
             mill.state, mill.cause = "OFF", cause
-            await shop.until(partial(measured, shop.desk, number))
+            await shop.until(partial(measured, shop.told, number))
         answer = await shop.arm(program)
         learned = np.array([row[2:] for row in mill.rows])
     assert [told.get("learned") is not None for told in shop.desk.passes] == [False, False, False, True]

@@ -27,7 +27,7 @@ WAITS: tuple[tuple[str, str, float], ...] = (
     ("commissioning.survey", "LISTEN_S", 0.15),
     ("commissioning.steps", "SETTLE_CYCLES", 120),
     ("commissioning.steps", "AVERAGE_CYCLES", 60),
-    ("commissioning.watchdog", "STARVE_TIMEOUT_S", 0.1),
+    ("commissioning.watchdog", "STARVE_TIMEOUT_S", 1.0),
     ("drivers.can.sdo", "RESPONSE_TIMEOUT_S", 0.2),
     ("drivers.can.sdo", "QUIET_S", 0.1),
     ("commissioning.strokes", "JOG_MM", 1.0),

@@ -15,6 +15,7 @@ from fdhil.cli.doctor.uplink import examine_uplink
 from fdhil.store import HISTORY_FILE
 from fdhil.store.outbox import POSITION_FILE, OutboxReader, Position, write_position
 from tests.fleet.machine import Machine, written
+from tests.held_port import held_port
 
 JETSTREAM = b'INFO {"server_id":"A","jetstream":true}\r\n'
 
@@ -135,6 +136,5 @@ def test_who_answers_is_heard_and_told_nothing(words: bytes, told: str, tmp_path
 
 
 def test_nobody_answers(tmp_path: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-    assert codes(recorded(tmp_path, server=f"nats://127.0.0.1:{port}"), offline=False) == ["UplinkServer"]
+    with held_port() as port:
+        assert codes(recorded(tmp_path, server=f"nats://127.0.0.1:{port}"), offline=False) == ["UplinkServer"]

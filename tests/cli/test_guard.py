@@ -7,7 +7,6 @@ import json
 import os
 import pwd
 import signal
-import socket
 import stat
 import subprocess
 import sys
@@ -27,6 +26,7 @@ from fdhil.guard.limits import OffsetLimits
 from fdhil.guard.settings import load
 from tests.arming.test_guard_settings import RECORD
 from tests.guard.peer import Peer, at_rest, write_config
+from tests.held_port import held_port
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
@@ -76,10 +76,8 @@ def test_without_a_correction_section_writing_is_off(
 def test_no_hub_is_one_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as closed:
-        port = closed.getsockname()[1]
-    config = write_config(tmp_path, port)
-    assert run(monkeypatch, str(config)) == 3
+    with held_port() as port:
+        assert run(monkeypatch, str(write_config(tmp_path, port))) == 3
     told = capsys.readouterr().err
     assert "start the hub first" in told
     assert len(told.splitlines()) == 1

@@ -219,8 +219,11 @@ def test_what_a_file_says_cannot_break_the_comments(fdhil: Said, tmp_path: Path)
     assert machine_config.load(tmp_path / "m.toml").axis["X"].drive.increments_per_rev == 10000
 
 
-def test_beside_an_nc_nothing_is_sent(fdhil: Said, peer: DrivePeer, bus: dict[str, Any], tmp_path: Path) -> None:
+def test_beside_an_nc_nothing_is_sent(
+    fdhil: Said, peer: DrivePeer, bus: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The drive is known by its node-ID alone, so that its scales are asked; the period is heard."""
+    monkeypatch.setattr("fdhil.commissioning.scan.LISTEN_S", 2.0)
     axis = SHEET | RAPID | {"drive": SHEET["drive"] | {"increments_per_rev": 65536}}
     answers = written(tmp_path, axis={"X": axis}, bus=bus, machine={"sync_period_s": 0.001})
     stop = threading.Event()

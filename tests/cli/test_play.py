@@ -24,7 +24,7 @@ from tests.sim.twin_process import TwinProcess, write_config
 
 PER_MM = 65536 / 20
 HEARTBEAT_LOST = 0x8130
-STROKE = "G21 G90 G94\nG1 X300 F9000\nM2\n"
+STROKE = "G21 G90 G94\nG1 X300 F1500\nM2\n"  # longer than a host is held up
 SETPOINTS = "[axis.X.setpoints]\ntravel_mm = [-10.0, 400.0]\n[axis.Y.setpoints]\ntravel_mm = [-10.0, 10.0]\n"
 # fdhil as a process of its own that waits a shorter time than on a real machine
 QUICK = """

@@ -24,6 +24,7 @@ from fdhil.records import Notice
 from fdhil.report.parameter_view import cell, half_of
 from tests.daemon.machine import config_of
 from tests.daemon.shop import BENCH, fdhil
+from tests.held_port import held_port
 from tests.store.made import outcome, published
 
 
@@ -191,11 +192,9 @@ def test_a_wrong_method_or_config_is_2(machine: Path, tmp_path: Path, capsys: An
 
 def test_run_on_a_bus_that_is_not_there_is_3_and_one_sentence(tmp_path: Path, capsys: Any) -> None:
     path = tmp_path / "machine.toml"
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    path.write_text(f'{BENCH}[bus.can0]\ninterface = "socketcand"\nport = {port}\n')
-    code, out, err = fdhil("run", path, "--method", "least_squares", capsys=capsys)
+    with held_port() as port:
+        path.write_text(f'{BENCH}[bus.can0]\ninterface = "socketcand"\nport = {port}\n')
+        code, out, err = fdhil("run", path, "--method", "least_squares", capsys=capsys)
     assert (code, out) == (3, "")
     assert err.splitlines()[-1].startswith("fdhil: ")
     assert "Traceback" not in err

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +48,7 @@ def test_warming_and_load(shop: Shop, capsys: pytest.CaptureFixture[str]) -> Non
         shop.nc(on=True)
         for celsius in CELSIUS:
             shop.twin.command("temperature", celsius=float(celsius))
+            shop.status_when(partial(_is_read, float(celsius)))
             _shuttle(shop)
         assert not [n for n in _notices(shop) if n["code"] in {"LoadChanged", "ParameterJump", "MaintenanceDue"}]
         shop.twin.command("set", axis="X", parameters={"Jt": 0.085 * 1.13})
@@ -62,6 +65,11 @@ def test_warming_and_load(shop: Shop, capsys: pytest.CaptureFixture[str]) -> Non
     assert change["parameters"]["Jt"]["after"] == pytest.approx(0.085 * 1.13, rel=0.01)
     windows = document["windows"]["X"]
     assert [w["temperature_c"] for w in windows[:-2:2]] == pytest.approx(list(CELSIUS), abs=0.02)
+
+
+def _is_read(celsius: float, status: dict[str, Any]) -> bool:
+    """Whether the daemon has read the temperature."""
+    return abs(status["axes"]["X"].get("slideway_c", math.nan) - celsius) < 0.01
 
 
 def _shuttle(shop: Shop) -> None:

@@ -38,7 +38,11 @@ def test_from_the_bus_to_the_history_to_a_corrected_cut_and_back(shop: Shop, cap
         _refuses_what_is_not_known(shop, capsys)
         shop.nc(on=True)
         shop.play("shuttle.ngc", SHUTTLE)
-        told = shop.status_when(lambda s: all(s["axes"][a]["accepted"] + s["axes"][a]["refused"] >= 4 for a in "XY"))
+        told = shop.status_when(
+            lambda s: (
+                s["sync"]["rate_hz"] and all(s["axes"][a]["accepted"] + s["axes"][a]["refused"] >= 4 for a in "XY")
+            )
+        )
         _knows_the_drives(told)
         _refuses_a_second_daemon(shop)
         plain = _cuts_corrected(shop, capsys)
