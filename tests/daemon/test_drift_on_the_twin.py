@@ -69,7 +69,7 @@ def test_warming_and_load(shop: Shop, capsys: pytest.CaptureFixture[str]) -> Non
 
 def _is_read(celsius: float, status: dict[str, Any]) -> bool:
     """Whether the daemon has read the temperature."""
-    return abs(status["axes"]["X"].get("slideway_c", math.nan) - celsius) < 0.01
+    return bool(abs(status["axes"]["X"].get("slideway_c", math.nan) - celsius) < 0.01)
 
 
 def _shuttle(shop: Shop) -> None:
