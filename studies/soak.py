@@ -34,7 +34,7 @@ MOST_MB_A_DAY = 1.0
 EMERGENCIES = 1_000_000
 RESTARTING = 0.15  # of the rounds at speed-up, at the beginning, in which daemon and guard are restarted
 RESTARTED = 12  # rounds by the clock in which they are
-AT_ONCE = 66  # first rounds by the clock, with no rest: whatever happens has happened once when they are over
+AT_ONCE = 200  # first rounds by the clock, with no rest: whatever happens has happened often when they are over
 WARM = 0.5  # of a process' life, before anything is concluded
 SEEN = 2000  # rapids of each axis that the pages hold: a shop that works in real time has had as many before
 BY_CLOCK = 4  # rapids in a round by the clock
@@ -254,8 +254,8 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
         lines += pages.paragraph(
             f"""What grows with each rapid is seen in the week, what grows by the clock alone is seen here: a round of
             {BY_CLOCK} rapids, then a rest, about as many as a machine makes in a day. The first {AT_ONCE} rounds follow
-            each other at once, so that what an event takes when it happens for the first time is taken early. Some
-            hours tell a growth per day no better than the intervals say, so the goal here is that nothing grows for
+            each other at once, so that what an event takes when it happens for the first time, and what the pieces of
+            freed memory between used ones come to, is taken early. Some hours tell a growth per day no better than the intervals say, so the goal here is that nothing grows for
             certain. The pages hold the newest {SEEN:,} rapids of each axis, and the store of these shops has had as
             many at speed-up before. Each run is a shop with processes of its own; those of one command worked at the
             same time."""
