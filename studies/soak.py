@@ -255,8 +255,8 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
             f"""What grows with each rapid is seen in the week, what grows by the clock alone is seen here: a round of
             {BY_CLOCK} rapids, then a rest, about as many as a machine makes in a day. The first {AT_ONCE} rounds follow
             each other at once, so that what an event takes when it happens for the first time, and what the pieces of
-            freed memory between used ones come to, is taken early. Some hours tell a growth per day no better than the intervals say, so the goal here is that nothing grows for
-            certain. The pages hold the newest {SEEN:,} rapids of each axis, and the store of these shops has had as
+            freed memory between used ones come to, is taken early. Some hours tell a growth per day no better than the
+            intervals say, so the goal here is that nothing grows for certain. The pages hold the newest {SEEN:,} rapids of each axis, and the store of these shops has had as
             many at speed-up before. Each run is a shop with processes of its own; those of one command worked at the
             same time."""
         )
