@@ -256,9 +256,9 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
             {BY_CLOCK} rapids, then a rest, about as many as a machine makes in a day. The first {AT_ONCE} rounds follow
             each other at once, so that what an event takes when it happens for the first time, and what the pieces of
             freed memory between used ones come to, is taken early. Some hours tell a growth per day no better than the
-            intervals say, so the goal here is that nothing grows for certain. The pages hold the newest {SEEN:,} rapids of each axis, and the store of these shops has had as
-            many at speed-up before. Each run is a shop with processes of its own; those of one command worked at the
-            same time."""
+            intervals say, so the goal here is that nothing grows for certain. The pages hold the newest {SEEN:,} rapids
+            of each axis, and the store of these shops has had as many at speed-up before. Each run is a shop with
+            processes of its own; those of one command worked at the same time."""
         )
     for k, run in enumerate(figures["hours"], 1):
         lines += [f"### Run {k}", "", *_hours_words(run), *_tables(run, "a day")]
