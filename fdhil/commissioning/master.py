@@ -76,8 +76,8 @@ class Master:
         self.loop = cycle or Cycle(config, (settings.drive.bus,))
         self.bus = self.loop.buses[settings.drive.bus]
         self._own_loop = cycle is None
-        self._patience = LOCKSTEP_PATIENCE if self.loop.lockstep else 1.0
-        self.sdo = AxisSdo(self.device, self.node_id, self.bus.send, self._patience)
+        self.patience = LOCKSTEP_PATIENCE if self.loop.lockstep else 1.0
+        self.sdo = AxisSdo(self.device, self.node_id, self.bus.send, self.patience)
         self.sdo.profile = self.profile
         self.heard = Heard()
         self.controlword = 0
@@ -213,7 +213,7 @@ class Master:
 
     def wait(self, condition: Callable[[], bool], timeout_s: float, otherwise: str) -> None:
         """Wait until ``condition`` holds; DeviceTimeout with the sentence ``otherwise`` when it does not in time."""
-        deadline = time.monotonic() + timeout_s * self._patience
+        deadline = time.monotonic() + timeout_s * self.patience
         while not condition():
             self.check()
             if time.monotonic() > deadline:

@@ -71,7 +71,7 @@ def prepare(master: Master) -> None:
 
 def enable(master: Master) -> None:
     """Bring the drive to Operation enabled, holding its position; DriveFault when it does not get there."""
-    deadline = time.monotonic() + ENABLE_TIMEOUT_S
+    deadline = time.monotonic() + ENABLE_TIMEOUT_S * master.patience
     reset_tried = False
     while master.state() is not State.OPERATION_ENABLED:
         if time.monotonic() > deadline:
@@ -194,7 +194,7 @@ def feedforward_test(master: Master) -> bool | None:
     if step < 1 or read_optional(master, Object.VELOCITY_DEMAND, signed=True) is None:
         return None
     excess: list[Excess] = []
-    for number in range(MOST_RAMPS):
+    for number in range(round(MOST_RAMPS * master.patience)):
         goal = step * RAMP_CYCLES if number % 2 == 0 else 0
         excess += _early_excess(master, goal, step)
         master.wait_cycles(SETTLE_CYCLES // 2)

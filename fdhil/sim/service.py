@@ -40,7 +40,7 @@ Emit = Callable[[dict[str, Any]], None]
 WALL_CLOCK_S = 0.004  # how often heartbeats and their time-outs are looked at
 ALONE_S = 0.001  # the same while a drive moves by its own clock
 IDLE_PERIODS = 4  # in lockstep, of a machine that stands: whoever listens is not kept busy for nothing
-LOCKSTEP_WAIT_S = 2.0  # a guard may be held up for so long before the machine goes on without it
+LOCKSTEP_WAIT_S = 2.0  # a guard may be held up for so long before a machine that stands goes on without it
 LOCKSTEP_HOLDING_WAIT_S = 8.0  # a listener takes ten seconds without SYNC for a bus that is dead
 _MIN_SPACING = 0.75  # of a period, between two SYNCs after a late one
 _CATCH_UP = 0.95  # of a period, between two SYNCs while a stream's rows pile up
@@ -59,7 +59,8 @@ class Pace:
     def due_s(self, *, waits: bool, idle: bool, holds: bool = False) -> float:
         """Return the time of the next SYNC.
 
-        ``waits``: an awaited RPDO has not come; ``holds``: an offset is in force; ``idle``: nothing is played.
+        ``waits``: an awaited RPDO has not come; ``holds``: an offset is in force, or the program that it is for runs;
+        ``idle``: nothing is played.
         """
         if self._lockstep and waits:
             return self._last_s + (LOCKSTEP_HOLDING_WAIT_S if holds else LOCKSTEP_WAIT_S)
@@ -305,7 +306,9 @@ class SimService:
         idle, dry = not machine.nc.busy, False
         if self._stream is not None:
             idle, dry = idle or self._stream.stands, self._stream.runs_dry
-        return self._pace.due_s(waits=waits or dry, idle=idle, holds=waits and machine.holds_offset())
+        return self._pace.due_s(
+            waits=waits or dry, idle=idle, holds=waits and (machine.nc.busy or machine.holds_offset())
+        )
 
     def _senders_left(self) -> int:
         return sum(bus.senders_left for bus in self._buses.values())

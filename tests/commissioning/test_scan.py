@@ -26,6 +26,7 @@ from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, fra
 from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.errors import ConnectError, DriveFault, ProtocolError
 from fdhil.sim.drive.dictionary import AbortCode, TransferAbort
+from tests.dressed.test_set_up import until_it_answers
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import Row, Wire, machine
 
@@ -154,6 +155,7 @@ def test_a_node_that_lacks_objects_is_listed_all_the_same(
     peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fdhil.commissioning.scan.ANSWER_S", 2.0)
+    monkeypatch.setattr(BusScanner, "answering", until_it_answers)
     _, settings = peer
     exact = Description(Path("b.eds"), 0x46444849, 0x402, 0x10000)
     other = Description(Path("a.eds"), 0x46444849, 0x402, 7)

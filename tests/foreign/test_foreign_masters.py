@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -39,6 +40,20 @@ def master(make: str, twin: TwinProcess) -> ForeignProcess:
 @pytest.mark.parametrize("make", MAKES)
 async def test_a_drive_that_a_foreign_master_runs_is_sampled(make: str, twin: tuple[TwinProcess, Path]) -> None:
     process, path = twin
+    for _ in range(3):  # a computer that held the master up for its counter's whole turn is given another try
+        records, counters = await sampled(make, process, path)
+        if counters["can0.sync_missed"] == 0:
+            break
+    codes = {record.code for record in records if isinstance(record, Notice)}
+    assert not codes & {"SyncCollision", "ForeignProducer", "DemandMismatch", "PdoLength", "PdoMissing"}
+    # a busy computer holds one of them up now and then; whoever mistook the counter would lose each tenth
+    assert counters["can0.pdo_lost"] + counters["can0.pdo_ambiguous"] < 0.05 * counters["can0.X.heard"], counters
+    enabled = [record for record in records if isinstance(record, AxisSamples) and record.tick.size]
+    assert int(enabled[-1].statusword[-1]) & 0x6F == 0x27
+
+
+async def sampled(make: str, process: TwinProcess, path: Path) -> tuple[list[Record], Mapping[str, Any]]:
+    """Let a master run the drive until 300 samples came; return all records, and the counters."""
     records: list[Record] = []
     enough = asyncio.Event()
 
@@ -57,12 +72,7 @@ async def test_a_drive_that_a_foreign_master_runs_is_sampled(make: str, twin: tu
             await asyncio.wait_for(enough.wait(), 300)
         counters = source.counters()
         running.cancel()
-    codes = {record.code for record in records if isinstance(record, Notice)}
-    assert not codes & {"SyncCollision", "ForeignProducer", "DemandMismatch", "PdoLength", "PdoMissing"}
-    # a busy computer holds one of them up now and then; whoever mistook the counter would lose each tenth
-    assert counters["can0.pdo_lost"] + counters["can0.pdo_ambiguous"] < 0.05 * counters["can0.X.heard"], counters
-    enabled = [record for record in records if isinstance(record, AxisSamples) and record.tick.size]
-    assert int(enabled[-1].statusword[-1]) & 0x6F == 0x27
+    return records, counters
 
 
 @pytest.mark.parametrize("make", MAKES)

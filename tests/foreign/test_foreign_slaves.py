@@ -13,10 +13,12 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil.cli.demo.processes import Process
+from fdhil.commissioning.scan import BusScanner
 from fdhil.drivers.bus_source import BusSource
 from fdhil.records import AxisSamples, Notice
 from fdhil.sim.wire.hub import Hub
 from tests.daemon.shop import fdhil
+from tests.dressed.test_set_up import until_it_answers
 from tests.foreign.peers import ForeignProcess
 from tests.sim.hub_thread import joined, serving
 from tests.sim.twin_process import write_config
@@ -57,6 +59,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 0.4)
     # the slave is a process of its own, on a computer that is busy
     monkeypatch.setattr("fdhil.commissioning.scan.ANSWER_S", 2.0)
+    monkeypatch.setattr(BusScanner, "answering", until_it_answers)
     monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 60.0)
     monkeypatch.setattr("fdhil.drivers.can.sdo.DEADLINE_S", 60.0)
 

@@ -36,6 +36,7 @@ def test_every_offset_is_applied_in_its_own_cycle(bench: Bench, tmp_path: Path) 
     try:
         for axis in bench.config.axis:
             node = network.add_node(bench.config.node_id(axis), str(tmp_path / "epos4.eds"))
+            node.sdo.RESPONSE_TIMEOUT = 60.0
 
             def write(index: int, sub: int, value: int, size: int, node: canopen.RemoteNode = node) -> None:
                 node.sdo.download(index, sub, value.to_bytes(size, "little"))
