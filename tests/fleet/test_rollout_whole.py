@@ -71,9 +71,12 @@ class Shop:
     def uplink(self, name: str) -> None:
         """Run a machine's uplink until it has fetched and sent what there is."""
         log = self._folder / f"{name}.log"
-        log.unlink(missing_ok=True)
-        with running(log, "uplink", self.files[name]) as process:
-            until(lambda: "all that was recorded is sent" in process.said, "it has sent all")
+        for _ in range(3):  # on a busy host an answer may come too late, and it looks again after a minute only
+            log.unlink(missing_ok=True)
+            with running(log, "uplink", self.files[name]) as process:
+                until(lambda: "all that was recorded is sent" in process.said, "it has sent all")
+            if "no offers can be fetched" not in log.read_text():
+                break
 
     def lying(self, name: str) -> list[str]:
         """Return the offers that lie at a machine."""

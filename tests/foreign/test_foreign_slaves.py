@@ -180,9 +180,12 @@ def test_the_daemon_waits_for_a_foreign_drive_that_says_nothing(hub: Hub, machin
         with Process("daemon", ["fdhil", "run", str(machine)], log) as daemon:
             _wait(daemon, lambda: "BusSilent: Nothing is heard on bus can0" in log.read_text())
             master.send(can.Message(arbitration_id=0, data=[1, NODE], is_extended_id=False))
-            for _ in range(20):
+
+            def heard_again() -> bool:
                 master.send(can.Message(arbitration_id=0x80, is_extended_id=False))
-            _wait(daemon, lambda: "BusSilent: Bus can0 is heard again" in log.read_text())
+                return "BusSilent: Bus can0 is heard again" in log.read_text()
+
+            _wait(daemon, heard_again)
             assert daemon.stop() == 0
     assert "ready: bench, axes X; listening, sending nothing" in log.read_text()
 

@@ -121,6 +121,7 @@ async def test_a_broker_that_goes_away_and_comes_back(tmp_path: Path) -> None:
         await _said(tmp_path, "check host and port, and whether it runs")
         for _ in range(2):
             async with broker(tmp_path, open_to_all(port), port), host_application(port) as listening:
+                await listening.command("Node Control/Rebirth")  # its birth may have come before anybody listened
                 await listening.until(lambda host: host.alive)
     assert (tmp_path / "publish.log").read_text().count("Traceback") == 0
 

@@ -51,6 +51,7 @@ def test_a_page_is_for_everyone(page: str, paths: dict[str, str], reader: Tab) -
     """axe finds nothing in light and in dark, nothing is lost at 400 %, no scrolling to both sides, no motion."""
     reader.page.emulate_media(reduced_motion="reduce")
     reader.open(paths[page])
+    reader.page.wait_for_function("document.querySelector('#standing .state')?.textContent")  # the machine is known
     assert reader.page.title().endswith("fdhil")
     assert reader.page.locator("h1").count() == 1
     assert reader.wider() == []

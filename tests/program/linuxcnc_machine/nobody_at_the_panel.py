@@ -6,6 +6,7 @@ LinuxCNC starts this in place of its display, with the system's Python. The dema
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -31,9 +32,10 @@ def wait_for(status: Any, ready: Callable[[], bool]) -> None:
     """Poll until something is so; exit 1 when it takes too long."""
     end = time.monotonic() + LIMIT_S
     while time.monotonic() < end:
-        status.poll()
-        if ready():
-            return
+        with contextlib.suppress(linuxcnc.error):  # the status may be locked for longer than it waits
+            status.poll()
+            if ready():
+                return
         time.sleep(0.005)
     sys.exit("the machine did not get there in time")
 
@@ -53,7 +55,7 @@ def main() -> None:
     """Run the program of the environment and record every servo cycle of it."""
     command, status = linuxcnc.command(), linuxcnc.stat()
     prepare(command, status)
-    status.poll()
+    wait_for(status, lambda: True)
     begin = tuple(status.position)
     with Path(os.environ["DEMAND"]).open("w") as out:
         recorder = subprocess.Popen(["halsampler", "-t"], stdout=out)
@@ -63,7 +65,7 @@ def main() -> None:
         # a short program may be over before a busy computer looks
         wait_for(status, lambda: status.interp_state != linuxcnc.INTERP_IDLE or tuple(status.position) != begin)
         wait_for(status, lambda: status.interp_state == linuxcnc.INTERP_IDLE and bool(status.inpos))
-        time.sleep(0.3)
+        time.sleep(1.0)  # by which the recorder may be behind
         recorder.terminate()
         recorder.wait()
 
