@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Set
 from typing import TYPE_CHECKING
 
 import pytest
@@ -46,12 +47,17 @@ def test_every_page_is_looked_at(paths: dict[str, str]) -> None:
     assert {path.split("/")[1] for path in paths.values()} == set(SHELL)
 
 
+def without_digits(labels: Set[str]) -> set[str]:
+    """Return labels without what counts."""
+    return {re.sub(r"\d", "", label) for label in labels}
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_a_page_is_for_everyone(page: str, paths: dict[str, str], reader: Tab) -> None:
     """axe finds nothing in light and in dark, nothing is lost at 400 %, no scrolling to both sides, no motion."""
     reader.page.emulate_media(reduced_motion="reduce")
     reader.open(paths[page])
-    reader.page.wait_for_function("document.querySelector('#standing .state')?.textContent")  # the machine is known
+    reader.page.locator("#standing .state").filter(has_text=re.compile(".")).wait_for(state="attached")
     assert reader.page.title().endswith("fdhil")
     assert reader.page.locator("h1").count() == 1
     assert reader.wider() == []
@@ -60,6 +66,6 @@ def test_a_page_is_for_everyone(page: str, paths: dict[str, str], reader: Tab) -
     reader.page.emulate_media(color_scheme="dark")
     assert reader.violations("color-contrast") == []
     reader.page.set_viewport_size(AT_400_PERCENT)
-    assert wide - reader.labels() == set()
+    assert without_digits(wide) - without_digits(reader.labels()) == set()  # notices may come meanwhile
     assert reader.wider() == []
     assert reader.page.evaluate("document.getAnimations().length") == 0
