@@ -127,14 +127,17 @@ def read(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in file.read_text("utf-8").splitlines()] if file.exists() else []
 
 
-def longest_life(samples: Sequence[Mapping[str, Any]], name: str) -> list[Mapping[str, Any]]:
-    """Return the samples of a part's process that lived longest, after its warm-up."""
+def longest_life(samples: Sequence[Mapping[str, Any]], name: str, where: str) -> list[Mapping[str, Any]]:
+    """Return the samples of a part's process that lived longest, after its warm-up; ``where`` counts its life."""
     lives: dict[int, list[Mapping[str, Any]]] = {}
     for sample in samples:
         if name in sample["process"]:
             lives.setdefault(sample["process"][name]["pid"], []).append(sample)
     longest = max(lives.values(), key=len, default=[])
-    return longest[int(WARM * len(longest)) :]
+    if not longest:
+        return []
+    begin, end = longest[0][where], longest[-1][where]
+    return [sample for sample in longest if sample[where] >= begin + WARM * (end - begin)]
 
 
 def figures_of(folder: Path, per_day: bool) -> dict[str, Any]:
@@ -147,7 +150,7 @@ def figures_of(folder: Path, per_day: bool) -> dict[str, Any]:
     where = "at_s" if per_day else "round"
     processes = {}
     for name in (*OURS, "machine"):
-        life = longest_life(samples, name)
+        life = longest_life(samples, name, where)
         if life:
             processes[name] = _process(name, life, where, day)
     return {
