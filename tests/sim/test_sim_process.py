@@ -6,6 +6,7 @@ import signal
 import socket
 import struct
 import sys
+import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -20,7 +21,7 @@ from fdhil import config
 from fdhil.cli.main import cli, run_safely
 from fdhil.program import load_trajectory
 from fdhil.sim import fault_script
-from fdhil.sim.service import SimService
+from fdhil.sim.service import LOCKSTEP_WAIT_S, SimService
 from tests.sim.bench_twin import corner
 from tests.sim.hub_thread import frames_of
 from tests.sim.twin_process import PATIENCE_S, TwinProcess, write_config
@@ -200,12 +201,32 @@ def test_lockstep_waits_for_a_client_that_answers_every_sync(tmp_path: Path) -> 
     assert first["X_offset_um"][3:] == pytest.approx(expected[3:], abs=1e-5)
 
 
-def answer(bus: can.BusABC) -> None:
-    """Answer the next demand of X as a correction does: by a function of it, never 0, which is not waited for long."""
+def test_lockstep_waits_for_a_client_whose_offset_is_zero_while_a_program_runs(tmp_path: Path) -> None:
+    """A guard is held up while the offset that it sends is still 0: the program does not run on without it."""
+    path = write_config(tmp_path, 'pace = "lockstep"\nlockstep_rpdo = ["X:2"]')
+    demand = write_demand(tmp_path / "corner.csv", corner())
+    with TwinProcess(path) as twin, twin.join() as bus:
+        twin.command("nc", on=True)
+        twin.event("nc")
+        for _ in range(200):
+            answer(bus, 0.0)
+        twin.command("play", file=str(demand))
+        while not twin.happened("playing"):
+            answer(bus, 0.0)
+        for _ in range(100):
+            answer(bus, 0.0)
+        time.sleep(LOCKSTEP_WAIT_S + 1.0)
+        while not twin.happened("finished"):
+            answer(bus, 0.0)
+        assert twin.events[-1]["late_rpdo"] == {"X": 0, "Y": 0}
+
+
+def answer(bus: can.BusABC, gain: float = 1.0) -> None:
+    """Answer the next demand of X as a correction does: by a function of it, never 0 but for a gain of 0."""
     while (message := bus.recv(100)) is not None and message.arbitration_id != 0x201:
         pass
     assert message is not None
-    offset = 99 - struct.unpack("<i", message.data[2:6])[0] // 1000
+    offset = round(gain * (99 - struct.unpack("<i", message.data[2:6])[0] // 1000))
     bus.send(can.Message(arbitration_id=0x301, data=struct.pack("<i", offset), is_extended_id=False))
 
 
