@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 from fdhil.arming.answers import refusal
@@ -31,17 +30,18 @@ class NotAcknowledged(FdhilError):
 
 
 class NoticeBook:
-    """The newest notices of the history. Safe to call from several threads."""
+    """The newest notices of the history: each while it is open, then only who acknowledged it. For several threads."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._known: dict[int, StoredNotice] = {}
+        self._known: dict[int, StoredNotice | Acknowledgement] = {}
         self._last: deque[tuple[Notice, int]] = deque(maxlen=LAST_STORED)
 
     def begin(self, notices: Sequence[StoredNotice]) -> None:
         """Start from what the history has, oldest first."""
         with self._lock:
-            self._known = {notice.number: notice for notice in notices if notice.notice.severity != "info"}
+            asking = [notice for notice in notices if notice.notice.severity != "info"]
+            self._known = {notice.number: notice.acknowledged or notice for notice in asking}
 
     def stored(self, notice: Notice, number: int, stamp: Stamp) -> None:
         """Note that a notice was stored."""
@@ -56,7 +56,7 @@ class NoticeBook:
         """Return the open notices that a request names; NotAcknowledged where it names none that there is."""
         numbers, up_to = request.get("notices"), request.get("up_to")
         with self._lock:
-            waiting = [number for number, notice in self._known.items() if notice.is_open]
+            waiting = [notice.number for notice in self._open()]
             if isinstance(up_to, int) and _is_number(up_to) and numbers is None:
                 return [number for number in waiting if number <= up_to]
             if not (isinstance(numbers, list) and numbers and all(map(_is_number, numbers)) and up_to is None):
@@ -72,25 +72,29 @@ class NoticeBook:
         with self._lock:
             for number in given.notices:
                 if number in self._known:
-                    self._known[number] = replace(self._known[number], acknowledged=given)
+                    self._known[number] = given
 
     def told(self, notice: Notice) -> dict[str, Any]:
         """Return the number of a notice in the history (None: not stored, yet) and its acknowledgement."""
         with self._lock:
             number = next((number for known, number in reversed(self._last) if known is notice), None)
             known = self._known.get(number) if number is not None else None
-        return {"number": number, "acknowledged": acknowledgement_document(known.acknowledged if known else None)}
+        given = known if isinstance(known, Acknowledgement) else None
+        return {"number": number, "acknowledged": acknowledgement_document(given)}
 
     def status(self) -> dict[str, Any]:
         """Return what waits to be acknowledged: how many, how many of them MAJOR, and the newest, oldest first."""
         with self._lock:
-            waiting = [notice for notice in self._known.values() if notice.is_open]
+            waiting = self._open()
         major = sum(notice.notice.severity == "MAJOR" for notice in waiting)
         return {
             "count": len(waiting),
             "MAJOR": major,
             "newest": [notice_document(notice) for notice in waiting[-TOLD_OPEN:]],
         }
+
+    def _open(self) -> list[StoredNotice]:
+        return [known for known in self._known.values() if isinstance(known, StoredNotice)]
 
 
 def _is_number(value: object) -> bool:

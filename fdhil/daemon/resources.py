@@ -5,11 +5,9 @@ The bound is the tightest of what systemd set (MemoryMax, TasksMax) and the proc
 
 from __future__ import annotations
 
-import ctypes
 import errno
 import os
 import resource
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,20 +15,6 @@ from fdhil.records import Notice
 
 HIGH, LOW = 0.8, 0.7  # share of what is allowed at which it is told, and below which it is over
 CGROUPS = Path("/sys/fs/cgroup")
-# what mallopt(3) calls them; the sizes are those that a process of glibc begins with
-MALLOPT = {"M_TRIM_THRESHOLD": (-1, 128 << 10), "M_MMAP_THRESHOLD": (-3, 128 << 10), "M_ARENA_MAX": (-8, 2)}
-
-
-def give_back_what_is_freed() -> None:
-    """Keep the heap small over months: a large block that is freed goes back to the computer (glibc; else nothing).
-
-    By itself glibc takes each large block that was freed as a reason to lay the next ones of that size among the small
-    ones, where a small one that stays holds all before it, and gives each thread a heap of its own.
-    """
-    with suppress(OSError, AttributeError):
-        mallopt = ctypes.CDLL(None).mallopt
-        for name, value in MALLOPT.values():
-            mallopt(name, value)
 
 
 @dataclass(frozen=True, slots=True)

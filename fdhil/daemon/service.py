@@ -21,7 +21,7 @@ from fdhil.arming.guard_link import TRIPPED, VOIDING
 from fdhil.arming.standing import ADOPT, START_AND_ADOPT, Standing
 from fdhil.commissioning.void import void_record
 from fdhil.config import MachineConfig, unlikely
-from fdhil.daemon import blackbox, journal
+from fdhil.daemon import blackbox, heap, journal
 from fdhil.daemon.audited import Audited
 from fdhil.daemon.clock import ClockWatch, newest_record_s
 from fdhil.daemon.control import SOCKET_NAME, ControlServer
@@ -32,7 +32,7 @@ from fdhil.daemon.notify import notify
 from fdhil.daemon.offer_watch import OfferWatch
 from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.daemon.record_queue import RecordQueue
-from fdhil.daemon.resources import ResourceWatch, Use, give_back_what_is_freed, uses
+from fdhil.daemon.resources import ResourceWatch, Use, uses
 from fdhil.daemon.status import Watch
 from fdhil.errors import DeviceError, FdhilError, StoreError
 from fdhil.pipeline import AxisPipeline, Record
@@ -300,6 +300,7 @@ class Service:
         """Look now and then: is memory, are descriptors nearly used up, was the clock set, does an offer wait."""
         watch, offers = ResourceWatch(), OfferWatch(self._config)
         while True:
+            await asyncio.to_thread(heap.give_back)
             self._resources = uses()
             self._tell([*watch.look(self._resources), *clock.look(time.time(), time.monotonic())])
             self._tell(await asyncio.to_thread(offers.look))
@@ -369,7 +370,7 @@ def run(config: MachineConfig, open_source: OpenSource, method: str | None = Non
 
     FdhilError when it cannot start or meets what it must not survive.
     """
-    give_back_what_is_freed()
+    heap.keep_small()
     service = Service(config, open_source, method)
     try:
         return asyncio.run(service.run())

@@ -8,7 +8,7 @@ import signal
 from collections.abc import Awaitable, Callable
 from typing import TypeVar
 
-from fdhil.daemon import journal
+from fdhil.daemon import heap, journal
 from fdhil.daemon.notify import notify
 
 C = TypeVar("C")
@@ -16,6 +16,7 @@ C = TypeVar("C")
 
 def run(publisher: Callable[[C], Awaitable[None]], config: C) -> None:
     """Publish until it is told to stop. FdhilError when it cannot start."""
+    heap.keep_small()
     asyncio.run(_until_told_to_stop(publisher, config))
 
 

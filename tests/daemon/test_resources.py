@@ -24,8 +24,9 @@ def used() -> dict[str, int]:
 
 FREED = """
 import numpy as np
-from fdhil.daemon.resources import give_back_what_is_freed, uses
-give_back_what_is_freed()
+from fdhil.daemon.heap import keep_small
+from fdhil.daemon.resources import uses
+keep_small()
 for _ in range(3):
     np.ones(3 << 20)  # by itself glibc would lay blocks of up to this size among the small ones from now on
 before = uses()[0].used
@@ -41,6 +42,22 @@ print(uses()[0].used - before)
 def test_a_large_block_that_is_freed_is_given_back() -> None:
     said = subprocess.run([sys.executable, "-c", FREED], capture_output=True, text=True, check=True)
     assert int(said.stdout) < 5e6  # of 42 MB
+
+
+BETWEEN = """
+from fdhil.daemon.heap import give_back
+from fdhil.daemon.resources import uses
+small = [bytes(1000) for _ in range(40_000)]
+small = small[::200]  # a used one in every 200 kB
+before = uses()[0].used
+give_back()
+print(before - uses()[0].used)
+"""
+
+
+def test_what_lies_free_between_used_blocks_is_given_back() -> None:
+    said = subprocess.run([sys.executable, "-c", BETWEEN], capture_output=True, text=True, check=True)
+    assert int(said.stdout) > 30e6  # of 40 MB
 
 
 GROW = """
