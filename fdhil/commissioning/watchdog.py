@@ -31,11 +31,12 @@ def watchdog_test(master: Master, enable: Callable[[Master], None]) -> str:
         master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, 0, 4)
         undo.callback(master.sdo.write_int, Object.CONSUMER_HEARTBEAT, sub, before, 4)
         undo.callback(setattr, master, "heartbeat", False)
-        _feed(master, sub, entry, enable)
+        fed_from = _feed(master, sub, entry, enable)
         told = len(master.heard.emergencies)
         master.heartbeat = False
         with contextlib.suppress(DeviceError):
             master.wait(lambda: _reacted(master, told), STARVE_TIMEOUT_S, "")
+        master.wait_cycles(ANSWER_CYCLES)  # its EMCY may come after its statusword
         master.check()
         if master.state() is State.OPERATION_ENABLED:  # by 0x1029 it may have left Operational, and tell nothing
             master.nmt(NmtCommand.START)
@@ -43,7 +44,7 @@ def watchdog_test(master: Master, enable: Callable[[Master], None]) -> str:
         if master.state() is State.OPERATION_ENABLED:
             text = "it went on although our heartbeat stopped: its watchdog does not work; check 0x1016 and 0x6007"
             raise DriveFault(master.device, text)
-        codes = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[told:]]
+        codes = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[fed_from:]]
         if EMCY_HEARTBEAT not in codes:
             shown = ", ".join(f"{code:04X}" for code in codes) or "none"
             text = f"it stopped with the EMCY {shown} instead of 8130; find out what else stops it"
@@ -78,10 +79,11 @@ def _reacted(master: Master, told: int) -> bool:
     return master.state() is not State.OPERATION_ENABLED or len(master.heard.emergencies) > told
 
 
-def _feed(master: Master, sub: int, entry: int, enable: Callable[[Master], None]) -> None:
+def _feed(master: Master, sub: int, entry: int, enable: Callable[[Master], None]) -> int:
     """Have the drive watch our heartbeat, and keep it content for a while; DriveFault when that cannot be done.
 
     A busy computer sends a heartbeat late now and then, and the drive is right to stop then; that is tried again.
+    Returns how many emergencies came before it was content: what comes later may be of a heartbeat that was late.
     """
     for _ in range(FEEDING_TRIES):
         master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, entry, 4)
@@ -91,7 +93,7 @@ def _feed(master: Master, sub: int, entry: int, enable: Callable[[Master], None]
         master.heartbeat = True
         master.wait_cycles(round(FEEDING_S / master.period_s))
         if master.state() is State.OPERATION_ENABLED:
-            return
+            return told
         codes = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[told:]]
         if EMCY_HEARTBEAT not in codes:
             require_enabled(master)

@@ -14,6 +14,7 @@ import pytest
 
 from fdhil.cia402 import Object, State
 from fdhil.commissioning import steps, survey
+from fdhil.commissioning import watchdog as watchdog_module
 from fdhil.commissioning.cycle import Cycle
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.steps import (
@@ -277,6 +278,21 @@ def test_a_drive_that_trips_while_it_is_fed_is_not_tried_again(
     with pytest.raises(DriveFault, match="it fell from Operation enabled to Fault"):
         run_steps(fed.master, watchdog)
     assert fed.feedings == 1
+
+
+def test_a_heartbeat_that_is_late_right_after_the_feeding_proves_as_much(
+    fed: LateCycle, peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    feed = watchdog_module._feed
+
+    def fed_and_late(master: Master, sub: int, entry: int, enable: Callable[[Master], None]) -> int:
+        before = feed(master, sub, entry, enable)
+        peer[0].drive.trip(watchdog_module.EMCY_HEARTBEAT)
+        master.wait_cycles(20)
+        return before
+
+    monkeypatch.setattr(watchdog_module, "_feed", fed_and_late)
+    run_steps(fed.master, lambda m: watchdog(m) == "proven" or pytest.fail("not proven"))
 
 
 class SlowReader(Master):
