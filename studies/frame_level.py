@@ -61,10 +61,11 @@ class Cut(Bench):
 
     def step(self, inputs: Inputs) -> Output:
         """Decide, and judge what leaves."""
-        if not inputs.transmitted and self.outputs and self.outputs[-1].offsets is not None:
-            for wire in self.wires:
-                wire.lost()
-            self.series[-1] = self.series[-2]
+        if inputs.unsent and self.outputs and self.outputs[-1].offsets is not None:
+            for k in inputs.unsent:
+                self.wires[k].lost()
+            held = [self.series[-2 if k in inputs.unsent else -1][k] for k in range(len(self.wires))]
+            self.series[-1] = tuple(held)
         held = [drive.offset for drive in self.drives]
         output = super().step(inputs._replace(withdrawn=self.withdrawn))
         for k, wire in enumerate(self.wires):
@@ -215,7 +216,7 @@ def _one_sync(cut: Cut, row: str, k: int) -> None:
         case "A7":
             cut.silence() if k < 100 else cut.sync()
         case "A5":
-            cut.sync(transmitted=k > 3)
+            cut.sync(unsent=() if k > 3 else (0, 1))
         case "A8":
             assert isinstance(cut.listener, LateListener)
             cut.listener.late_s += 5e-5

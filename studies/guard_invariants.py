@@ -12,7 +12,7 @@ import random
 import struct
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -93,24 +93,26 @@ class Walk:
         """One of the drives, 0 or 1."""
         return self.rng.randrange(len(AXES))
 
-    def cycle(self, request: Request | None = None, late: bool = False, left: bool = True, nc: bool = True) -> None:
-        """One SYNC; its frames are judged."""
+    def cycle(
+        self, request: Request | None = None, late: bool = False, unsent: Sequence[int] = (), nc: bool = True
+    ) -> None:
+        """One SYNC; its frames are judged. ``unsent``: the axes whose frames of the step before did not leave."""
         machine = self.machine
-        if not left and machine.outputs:
-            self._not_left(machine.outputs[-1])
+        if unsent and machine.outputs:
+            self._not_left(machine.outputs[-1], unsent)
         machine.outputs, machine.frames, machine.held = machine.outputs[-1:], machine.frames[-1:], []
         dropped = tuple([cob_id for cob_id, until in self.drop.items() if machine.tick < until])
-        output = machine.sync(request, late=late, transmitted=left, nc=nc, drop=dropped)
+        output = machine.sync(request, late=late, unsent=unsent, nc=nc, drop=dropped)
         self.seen["sync"] += 1
         self.judge(output, late)
 
-    def _not_left(self, output: Output) -> None:
-        for wire in self.wires if output.offsets is not None else ():
-            wire.lost()
-        for fed_wire, drive in zip(self.fed_wires, self.machine.drives, strict=True):
+    def _not_left(self, output: Output, unsent: Sequence[int]) -> None:
+        for k in unsent:
+            if output.offsets is not None:
+                self.wires[k].lost()
             if output.feed is not None:
-                drive.received_fed = None
-                fed_wire.lost()
+                self.machine.drives[k].received_fed = None
+                self.fed_wires[k].lost()
 
     def judge(self, output: Output, late: bool) -> None:
         """Judge what left at a SYNC, or at the local timer without one."""
@@ -188,7 +190,12 @@ def restarted(walk: Walk) -> None:
         wire.last = FORGETS  # where none is shown it begins at zero, whatever the drive holds
 
 
-def cycles(**how: bool) -> Callable[[Walk], None]:
+def not_left_of_one(walk: Walk) -> None:
+    """The frames of one axis do not leave for a few cycles, those of the other do."""
+    cycles(unsent=(walk.node,))(walk)
+
+
+def cycles(**how: Any) -> Callable[[Walk], None]:
     """Return a happening of a few cycles that are not as they should be."""
 
     def happen(walk: Walk) -> None:
@@ -296,7 +303,8 @@ HAPPENINGS: tuple[tuple[str, Callable[[Walk], None]], ...] = (
     ("TPDO3 remapped", drive(remapped=(True, False))),
     ("garbage", garbage),
     ("late cycles", cycles(late=True)),
-    ("frames that did not leave", cycles(left=False)),
+    ("frames that did not leave", cycles(unsent=(0, 1))),
+    ("an axis' frames that did not leave", not_left_of_one),
     ("NC silent", cycles(nc=False)),
     ("SYNC silent", no_sync),
     ("SYNC counter jumped", counter_jumped),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import math
 import socket
 import struct
 from abc import ABC, abstractmethod
@@ -197,9 +198,10 @@ class SocketcandText(CanSocket):
         if cob_id is None or words[1] != b"frame":
             return None
         try:
-            return cob_id, bytes.fromhex(b"".join(words[4:]).decode("ascii")), float(words[3])
+            data, stamp_s = bytes.fromhex(b"".join(words[4:]).decode("ascii")), float(words[3])
         except ValueError:
             return None
+        return (cob_id, data, stamp_s) if math.isfinite(stamp_s) else None
 
     @staticmethod
     def _controller(words: list[bytes]) -> Frame | None:

@@ -34,13 +34,11 @@ class Closer:
 
     def __init__(self) -> None:
         self._left: queue.SimpleQueue[int | None] = queue.SimpleQueue()
-        self._thread: threading.Thread | None = None
+        self._thread = threading.Thread(target=self._run, name="closer", daemon=True)
+        self._thread.start()  # now: later there may be no room for a thread
 
     def take(self, descriptor: int) -> None:
         """Close a descriptor some time."""
-        if self._thread is None:
-            self._thread = threading.Thread(target=self._run, name="closer", daemon=True)
-            self._thread.start()
         self._left.put(descriptor)
 
     def _run(self) -> None:
@@ -50,9 +48,8 @@ class Closer:
 
     def end(self) -> None:
         """Wait a moment for what is left; what still waits then is closed by the process' end."""
-        if self._thread is not None:
-            self._left.put(None)
-            self._thread.join(0.5)
+        self._left.put(None)
+        self._thread.join(0.5)
 
 
 @dataclass(slots=True, eq=False)
@@ -101,7 +98,7 @@ class Client:
             for descriptor in array("i", data):
                 self.release()
                 self.descriptor = descriptor
-        self.gone = not chunk
+        self.gone = self.gone or not chunk  # one that has to make room for another has gone, whatever it says
         self.inbox += chunk
 
     def settle(self) -> None:
@@ -149,7 +146,6 @@ class Control:
         self.path = run_directory / SOCKET_NAME
         self.clients: list[Client] = []
         self._access, self._turned_away = access, turned_away
-        self._closer = Closer()
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             self.path.unlink(missing_ok=True)  # the bus lock is ours already: no other guard listens here
@@ -164,6 +160,7 @@ class Control:
             text = f"the control socket cannot be made ({error.strerror or error}), and nothing is sent"
             raise DeviceError(str(self.path), f"{text}; check the run directory") from None
         self._listener.setblocking(False)
+        self._closer = Closer()
 
     def fileno(self) -> int:
         """The listener's descriptor, for poll."""
@@ -184,7 +181,7 @@ class Control:
         """Take one connection, and one request of the client that has waited longest."""
         if self.fileno() in ready:
             self._accept(now_s)
-        for client in self.clients:
+        for client in [client for client in self.clients if not client.gone]:
             if client.fileno() in ready or (b"\n" in client.inbox and not client.outbox):
                 self.clients.remove(client)
                 self.clients.append(client)

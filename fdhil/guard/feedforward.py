@@ -96,9 +96,13 @@ class Feed(NamedTuple):
         """Note what is sent now."""
         return self._replace(sent=(pairs, *self.sent)[:KEPT])
 
-    def not_sent(self) -> Feed:
-        """The last frames did not leave: the offsets before them are still in force."""
-        return self._replace(sent=(self.sent[1], *self.sent[1:])) if len(self.sent) > 1 else self
+    def not_sent(self, axes: Sequence[int]) -> Feed:
+        """The last frames of some axes did not leave: the offsets before them are still in force."""
+        if not axes or len(self.sent) == 1:
+            return self
+        newest, before = self.sent[:2]
+        held = [before[k] if k in axes else pair for k, pair in enumerate(newest)]
+        return self._replace(sent=(tuple(held), *self.sent[1:]))
 
 
 def armed(laws: tuple[Law, ...]) -> Feed:

@@ -17,7 +17,7 @@ def is_fed(state: State) -> bool:
 
 def go_on(state: State, inputs: Inputs, alarms: Alarms, settings: Settings, output: Output) -> tuple[State, Output]:
     """Go on with the feed-forward; on a lost SYNC its zeros are sent all the same."""
-    before = state.feed if inputs.transmitted else state.feed.not_sent()
+    before = state.feed.not_sent(inputs.unfed)
     if before.mode is FeedMode.OFF:
         return state, output
     own = () if inputs.main_alive is True else (Alarm("MainLost"),)

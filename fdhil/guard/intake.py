@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 from fdhil.guard import table
 from fdhil.guard.control import Client
@@ -17,6 +17,7 @@ from fdhil.guard.state import State
 ROWS_PER_TURN = 64
 ROWS_PER_IDLE_TURN = 1024
 MAX_RUNNING_PIECE_BYTES = 1 << 18
+Kind = Literal["whole", "piece", "renewal"]
 
 
 class Intake:
@@ -27,7 +28,7 @@ class Intake:
         self._settings = settings
         self._journal = journal
         self._loading: tuple[table.Loading, Client, Document] | None = None
-        self._renews = False
+        self._kind: Kind = "whole"
         self._taken = 0
         self._refused = ""
 
@@ -48,13 +49,13 @@ class Intake:
                 raise table.TableRefused("TableBusy", "another table is being checked; wait for its answer")
             most_bytes = MAX_RUNNING_PIECE_BYTES if running else table.MAX_TABLE_BYTES
             loading = self._joined(table.read_sealed(client.descriptor, most_bytes), state, running, renews)
-            if running and not renews and loading.joined.first == 0 and loading.next_row == 0:
-                raise table.TableRefused("TableBusy", Alarm("TableBusy").cause)
+            kind = _kind(loading, renews)
+            _require(kind, state)
         except table.TableRefused as refusal:
             self._refuse(client, document, refusal)
         else:
             self._taken += 1
-            self._loading, self._renews = (loading, client, document), renews
+            self._loading, self._kind = (loading, client, document), kind
         client.release()
 
     def _joined(self, body: bytes, state: State, running: bool, renews: bool) -> table.Loading:
@@ -72,8 +73,7 @@ class Intake:
             return
         loading, client, document = self._loading
         try:
-            if self._renews and state.mode is not Mode.ARMED:
-                raise table.TableRefused("TableBusy", Alarm("TableBusy").cause)
+            _require(self._kind, state)  # it may have been armed since the table came
             loading.check(ROWS_PER_TURN if state.sending else ROWS_PER_IDLE_TURN)
         except table.TableRefused as refusal:
             self._loading = None
@@ -90,3 +90,17 @@ class Intake:
         self._refused = str(refusal)
         advice = Alarm(refusal.code).action
         client.reply(document, ok=False, code=refusal.code, text=str(refusal), advice=advice)
+
+
+def _kind(loading: table.Loading, renews: bool) -> Kind:
+    """Return what a table is that has just begun."""
+    if renews:
+        return "renewal"
+    return "whole" if loading.joined.first == 0 and loading.next_row == 0 else "piece"
+
+
+def _require(kind: Kind, state: State) -> None:
+    """TableRefused where such a table may not take force: what is armed is replaced by its own renewal alone."""
+    standing = state.mode is Mode.OFF and not state.sending
+    if not {"piece": True, "renewal": state.mode is Mode.ARMED, "whole": standing}[kind]:
+        raise table.TableRefused("TableBusy", Alarm("TableBusy").cause)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import select
 import time
+from collections.abc import Sequence
 
 from fdhil.cia402 import COB_SYNC, pack
 from fdhil.guard.can_socket import BusDown, CanSocket
@@ -15,12 +16,13 @@ from fdhil.guard.state import State
 ZEROS = 5
 
 
-def land(state: State, settings: Settings, can: CanSocket) -> tuple[int, ...]:
+def land(state: State, unsent: Sequence[int], settings: Settings, can: CanSocket) -> tuple[int, ...]:
     """Ramp the offsets to zero and return what was sent last, in increments per axis; it stops when SYNC or bus stop.
 
-    Speed and torque offsets are set to zero at once. Nothing is judged and nothing is read back.
+    ``unsent`` are the axes whose last offset did not leave. Speed and torque offsets are set to zero at once. Nothing
+    is judged and nothing is read back.
     """
-    moving = [(axis.offset, axis.rate) for axis in state.axes]
+    moving = [(axis.sent[1], 0) if k in unsent else (axis.offset, axis.rate) for k, axis in enumerate(state.axes)]
     feeds = () if state.feed.mode is FeedMode.OFF else settings.feeds
     zeros = 0 if state.sending else ZEROS
     try:

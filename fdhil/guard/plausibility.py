@@ -15,9 +15,9 @@ from fdhil.guard.transitions import Event
 def observe(state: State, inputs: Inputs, settings: Settings) -> State:
     """Take in what was sampled: failed frames, read-backs, following errors, the targets just latched."""
     axes, failed = tuple(map(_touched, state.axes, inputs.axes)), 0
-    if not inputs.transmitted:
-        axes, failed = tuple(map(_not_sent, axes)), state.failed_run + 1
-        state = behind(state)
+    if inputs.unsent or inputs.unfed:
+        axes = tuple([_not_sent(axis) if k in inputs.unsent else axis for k, axis in enumerate(axes)])
+        state, failed = behind(state), state.failed_run + 1
     if not inputs.sync:
         return state._replace(axes=axes, failed_run=failed, tick=state.tick + (not settings.offset_synchronous))
     heard = [axis.target for axis in inputs.axes]

@@ -10,7 +10,7 @@ import select
 import socket
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +60,8 @@ class Guard:
         self._disarms = 0
         self._owner: Client | None = None
         self._withdrawn: tuple[Alarm, ...] = ()
-        self._transmitted = True
+        self._unsent: tuple[int, ...] = ()
+        self._unfed: tuple[int, ...] = ()
         self._inputs: Inputs | None = None
         self._shadow = Shadow()
         self._last_sync_s = time.monotonic()
@@ -96,7 +97,7 @@ class Guard:
         text = f"{cause.cause}; {effect}; {cause.action}"
         self._journal.write("failed", code=cause.code, state=self.state.mode.value, text=text)
         self._notifier.tell("STOPPING=1")
-        sending, sent = self.state.sending, land(self.state, self.settings, self._can)
+        sending, sent = self.state.sending, land(self.state, self._unsent, self.settings, self._can)
         standing_um = status.may_stand_um(self.state, self.settings)
         if sending:  # nothing was read back on the way
             standing_um = dict.fromkeys(standing_um)
@@ -220,11 +221,11 @@ class Guard:
         taking_over = arming and not self.state.sending
         in_charge, withdrawn = (client, ()) if taking_over else (self._owner, self._withdrawn)
         alive, alarms = self._alive(in_charge, now_s), self._listener.alarms()
-        heard = (late, self._transmitted, alive, alarms, withdrawn, self.intake.path, request)
+        heard = (late, self._unsent, self._unfed, alive, alarms, withdrawn, self.intake.path, request)
         inputs = Inputs(seen.sync, seen.axes, seen.bus, *heard)
         before = self.state.axes
         self.state, output = core.step(self.state, inputs, self.settings)
-        self._transmitted = self._send(output)
+        self._send(output)
         self._inputs, self._stepped_s = inputs, now_s
         if inputs.sync:
             self._shadow.follow(self.state, self.intake.path)
@@ -232,10 +233,12 @@ class Guard:
             self._own(client)
         if output.refused is not None and client is not None:
             self._answer(client, document, output.refused)
+        asked = client.peer if client is not None and request is not None and request.kind == "disarm" else None
+        by = {"uid": asked.uid, "pid": asked.pid} if asked is not None else {}
         if output.transition is not None and not {*output.transition[:2]} <= {Mode.RAMPING, Mode.ACTIVE}:
-            self._tell(*output.transition)
+            self._tell(*output.transition, by)
         if output.feed_transition is not None:
-            self._tell_feed(*output.feed_transition)
+            self._tell_feed(*output.feed_transition, by)
         for own, was, axis in zip(self.settings.axes, before, self.state.axes, strict=True):
             if axis.record_void and not was.record_void:
                 self._journal.write("record_void", axis=own.name, text=Alarm("RecordVoid", own.name).sentence())
@@ -249,23 +252,30 @@ class Guard:
             each.armed = each is client
         self._owner, self._withdrawn = client, ()
 
-    def _send(self, output: Output) -> bool:
-        sent = True
-        try:
-            if output.offsets is not None:
-                for axis, entries, offset in zip(self.settings.axes, self._entries, output.offsets, strict=True):
-                    sent = self._can.send(axis.offset.cob_id, pack(entries, (offset,))) and sent
-            if output.feed is not None:
-                for feed, pair in zip(self.settings.feeds, output.feed, strict=True):
-                    sent = self._can.send(feed.pdo.cob_id, pack(feed.pdo.entries, pair)) and sent
-            if output.heartbeat:
-                self._can.send(COB_HEARTBEAT + self.settings.node_id, bytes([Nmt.OPERATIONAL]))
-        except BusDown as error:
-            self._bus_down(error)
-            return False
-        return sent
+    def _send(self, output: Output) -> None:
+        """Send what a step says, and note which axes' frames did not leave."""
+        axes = zip(self.settings.axes, self._entries, output.offsets or (), strict=output.offsets is not None)
+        self._unsent = self._sent([(axis.offset.cob_id, pack(entries, (offset,))) for axis, entries, offset in axes])
+        feeds = zip(self.settings.feeds, output.feed or (), strict=output.feed is not None)
+        self._unfed = self._sent([(feed.pdo.cob_id, pack(feed.pdo.entries, pair)) for feed, pair in feeds])
+        if output.heartbeat:
+            self._sent([(COB_HEARTBEAT + self.settings.node_id, bytes([Nmt.OPERATIONAL]))])
 
-    def _tell(self, before: Mode, mode: Mode, cause: Alarm | None) -> None:
+    def _sent(self, frames: Sequence[tuple[int, bytes]]) -> tuple[int, ...]:
+        """Send frames; return the places of those that did not leave. On a dead bus none is tried."""
+        unsent = []
+        for k, (cob_id, data) in enumerate(frames):
+            try:
+                left = self._listener.bus_state != "down" and self._can.send(cob_id, data)
+            except BusDown as error:
+                self._bus_down(error)
+                left = False
+            if not left:
+                unsent.append(k)
+        return tuple(unsent)
+
+    def _tell(self, before: Mode, mode: Mode, cause: Alarm | None, by: Mapping[str, int]) -> None:
+        """Write down a change of state; ``by`` is whose disarm led to it."""
         standing_um = status.may_stand_um(self.state, self.settings)
         off = mode is Mode.OFF and not status.sentence(standing_um)
         told = {"code": cause.code, "axis": cause.axis, "text": cause.sentence(off)} if cause else {}
@@ -278,13 +288,14 @@ class Guard:
             may_stand_um=standing_um,
             missed=self.state.missed,
             **told,
+            **by,
         )
         self._notifier.tell(f"STATUS={mode.value}" + (f": {cause.cause}" if cause else ""))
 
-    def _tell_feed(self, before: FeedMode, mode: FeedMode) -> None:
+    def _tell_feed(self, before: FeedMode, mode: FeedMode, by: Mapping[str, int]) -> None:
         cause = self.state.feed.cause
         told = {"code": cause.code, "axis": cause.axis, "text": cause.sentence(mode is FeedMode.OFF)} if cause else {}
-        self._journal.write("feedforward", before=before.value, state=mode.value, tick=self.state.tick, **told)
+        self._journal.write("feedforward", before=before.value, state=mode.value, tick=self.state.tick, **told, **by)
         self._notifier.tell(f"STATUS=feed-forward {mode.value}" + (f": {cause.cause}" if cause else ""))
 
     # --- the clients ---
@@ -319,23 +330,33 @@ class Guard:
             client.reply(document, ok=False, code="BadRequest", text=told, advice=f"use one of {', '.join(DECIDED)}")
 
     def _queue(self, client: Client, document: Document, request: Request) -> None:
-        """Have a step decide; one request of a client waits at a time, but a disarm takes the place of another.
+        """Have a step decide; one request of a client waits at a time, but a disarm takes the place of all others.
 
-        A request that names another number of ``disarms`` was made before the last of them, and slept since.
+        A request that names another number of ``disarms`` was made before the last of them, and slept since. Of clients
+        that have gone one disarm waits, however many said it.
         """
-        if request.kind == "disarm":
+        disarms = request.kind == "disarm"
+        if disarms:
             self._disarms += 1
         elif document.get("disarms", self._disarms) != self._disarms:
             self._answer(client, document, (Alarm("DisarmedSince"),))
             return
-        waiting = next((waits for waits in self._requests if waits[0] is client), None)
-        if waiting is not None and (request.kind != "disarm" or waiting[2].kind == "disarm"):
-            self._answer(client, document, (Alarm("GuardBusy"),))
+        elif self._stopping:
+            self._answer(client, document, (Alarm("Stopped"),))
             return
-        if waiting is not None:
-            self._requests.remove(waiting)
-            self._answer(client, waiting[1], (Alarm("GuardBusy"),))
-        self._requests.append((client, document, request))
+        for waits in list(self._requests):
+            owner, asked, other = waits
+            if owner is None:
+                continue
+            if disarms and other.kind != "disarm":
+                self._answer(owner, asked, (Alarm("DisarmedSince"),))
+                self._requests.remove(waits)
+            elif owner.gone and (disarms or other.kind != "disarm"):
+                self._requests.remove(waits)
+        if any(waits[0] is client for waits in self._requests):
+            self._answer(client, document, (Alarm("GuardBusy"),))
+        else:
+            self._requests.append((client, document, request))
 
     def _withdraw(self, client: Client, document: Document) -> None:
         """The daemon's keep-alive; what it no longer vouches for ends the correction."""

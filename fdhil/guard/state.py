@@ -75,15 +75,17 @@ class BusView(NamedTuple):
 class Inputs(NamedTuple):
     """All that one step may know. ``sync`` False: the local timer, because no SYNC came.
 
-    ``late``: the next SYNC is already there, so that nothing sent now would be in time. ``transmitted`` says whether
-    the frames of the step before left. ``alarms`` are events since the last step (emergency, foreign frame).
+    ``late``: the next SYNC is already there, so that nothing sent now would be in time. ``unsent`` are the axes whose
+    offset of the step before did not leave, ``unfed`` those whose speed and torque offset did not. ``alarms`` are
+    events since the last step (emergency, foreign frame).
     """
 
     sync: bool
     axes: tuple[AxisInput, ...]
     bus: BusView
     late: bool = False
-    transmitted: bool = True
+    unsent: tuple[int, ...] = ()
+    unfed: tuple[int, ...] = ()
     main_alive: bool = True
     alarms: tuple[Alarm, ...] = ()
     withdrawn: tuple[Alarm, ...] = ()

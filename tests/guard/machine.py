@@ -221,18 +221,21 @@ class Bench:
         request: Request | None = None,
         *,
         late: bool = False,
-        transmitted: bool = True,
+        unsent: Sequence[int] = (),
         nc: bool = True,
         drop: Sequence[int] = (),
     ) -> Output:
         """One SYNC: drives latch and sample, the guard steps and sends, then the NC streams.
 
-        ``transmitted`` False: what the guard sent in the step before did not leave.
+        ``unsent``: the axes whose frames of the step before did not leave.
         """
-        if not transmitted and self.outputs and self.outputs[-1].offsets is not None:
-            self.frames.pop()
-            for drive in self.drives:
-                drive.received_offset = None
+        if unsent and self.outputs and self.outputs[-1].offsets is not None:
+            tick, offsets = self.frames.pop()
+            for k in unsent:
+                self.drives[k].received_offset = None
+            if len(unsent) < len(self.drives) and self.frames:
+                before = self.frames[-1][1]
+                self.frames.append((tick, tuple([before[k] if k in unsent else o for k, o in enumerate(offsets)])))
         self.tick += 1
         self.counter = self.counter % 240 + 1
         sampled = [frame for drive in self.drives for frame in drive.at_sync(self.tick)]
@@ -243,7 +246,8 @@ class Bench:
             axes,
             bus,
             late,
-            transmitted,
+            tuple(unsent),
+            tuple(unsent),
             self.main_alive,
             self.listener.alarms(),
             path=self.path,

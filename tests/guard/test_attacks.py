@@ -225,7 +225,7 @@ def test_a_second_request_waits_for_the_answer_to_the_first(rig: Rig) -> None:
         assert (told["id"], told["code"]) == (2, "GuardBusy")
         client.send(b'{"request": "disarm", "id": 3}\n')
         told = answer(client)
-        assert (told["id"], told["code"]) == (1, "GuardBusy")
+        assert (told["id"], told["code"]) == (1, "DisarmedSince")
         rig.peer.syncing = True
         told = answer(client)
         assert (told["id"], told["ok"]) == (3, True)

@@ -200,7 +200,7 @@ def test_a_frame_that_did_not_leave_changes_nothing() -> None:
     machine = active()
     before = machine.state.axes[0]
     machine.sync()
-    seen = inputs_of(machine)._replace(transmitted=False)
+    seen = inputs_of(machine)._replace(unsent=(0, 1))
     after = observe(machine.state, seen, machine.settings)
     assert after.axes[0].offset == before.offset
     assert after.axes[0].rate == 0

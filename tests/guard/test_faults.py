@@ -322,7 +322,7 @@ def test_on_a_real_machine_a_late_loop_is_told_before_it_is_armed() -> None:
 @pytest.mark.fault("A5")
 def test_full_transmit_queue(cutting: Bench, failures: int, mode: Mode) -> None:
     for _ in range(failures):
-        cutting.sync(transmitted=False)
+        cutting.sync(unsent=(0, 1))
     cutting.run(80)
     assert cutting.mode is mode
     assert {alarm.code for alarm in cutting.alarms if alarm.reaction > 1} <= {"TxQueueFull"}

@@ -123,9 +123,16 @@ def test_before_it_acts_zeros_are_in_force() -> None:
 
 def test_what_did_not_leave_is_what_was_sent_before() -> None:
     first, second, third = ((1, 1),), ((2, 2),), ((3, 3),)
-    assert Feed(sent=(third, second, first)).not_sent().sent == (second, second, first)
-    assert Feed(sent=(third, second)).not_sent().sent == (second, second)
-    assert Feed(sent=(third,)).not_sent().sent == (third,)
+    assert Feed(sent=(third, second, first)).not_sent((0,)).sent == (second, second, first)
+    assert Feed(sent=(third, second)).not_sent((0,)).sent == (second, second)
+    assert Feed(sent=(third,)).not_sent((0,)).sent == (third,)
+    assert Feed(sent=(third, second)).not_sent(()).sent == (third, second)
+
+
+def test_an_axis_whose_offsets_left_holds_them() -> None:
+    now, before = ((3, 1), (6, 2)), ((2, 1), (4, 2))
+    assert Feed(sent=(now, before)).not_sent((1,)).sent == (((3, 1), (4, 2)), before)
+    assert Feed(sent=(now, before)).not_sent((0,)).sent == (((2, 1), (6, 2)), before)
 
 
 def test_zeros_end_it_after_more_than_three_that_are_shown_or_fifty_that_are_not() -> None:

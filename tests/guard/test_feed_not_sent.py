@@ -12,7 +12,7 @@ def test_frames_that_did_not_leave_make_no_step() -> None:
     held = [bench.outputs[-1].feed]
     bench.targets = lambda: [0, 0]  # type: ignore[method-assign] # the NC jumps back: the law asks for far less
     for left in (True, False, False, True):
-        held.append(bench.sync(transmitted=left).feed)
+        held.append(bench.sync(unsent=() if left else (0, 1)).feed)
         if not left:
             del held[-2]
     for before, after in pairwise(held):

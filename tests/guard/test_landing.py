@@ -67,7 +67,7 @@ def test_each_axis_goes_to_zero_by_its_limits_and_five_zeros_end_it(rate: int, f
     made = machine.settings()
     wire = Ticking(made, fulls)
     try:
-        assert land(sending(made, 600, -200, rate=rate), made, wire) == (0, 0)
+        assert land(sending(made, 600, -200, rate=rate), (), made, wire) == (0, 0)
     finally:
         wire.close()
     for node, offset in ((1, 600), (2, -200)):
@@ -77,12 +77,26 @@ def test_each_axis_goes_to_zero_by_its_limits_and_five_zeros_end_it(rate: int, f
     assert len(wire.offsets(1)) - 1 - last == LAST_ZEROS
 
 
+def test_an_axis_whose_last_offset_did_not_leave_goes_on_from_the_one_before() -> None:
+    made = machine.settings()
+    state = sending(made, 600, -200, rate=40)
+    axes = (state.axes[0]._replace(sent=(600, 560, 520, 480)), state.axes[1])
+    wire = Ticking(made)
+    try:
+        assert land(state._replace(axes=axes), (0,), made, wire) == (0, 0)
+    finally:
+        wire.close()
+    for node, offset, rate in ((1, 560, 0), (2, -200, 40)):
+        sent = wire.offsets(node)
+        assert sent == [value for value, _ in zip(ramp(offset, rate, ()), sent, strict=False)]
+
+
 def test_it_waits_a_moment_for_each_sync_in_the_time_of_the_wall_too() -> None:
     made = replace(machine.settings(), clock="monotonic", sync_period_s=0.2)
     assert 0.5 < made.silence_s < 1
     wire = Ticking(made)
     try:
-        assert land(sending(made, 0, 0), made, wire) == (0, 0)
+        assert land(sending(made, 0, 0), (), made, wire) == (0, 0)
     finally:
         wire.close()
     assert wire.offsets(1) == [0] * LAST_ZEROS
@@ -92,7 +106,7 @@ def test_where_nothing_was_sent_nothing_is_and_no_sync_is_awaited() -> None:
     made = fed_settings()
     wire = Ticking(made)
     try:
-        assert land(sending(made, 0, 0, mode=Mode.OFF), made, wire) == (0, 0)
+        assert land(sending(made, 0, 0, mode=Mode.OFF), (), made, wire) == (0, 0)
     finally:
         wire.close()
     assert (wire.syncs, wire.sent) == (0, [])
@@ -105,7 +119,7 @@ def test_only_what_was_sent_gets_zeros(mode: Mode, fed: bool) -> None:
     state = sending(made, 0, 0, mode=mode)
     wire = Ticking(made)
     try:
-        land(state._replace(feed=armed((LAW, LAW))) if fed else state, made, wire)
+        land(state._replace(feed=armed((LAW, LAW))) if fed else state, (), made, wire)
     finally:
         wire.close()
     wanted = [*([0x301, 0x302] if mode is Mode.ACTIVE else []), *([0x401, 0x402] if fed else [])]

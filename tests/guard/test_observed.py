@@ -36,7 +36,7 @@ def after(
 ) -> State:
     """The state behind a step that was shown this by its one drive."""
     given = AxisInput(**{"target": 9, "read_back_age": 0.0, **seen})
-    return observe(state, Inputs(sync, (given,), BusView(), transmitted=left), settings or made())
+    return observe(state, Inputs(sync, (given,), BusView(), unsent=() if left else (0,)), settings or made())
 
 
 @pytest.mark.parametrize("delay", [0, 1, 2, 3])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import os
@@ -14,13 +15,14 @@ from typing import Any
 import pytest
 
 from fdhil.errors import DeviceError
-from fdhil.guard import process, table
+from fdhil.guard import intake, process, table
 from fdhil.guard.control import MAX_CLIENTS, MAX_LINE_BYTES, Client, Closer, Control
 from fdhil.guard.journal import Journal, Notifier
 from fdhil.guard.landing import land
 from fdhil.guard.peers import Access, Peer
+from tests.guard import shop as shop_module
 from tests.guard.fed import FACTS, LAW, fed_settings
-from tests.guard.machine import DIGEST, LIMITS
+from tests.guard.machine import DIGEST, FACTS_GIVEN, LIMITS
 from tests.guard.shop import OWNER, TOKEN, Shop
 
 Make = Callable[..., Shop]
@@ -48,6 +50,11 @@ def inside(offsets: list[int]) -> None:
     assert max(map(abs, values)) <= LIMITS.offset
     assert max(map(abs, rates)) <= LIMITS.hard_rate
     assert max(abs(b - a) for a, b in itertools.pairwise(rates)) <= LIMITS.hard_acceleration
+
+
+def arm_line() -> bytes:
+    """The operator's request to arm."""
+    return json.dumps({"request": "arm", "token": TOKEN, "program_digest": DIGEST, "facts": dict(FACTS_GIVEN)}).encode()
 
 
 # --- signals and the end ---
@@ -134,15 +141,15 @@ def test_landing_stops_where_bus_or_sync_stop_and_waits_where_the_queue_is_full(
     shop.into_the_cut()
     offset = shop.offsets()[-1]
     state, quick = shop.guard.state, replace(shop.settings, clock="monotonic", sync_period_s=1e-5)
-    assert land(state, quick, shop.wire)[0] == offset  # no SYNC comes
+    assert land(state, (), quick, shop.wire)[0] == offset  # no SYNC comes
     shop.wire.feed([(0x181, b"", 0.0)])
-    assert land(state, quick, shop.wire)[0] == offset  # nor any that counts
+    assert land(state, (), quick, shop.wire)[0] == offset  # nor any that counts
     shop.wire.feed([(0x080, b"", 0.0)])
     shop.wire.full = True
-    assert land(state, quick, shop.wire)[0] == offset
+    assert land(state, (), quick, shop.wire)[0] == offset
     shop.wire.down = True
     shop.wire.feed([])
-    assert land(state, shop.settings, shop.wire)[0] == offset
+    assert land(state, (), shop.settings, shop.wire)[0] == offset
 
 
 def test_the_feed_forward_is_told_sent_and_set_to_zero_by_a_fault(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -234,6 +241,81 @@ def test_frames_that_do_not_leave_are_no_frames(make: Make) -> None:
     shop.run(20)
     assert shop.guard.state.cause is not None
     assert shop.guard.state.cause.code in ("TxQueueFull", "EchoMismatch")
+
+
+def steep(rows: int) -> list[int]:
+    """An offset (rows,) that rises to some hundred increments and falls again, nearly as steeply as is allowed."""
+    rise = [6] * 10 + [0] * 2 + [-6] * 10
+    rates = list(itertools.accumulate([0] * 200 + rise + [0] * 10 + [-change for change in rise] + [0] * rows))
+    return list(itertools.accumulate(rates))[:rows]
+
+
+@pytest.fixture
+def steep_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both axes' offsets are steep."""
+    monkeypatch.setattr(shop_module, "OFFSET", [steep(len(column)) for column in shop_module.DEMAND])
+
+
+@pytest.mark.usefixtures("steep_table")
+@pytest.mark.parametrize("node", [1, 2])
+@pytest.mark.parametrize("then", ["alive", "disarm"])
+@pytest.mark.fault("A5")
+def test_an_axis_whose_frame_left_goes_on_from_it_when_that_of_the_other_did_not(
+    make: Make, node: int, then: str
+) -> None:
+    shop = make()
+    client = shop.arm()
+    shop.playing = True
+    while shop.offsets()[-1] < 250:
+        shop.cycle()
+    stood = len(shop.offsets(node)) - 1
+    shop.wire.stuck = (0x300 + node,)
+    shop.cycle()
+    shop.wire.stuck = ()
+    client.send(json.dumps({"request": then}).encode() + b"\n")
+    shop.run(100)
+    inside(shop.offsets(3 - node))
+    inside([0] + [offset - shop.offsets(node)[stood] for offset in shop.offsets(node)[stood:]])
+    assert shop.state == ("OFF" if then == "disarm" else "ACTIVE")
+
+
+@pytest.mark.parametrize("ends_at", [0x302, 0x764])
+@pytest.mark.fault("A1")
+def test_an_offset_that_left_before_the_bus_went_down_stands(make: Make, ends_at: int) -> None:
+    shop = make()
+    client = shop.arm()
+    shop.playing = True
+    while not shop.wire.down:
+        if shop.offsets()[-1]:
+            shop.wire.ends_at = (ends_at,)
+        shop.cycle()
+        client.send(b'{"request": "alive"}\n')
+    shop.guard._last_sync_s -= 10.0
+    shop.turn()
+    assert shop.state == "FROZEN"
+    shop.stop.send(b"\x0f")
+    assert shop.guard.run() == 3
+    told = shop.events()[-1]["may_stand_um"]
+    per_um = shop.settings.axes[0].increments_per_mm / 1000
+    assert told["X"] == pytest.approx(shop.offsets(1)[-1] / per_um, abs=0.06)
+    assert told["X"] != 0.0
+
+
+def test_a_fault_of_the_program_ramps_from_what_left(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    shop = make()
+    shop.into_the_cut()
+    shop.wire.stuck = (0x301,)
+    shop.cycle()
+    shop.wire.stuck = ()
+    unsent: list[object] = []
+
+    def landed(_state: object, missed: object, *_: object) -> tuple[int, ...]:
+        unsent.append(missed)
+        return (0, 0)
+
+    monkeypatch.setattr(process, "land", landed)
+    shop.guard._failed(RecursionError("too deep"))
+    assert unsent == [(0,)]
 
 
 def test_controller_states_and_lost_frames_are_heard(make: Make) -> None:
@@ -342,8 +424,44 @@ def test_one_decision_of_a_client_waits_but_a_disarm_takes_its_place(make: Make)
     told = [shop.answer(client, syncing=False)]
     while len(told) < 3:
         told.append(shop.answer(client, syncing=False))
-    assert [(answer["id"], answer["code"]) for answer in told] == [(1, "GuardBusy"), (0, "GuardBusy"), (3, "GuardBusy")]
+    codes = [(1, "GuardBusy"), (0, "DisarmedSince"), (3, "GuardBusy")]
+    assert [(answer["id"], answer["code"]) for answer in told] == codes
     assert shop.answer(client)["ok"]
+
+
+def test_a_disarm_takes_the_place_of_what_others_ask_for(make: Make) -> None:
+    shop = make()
+    first, second = shop.connect(), shop.connect()
+    shop.run(5)
+    first.send(b'{"request": "arm"}\n')
+    shop.serve()
+    second.send(b'{"request": "disarm"}\n')
+    assert shop.answer(first, syncing=False)["code"] == "DisarmedSince"
+    assert shop.answer(second)["ok"]
+
+
+def test_what_those_ask_for_who_have_gone_does_not_pile_up(make: Make) -> None:
+    """Nor do those that make room for others come back by talking on."""
+    shop = make()
+    shop.run(130)
+    for kind in [b"adopt"] * 20 + [b"disarm"] * 20:
+        client = shop.connect()
+        client.send(b'{"request": "%s"}\n' % kind)
+        shop.serve()
+        client.close()
+        shop.serve()
+    assert len(shop.guard._requests) <= 2
+    disarms = shop.guard.status()["disarms"]
+    for _ in range(3 * MAX_CLIENTS):
+        shop.connect().send(b'{"request": "alive"}\n')
+        for client in shop._clients[-2 * MAX_CLIENTS :]:
+            with contextlib.suppress(OSError):
+                client.send(b'{"request": "alive"}\n')
+        shop.serve()
+    assert len(shop.guard.control.clients) <= MAX_CLIENTS
+    shop.cycle()
+    assert not shop.guard._requests
+    assert shop.guard.status()["disarms"] == disarms == 20
 
 
 def test_a_request_that_was_made_before_the_last_disarm_arms_nothing(make: Make) -> None:
@@ -385,6 +503,51 @@ def test_a_table_waits_for_the_one_before_and_a_long_one_for_the_end(make: Make)
         for descriptor in (*pieces, long):
             os.close(descriptor)
     assert sum(event["event"] == "table_refused" for event in shop.events()) == 5  # the same twice is told once
+
+
+def test_a_table_that_came_before_the_arming_takes_no_force_behind_it(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the same program, but with other offsets, and so long that it is checked while another client arms."""
+    monkeypatch.setattr(intake, "ROWS_PER_IDLE_TURN", 8)
+    shop = make()
+    client, other = shop.connect(), shop.connect()
+    shop.load(client)
+    shop.run(150)
+    turned = {"X": [-value for value in shop_module.OFFSET[0]], "Y": [0] * len(shop_module.OFFSET[0])}
+    sealed = table.seal(table.encode("XY", dict(zip("XY", shop_module.DEMAND, strict=True)), turned, DIGEST))
+    socket.send_fds(other, [b'{"request": "table"}\n'], [sealed])
+    os.close(sealed)
+    shop.serve()
+    assert shop.guard.intake.busy
+    assert shop.ask(client, arm_line())["ok"]
+    assert shop.answer(other)["code"] == "TableBusy"
+    path = shop.guard.intake.path
+    assert path is not None
+    assert list(path.offset[0]) == list(shop_module.OFFSET[0])
+
+
+def test_a_guard_that_was_told_to_stop_arms_nothing_more(make: Make) -> None:
+    shop = make()
+    client = shop.connect()
+    shop.load(client)
+    shop.run(150)
+    shop.stop.send(b"\x0f")
+    shop.serve()
+    client.send(arm_line() + b"\n")
+    shop.serve()
+    assert shop.answer(client)["code"] == "Stopped"
+    shop.cycle()
+    assert (shop.state, shop.guard.run()) == ("OFF", 0)
+
+
+def test_the_journal_says_whose_disarm_it_was(make: Make) -> None:
+    shop = make()
+    client = shop.into_the_cut()
+    assert shop.ask(client, {"request": "disarm"})["ok"]
+    shop.run(200)
+    states = [event for event in shop.events() if event["event"] == "state"]
+    assert [(event["state"], event.get("pid")) for event in states[-2:]] == [("RAMP_DOWN", os.getpid()), ("OFF", None)]
 
 
 @pytest.mark.fault("E2")

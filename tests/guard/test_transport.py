@@ -81,6 +81,7 @@ def test_only_our_own_frames_leave(wire: tuple[SocketcandText, socket.socket]) -
 def test_frames_of_any_spelling(wire: tuple[SocketcandText, socket.socket]) -> None:
     text = b"< frame 181 23.424242 11 22 >< frame 080 1.5 >< frame 181 1.0 0AFF                 >"
     text += b"< frame 7FF 1.0 00 >< frame 00000181 1.0 00 >< ok >< frame 181 x 00 >< frame 181 1.0 0 >garbage>"
+    text += b"< frame 181 nan 00 >"
     text += b"< error 00000040 1.0 >< error zz 1.0 >< frame 301 1.0 01 >"
     assert frames_of(*wire, text) == [
         (0x181, b"\x11\x22"),
