@@ -2,7 +2,7 @@
 
 The broker is told when the node is born and when it dies, and in between only what changes. Of all commands the one
 that asks for the births is obeyed, and no other. Nothing is stored: what happens while the broker is away is not told
-later.
+later, and a broker that takes less than comes is told the newest values and the newest notices.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import contextlib
 import hashlib
 import logging
 import time
+from collections import deque
 from collections.abc import Iterable, Mapping
 from typing import NoReturn
 
@@ -43,6 +44,7 @@ FIRST_RETRY_S, LAST_RETRY_S = 1.0, 60.0
 DEATH_S = 2.0  # a broker that does not take our death certificate sends the one it has
 REBIRTH_S = 1.0  # births are sent no more often
 WAITING = 32  # messages of the broker that wait to be looked at
+MOST_EVENTS = 256  # notices that wait to be told
 NOTICE = "the newest notice"
 DATATYPES: Mapping[str, int] = {"measure": DOUBLE, "count": INT64, "flag": BOOLEAN, "state": STRING, "text": STRING}
 
@@ -154,7 +156,9 @@ class Session:
         self._host = settings.primary_host
         self._news: News | None = None
         self._notices: dict[str, Metric] = {}
-        self._waiting = asyncio.Queue[News]()
+        self._events = deque[Event]()
+        self._untold = 0  # notices that made room for newer ones
+        self._fresh = False  # whether the news has not been told yet
         self._stir = asyncio.Event()
         self._rebirth = self._born = False
         self._host_state: HostState | None = None
@@ -163,16 +167,32 @@ class Session:
         """Take what the daemon says now; it is told where a broker is there."""
         self._news = news
         if self._born:
-            self._waiting.put_nowait(news)
+            self._fresh = True
+            self._wait(news.events)
         else:  # the births tell the newest notice, too
             for event in news.events:
                 self._note(event)
         self._stir.set()
 
+    def _wait(self, events: Iterable[Event]) -> None:
+        """Have notices told one after another; where the broker is too slow, the oldest make room."""
+        self._events.extend(events)
+        while len(self._events) > MOST_EVENTS:
+            self._note(self._events.popleft())
+            if not self._untold:
+                text = f"the broker takes less than there is to tell: the oldest of {MOST_EVENTS} notices make room"
+                journal.write_line(f"{text} for newer ones", "minor")
+            self._untold += 1
+
+    def _waited(self) -> None:
+        """Say how many notices made room, now that none waits any more."""
+        if self._untold:
+            journal.write_line(f"{self._untold} notices were not told one by one: the broker was too slow", "minor")
+        self._untold = 0
+
     async def run(self, broker: aiomqtt.Client) -> None:
         """Serve one connection until it breaks (an ExceptionGroup with MqttError or HostGone), or all is cancelled."""
         self._rebirth, self._born, self._host_state = False, False, None
-        self._waiting = asyncio.Queue()
         await broker.subscribe(self.node.topic("NCMD"), qos=1)
         if self._host:
             await broker.subscribe(host_topic(self._host), qos=1)
@@ -188,6 +208,9 @@ class Session:
         if not self._born:
             return
         self._born = False
+        while self._events:  # the next births tell the newest
+            self._note(self._events.popleft())
+        self._waited()
         with contextlib.suppress(aiomqtt.MqttError):  # it broke: the broker has the will
             await _send(broker, [self.node.death(_now_ms())], DEATH_S)
 
@@ -214,13 +237,12 @@ class Session:
             await self._stirred()
         while True:
             if self._rebirth or not self._born:
-                self._rebirth, self._born = False, True
-                self._waiting = asyncio.Queue()
+                self._rebirth, self._born, self._fresh = False, True, False
                 assert self._news is not None
                 await _send(broker, self.node.births(*self._metrics(self._news), self._news.stamp_ms))
                 await asyncio.sleep(REBIRTH_S)
-            while not self._rebirth and not self._waiting.empty():
-                await _send(broker, self._changes(self._waiting.get_nowait()))
+            while not self._rebirth and (self._fresh or self._events):
+                await _send(broker, self._changes(self._news))
             if not self._rebirth:
                 await self._stirred()
 
@@ -229,12 +251,13 @@ class Session:
         self._stir.clear()
 
     def _changes(self, news: News) -> list[Message]:
-        """Return what is new, every notice of several by itself."""
-        messages: list[Message] = []
-        for event in news.events:
-            self._note(event)
-            messages += self.node.news(*self._metrics(news), news.stamp_ms)
-        return messages or self.node.news(*self._metrics(news), news.stamp_ms)
+        """Return what is new, of several notices the oldest one: each is told by itself."""
+        self._fresh = False
+        if self._events:
+            self._note(self._events.popleft())
+        if not self._events:
+            self._waited()
+        return self.node.news(*self._metrics(news), news.stamp_ms)
 
     def _note(self, event: Event) -> None:
         text = f"{event.code}: {event.text}"

@@ -18,6 +18,7 @@ from asyncua.crypto.truststore import TrustStore
 from asyncua.crypto.uacrypto import x509
 from asyncua.crypto.validator import CertificateValidator, CertificateValidatorOptions
 from asyncua.server.internal_server import InternalServer
+from asyncua.server.internal_session import InternalSession
 from asyncua.server.user_managers import UserManager
 
 from fdhil.config.publish import OpcUaServer
@@ -26,6 +27,7 @@ from fdhil.config.users import matches, read_users
 from fdhil.errors import ConnectError
 
 NAME = "OPC UA server"
+ANYONE = User(role=UserRole.Anonymous)
 MOST_CONNECTIONS = 16
 MOST_SUBSCRIPTIONS = 64
 MOST_FAILURES, FAILURES_S = 10, 60.0
@@ -60,12 +62,15 @@ class ForReading(SimpleRoleRuleset):
 class Doorkeeper(UserManager):
     """Lets in who knows a user's password; without a users file anyone, for then only this computer is served.
 
-    After ten wrong passwords in a minute none is taken for the rest of it: guessing is slow, and cheap to refuse.
+    After ten wrong passwords in a minute from one address none is taken from there for the rest of it: guessing is
+    slow, cheap to refuse, and locks nobody else out.
     """
 
     def __init__(self, users: Mapping[str, KnownUser] | None) -> None:
         self._users = users
-        self._failures_s: list[float] = []
+        self._failures: list[tuple[str, float]] = []  # from where, and when
+        self.address = ""
+        """Where who asks next is."""
 
     def get_user(
         self, iserver: Any, username: str | None = None, password: str | None = None, certificate: Any = None
@@ -74,13 +79,26 @@ class Doorkeeper(UserManager):
         if self._users is None:
             return User(role=UserRole.User)
         now_s = time.monotonic()
-        self._failures_s = [at_s for at_s in self._failures_s if now_s - at_s < FAILURES_S]
-        if len(self._failures_s) >= MOST_FAILURES or username is None or password is None:
+        self._failures = [(address, at_s) for address, at_s in self._failures if now_s - at_s < FAILURES_S]
+        failures = sum(address == self.address for address, _ in self._failures)
+        if failures >= MOST_FAILURES or username is None or password is None:
             return None
         if matches(self._users.get(username), password):
             return User(role=UserRole.User, name=username)
-        self._failures_s.append(now_s)
+        self._failures.append((self.address, now_s))
         return None
+
+
+class Visit(InternalSession):
+    """A client's session, which tells the doorkeeper where its client is."""
+
+    def activate_session(self, *given: Any) -> Any:
+        """Ask the doorkeeper whether it is let in; nothing else is done meanwhile."""
+        peer: Any = self.name  # of a client its address and port
+        door = self.iserver.user_manager
+        assert isinstance(door, Doorkeeper)
+        door.address = str(peer[0]) if isinstance(peer, tuple) else ""
+        return super().activate_session(*given)
 
 
 class ReadServer(InternalServer):
@@ -95,6 +113,10 @@ class ReadServer(InternalServer):
         self.max_subscriptions = MOST_SUBSCRIPTIONS
         taken: Any = (ua.UserNameIdentityToken,) if users is not None else (ua.AnonymousIdentityToken,)
         self.supported_tokens = taken
+
+    def create_session(self, name: str, user: User = ANYONE, external: bool = False) -> InternalSession:
+        """Return the session of a client."""
+        return Visit(self, self.aspace, self.subscription_service, name, user=user, external=external)
 
     def register_server(self, server: Any, conf: Any = None) -> None:
         """Refuse to be a discovery server."""

@@ -15,6 +15,7 @@ from prometheus_client.exposition import choose_encoder
 
 from fdhil.config import MachineConfig
 from fdhil.config.publish import PrometheusMetrics
+from fdhil.connections import BoundedHttp
 from fdhil.errors import ConnectError
 from fdhil.shopfloor.metrics import Metrics
 from fdhil.shopfloor.news import listen
@@ -92,12 +93,14 @@ def _configured(settings: PrometheusMetrics, page: Page) -> uvicorn.Config:
     configured = uvicorn.Config(
         page,
         lifespan="off",
+        http=BoundedHttp,
         ws="none",
         log_config=None,
         log_level="error",
         access_log=False,
         server_header=False,
         limit_concurrency=MOST_CONNECTIONS,
+        backlog=MOST_CONNECTIONS,  # as many are taken at once: each is a descriptor
         timeout_graceful_shutdown=2,
         ssl_certfile=settings.tls_certificate_file,
         ssl_keyfile=settings.tls_key_file,

@@ -13,7 +13,7 @@ import secrets
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from fdhil.config.users import LONGEST_PASSWORD, Role, User, matches, read_users
@@ -40,7 +40,7 @@ class Asker:
     role: Role
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Session:
     """A login: whose, and until when, on the monotonic clock. ``user`` is what the file said of him then."""
 
@@ -170,9 +170,9 @@ class Access:
             return None
         changed = self._user(session.asker.name) != session.user
         if changed or now_s >= min(session.ends_s, session.idle_ends_s):
-            del self._sessions[_key(token)]
+            self.log_out(token)
             return None
-        self._sessions[_key(token)] = replace(session, idle_ends_s=now_s + IDLE_S)
+        session.idle_ends_s = now_s + IDLE_S  # in place: to write it back would undo a logout that came meanwhile
         return session.asker
 
     def log_out(self, token: str | None) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 
 from fastapi import APIRouter, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import HTMLResponse, JSONResponse, Response
+from fastapi.responses import HTMLResponse, Response
 from fastapi.staticfiles import StaticFiles
 from starlette.exceptions import HTTPException
 from starlette.middleware.gzip import GZipMiddleware
@@ -29,6 +29,7 @@ from fdhil.web.answers import Fault, Refused, document_of, status_of
 from fdhil.web.context import Context, Entry
 from fdhil.web.daemon import Daemon
 from fdhil.web.gate import Gate
+from fdhil.web.json_answer import Json
 
 MENU = ("machine", "live", "rapids", "history", "program", "events")
 SHELL = (*MENU, "panel")
@@ -63,7 +64,10 @@ def application(
     ``command`` tells the same where a browser runs no scripts.
     """
     access = Access(web.users_file)
-    app = FastAPI(title="fdhil", docs_url=None, redoc_url=None, openapi_url=None, redirect_slashes=False)
+    app = FastAPI(
+        title="fdhil", docs_url=None, redoc_url=None, openapi_url=None, redirect_slashes=False,
+        default_response_class=Json,
+    )  # fmt: skip
     app.state.entry = Entry(web, access)
     for router in routers:
         app.include_router(router, responses=FAULTS)
@@ -87,7 +91,7 @@ def page_routers() -> Iterator[APIRouter]:
 def _serve_shell(app: FastAPI, document: str, paths: Iterable[str]) -> None:
     """Serve the one document of all pages, its scripts, and the carried uPlot."""
 
-    def shell() -> Response:
+    async def shell() -> Response:
         return HTMLResponse(document)
 
     app.add_api_route("/", shell, include_in_schema=False, response_class=Response)
@@ -100,32 +104,35 @@ def _serve_shell(app: FastAPI, document: str, paths: Iterable[str]) -> None:
 
 
 def _answer_faults(app: FastAPI) -> None:
-    """Answer every fault with one kind of document, and never with a traceback."""
+    """Answer every fault with one kind of document, and never with a traceback.
+
+    All are coroutines, as in ``fdhil.web.context``: a disarm that is refused waits for no thread either.
+    """
 
     @app.exception_handler(Refused)
-    def refused(_request: Request, error: Refused) -> JSONResponse:
-        return JSONResponse(error.document, error.status)
+    async def refused(_request: Request, error: Refused) -> Json:
+        return Json(error.document, error.status)
 
     @app.exception_handler(FdhilError)
-    def failed(_request: Request, error: FdhilError) -> JSONResponse:
-        return JSONResponse(document_of(error), status_of(error))
+    async def failed(_request: Request, error: FdhilError) -> Json:
+        return Json(document_of(error), status_of(error))
 
     @app.exception_handler(RequestValidationError)
-    def wrong(_request: Request, error: RequestValidationError) -> JSONResponse:
+    async def wrong(_request: Request, error: RequestValidationError) -> Json:
         told = "; ".join(f"{'.'.join(map(str, fault['loc'][1:]))}: {fault['msg']}" for fault in error.errors()[:5])
-        return JSONResponse(refusal("BadRequest", told, "mend the values that are named"), 422)
+        return Json(refusal("BadRequest", told, "mend the values that are named"), 422)
 
     @app.exception_handler(HTTPException)
-    def none_such(_request: Request, error: HTTPException) -> JSONResponse:
+    async def none_such(_request: Request, error: HTTPException) -> Json:
         if isinstance(error.__cause__, Refused):  # a body that grew too large while it was read
-            return refused(_request, error.__cause__)
+            return await refused(_request, error.__cause__)
         code = {404: "NotFound", 405: "NoSuchMethod"}.get(error.status_code, "BadRequest")
         text = {404: "there is nothing at this address", 405: "this address does not take that method"}
         told = refusal(code, text.get(error.status_code, str(error.detail)), "see /api/openapi.json")
-        return JSONResponse(told, error.status_code, headers=error.headers)
+        return Json(told, error.status_code, headers=error.headers)
 
     @app.exception_handler(Exception)
-    def broken(request: Request, error: Exception) -> JSONResponse:
+    async def broken(request: Request, error: Exception) -> Json:
         logging.getLogger("fdhil.web").error("%s %s failed", request.method, request.url.path, exc_info=error)
         text = "fdhil web met a fault of its own; the machine and the daemon are not touched by it"
-        return JSONResponse(refusal("InternalError", text, "report what its log says"), 500)
+        return Json(refusal("InternalError", text, "report what its log says"), 500)

@@ -1,4 +1,8 @@
-"""What the routes need: the configuration, the daemon, the store, and who asks."""
+"""What the routes need: the configuration, the daemon, the store, and who asks.
+
+What is needed before a route begins is a coroutine here and on every page: a plain function would wait for one of the
+forty threads that plain routes run in, and who takes those would keep an operator from disarming.
+"""
 
 from __future__ import annotations
 
@@ -42,19 +46,19 @@ class Entry:
     access: Access
 
 
-def _entry(connection: HTTPConnection) -> Entry:
+async def _entry(connection: HTTPConnection) -> Entry:
     entry = connection.app.state.entry
     assert isinstance(entry, Entry)
     return entry
 
 
-def _context(connection: HTTPConnection) -> Context:
+async def _context(connection: HTTPConnection) -> Context:
     context = connection.app.state.context
     assert isinstance(context, Context)
     return context
 
 
-def _asker(connection: HTTPConnection) -> Asker:
+async def _asker(connection: HTTPConnection) -> Asker:
     asker = connection.scope["fdhil.asker"]  # the gate has put it there
     assert isinstance(asker, Asker)
     return asker

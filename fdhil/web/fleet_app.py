@@ -50,7 +50,7 @@ class Answers:
         return answer
 
 
-def _answers(request: Request) -> Answers:
+async def _answers(request: Request) -> Answers:
     answers = request.app.state.answers
     assert isinstance(answers, Answers)
     return answers

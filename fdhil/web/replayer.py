@@ -6,7 +6,7 @@ import contextlib
 import json
 import subprocess
 import sys
-from threading import Lock, Timer
+from threading import BoundedSemaphore, Lock, Timer
 
 from fdhil.config import MachineConfig
 from fdhil.web.answers import Refused
@@ -14,6 +14,8 @@ from fdhil.web.answers import Refused
 PROCESS = "fdhil.web.replay_process"
 LONGEST_S = 60.0
 """A rapid takes 20 ms, the process a second to start, kernels that were never compiled here half a minute."""
+MOST_ASKING = 8
+"""Who asks holds one of the forty threads that serve the pages until he is answered."""
 
 
 class Replayer:
@@ -23,9 +25,19 @@ class Replayer:
         self._config = config
         self._process: subprocess.Popen[bytes] | None = None
         self._one = Lock()
+        self._places = BoundedSemaphore(MOST_ASKING)
 
     def signals(self, axis: str, number: int) -> bytes:
-        """Return a rapid's signals with the model laid over them, as JSON (blocking). Refused."""
+        """Return a rapid's signals with the model laid over them, as JSON (blocking). Refused, also where many wait."""
+        if not self._places.acquire(blocking=False):
+            text = f"{MOST_ASKING} others wait for a replay already, this rapid was not replayed"
+            raise Refused(503, "Busy", text, "try again in a few seconds")
+        try:
+            return self._replayed(axis, number)
+        finally:
+            self._places.release()
+
+    def _replayed(self, axis: str, number: int) -> bytes:
         request = json.dumps({"axis": axis, "number": number}).encode() + b"\n"
         with self._one:
             fresh = self._process is None

@@ -123,7 +123,7 @@ def server_of(app: FastAPI, certificate: ssl.SSLContext | None, ready: Callable[
     """Return the server of an application; it calls ``ready`` when it has begun."""
     import uvicorn  # late: the extra may be missing, and this must import without it
 
-    from fdhil.web.connections import MOST_CONNECTIONS, BoundedHttp, BoundedSocket
+    from fdhil.connections import MOST_CONNECTIONS, BoundedHttp, BoundedSocket
 
     class Server(uvicorn.Server):
         @contextlib.contextmanager

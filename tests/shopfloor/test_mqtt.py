@@ -131,6 +131,31 @@ async def test_every_notice_is_told_also_the_same_one_again(tmp_path: Path) -> N
         await broker.until(lambda host: host.verbs.count("DDATA/X") >= before + 3)
 
 
+async def test_a_slow_broker_is_told_the_newest_state_and_no_more_notices_than_may_wait(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(mqtt, "MOST_EVENTS", 3)
+    daemon, session = Daemon(tmp_path), session_of()
+    session.node.will(NOW)
+    async with connected(session) as broker:
+        session.hear(daemon.news())
+        await broker.until(is_born)
+        before = len(broker.host.verbs)
+        for _ in range(100):  # while the broker takes nothing
+            session.hear(daemon.news())
+        for number in range(10):
+            session.hear(daemon.news(load_changed(f"{number}")))
+        newest = daemon.news(*identified())
+        session.hear(newest)
+        await broker.until(lambda host: host.values["X"]["notice"] == "LoadChanged: 9")
+        told = broker.host.verbs[before:]
+        assert (told.count("DDATA/X"), told.count("NDATA")) == (3, 1)
+        assert (broker.host.values["X"]["K"], broker.host.values["X"]["windows_accepted"]) == (0.8, 1)
+    said = capsys.readouterr().err
+    assert said.count("the oldest of 3 notices make room for newer ones") == 1
+    assert said.count("7 notices were not told one by one: the broker was too slow") == 1
+
+
 async def test_a_trouble_is_an_alarm_until_it_is_over(tmp_path: Path) -> None:
     daemon, session = Daemon(tmp_path), session_of()
     session.node.will(NOW)

@@ -24,6 +24,7 @@ from fdhil.errors import ConnectError
 from fdhil.shopfloor.news import Listener
 from fdhil.shopfloor.opcua import Served, publish, serving
 from fdhil.shopfloor.opcua_nodes import OWN
+from fdhil.shopfloor.opcua_security import Doorkeeper
 from fdhil.shopfloor.published import AXIS, BUS, MACHINE
 from tests.daemon.machine import Machine, config_of
 from tests.daemon.test_service import serving as daemon_serving
@@ -287,8 +288,15 @@ async def refused(entering: Awaitable[Any]) -> str:
 
 
 async def test_who_enters_is_known_by_certificate_and_password(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    addresses, ask = set[str](), Doorkeeper.get_user
+
+    def asked(door: Doorkeeper, *given: Any, **named: Any) -> Any:
+        addresses.add(door.address)
+        return ask(door, *given, **named)
+
+    monkeypatch.setattr(Doorkeeper, "get_user", asked)
     trusted = tmp_path / "trusted"
     trusted.mkdir()
     ours = await certificates(tmp_path, "scada", "urn:scada")
@@ -305,6 +313,7 @@ async def test_who_enters_is_known_by_certificate_and_password(
         assert await refused(plain.connect()) != "let in"
     said = capfd.readouterr()
     assert PASSWORD not in said.out + said.err
+    assert addresses == {"127.0.0.1"}  # by which wrong passwords are counted
 
 
 @pytest.mark.parametrize(

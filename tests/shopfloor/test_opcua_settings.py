@@ -29,6 +29,8 @@ def test_guessing_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     for _ in range(MOST_FAILURES):
         assert door.get_user(None, "scada", "wrong") is None
     assert door.get_user(None, "scada", PASSWORD) is None  # not even the right one, for a while
+    door.address = "192.0.2.7"
+    assert door.get_user(None, "scada", PASSWORD) is not None  # from elsewhere
 
 
 @pytest.mark.parametrize(

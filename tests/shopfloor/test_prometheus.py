@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import re
 import shutil
@@ -21,7 +22,7 @@ from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConnectError
 from fdhil.shopfloor.metrics import Metrics
 from fdhil.shopfloor.news import Listener, News
-from fdhil.shopfloor.prometheus import Page, publish
+from fdhil.shopfloor.prometheus import MOST_CONNECTIONS, Page, publish
 from tests.daemon.machine import Machine, config_of, rapids
 from tests.daemon.test_service import serving, status_when
 from tests.shopfloor.made import NOW_MS, notice, publishing, said, status, trouble
@@ -161,6 +162,22 @@ async def test_a_real_daemon_is_read_over_http(
             found = await metrics_when(client, address, ("fdhil_revision", (("axis", "X"),)), 1.0)
             assert found["fdhil_windows_accepted_total", (("axis", "X"),)] == 1
         await metrics_when(client, address, ("fdhil_up", ()), 0.0)
+
+
+async def test_who_only_holds_connections_keeps_no_scrape_out_and_is_ended(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = config_of(tmp_path, publish={"prometheus": {"port": 0}})
+    async with publishing("prometheus", config) as task, httpx.AsyncClient(timeout=PATIENCE_S) as client:
+        address = httpx.URL((await said(task, capsys, "/metrics")).rsplit(" ", 1)[1])
+        held = [await asyncio.open_connection(address.host, address.port) for _ in range(MOST_CONNECTIONS + 8)]
+        assert (await client.get(address)).status_code == 200
+        monkeypatch.setattr("fdhil.connections.QUIET_S", 0.05)
+        reader, silent = await asyncio.open_connection(address.host, address.port)
+        with contextlib.suppress(ConnectionError):
+            assert await asyncio.wait_for(reader.read(), PATIENCE_S) == b""
+        for writer in (silent, *(writer for _, writer in held)):
+            writer.close()
 
 
 async def test_a_stranger_without_a_certificate_reads_nothing(

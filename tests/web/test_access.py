@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from fdhil.config.users import User, matches, read_users, write_users
+from fdhil.config.users import Role, User, matches, read_users, write_users
 from fdhil.errors import ConfigError
 from fdhil.web.access import FREE_GUESSES, IDLE_S, LIFE_S, LONGEST_WAIT_S, MOST_TOKENS, Access, Asker, place_of
 from fdhil.web.answers import Refused
@@ -90,6 +90,22 @@ def test_a_user_who_is_taken_out_or_given_another_role_has_no_old_rights(access:
     assert access.asker(access.begin("op", user("watch"))[0]) == Asker("op", "watch")
     (tmp_path / "users").unlink()
     assert access.asker(access.begin("op", user("watch"))[0]) is None
+
+
+@pytest.mark.parametrize("role", ["operate", "watch"])  # of whom is asked for, the same as at the login or not
+def test_a_logout_ends_a_login_that_is_just_being_used(
+    access: Access, role: Role, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    token, _ = access.begin("op", user("operate"))
+
+    def logged_out_meanwhile(_: str) -> User:
+        access.log_out(token)
+        return user(role)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(access, "_user", logged_out_meanwhile)
+        access.asker(token)
+    assert access.asker(token) is None
 
 
 @pytest.mark.parametrize("token", [None, "", "x", "é", "a" * 100_000])

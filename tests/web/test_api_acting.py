@@ -7,11 +7,13 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
+from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
+from anyio import to_thread
 
 from fdhil.arming.token import ensure_token
 from fdhil.config import MachineConfig
@@ -102,6 +104,20 @@ async def test_one_who_may_only_watch_may_disarm(config: MachineConfig) -> None:
         answer = await client.post("/api/machine/disarm", headers=OWN)
     assert answer.json() == {"ok": True, "text": "guard: OFF, offset 0", "state": "OFF"}
     assert asked == [{"request": "disarm", "by": "watcher"}]
+
+
+@pytest.mark.parametrize("daemon", [True, False])
+async def test_a_disarm_waits_for_none_of_the_threads_that_serve_pages(config: MachineConfig, daemon: bool) -> None:
+    threads = to_thread.current_default_thread_limiter()
+    for _ in range(round(threads.total_tokens)):
+        threads.acquire_on_behalf_of_nowait(object())
+    async with AsyncExitStack() as stack, asyncio.timeout(60):
+        if daemon:
+            await stack.enter_async_context(daemon_that(config, granting))
+        client = await stack.enter_async_context(client_of(make_app(config), "operator", **OWN))
+        answer = await client.post("/api/machine/disarm")
+        who = await client.get("/api/session")
+    assert (answer.status_code, who.json()["name"]) == (200 if daemon else 503, "operator")
 
 
 async def test_a_daemon_that_is_gone_is_told_with_what_to_do(config: MachineConfig) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from fdhil.web.pages.machine_lights import axis_light, change_light, steps
 from tests.daemon.machine import Machine, rapids
 from tests.daemon.test_service import serving, status_when
 from tests.store.made import BENCH, STAMP, published
-from tests.web.clients import client_of, daemon_that, machine_of
+from tests.web.clients import OWN, client_of, daemon_that, machine_of
 
 CALM: dict[str, Any] = {
     "samples_s_ago": 0.1, "drive_state": "Operation enabled", "parameters": {}, "last_window": None, "warnings": [],
@@ -84,6 +85,21 @@ async def test_many_browsers_ask_the_daemon_no_more_than_one_does(tmp_path: Path
         for _ in range(20):
             assert (await client.get("/api/machine")).json()["machine"] == "bench"
     assert len(asked) < 20
+
+
+async def test_half_a_character_and_a_number_that_is_none_end_no_answer(tmp_path: Path) -> None:
+    """As a program's name that is no UTF-8 has it; in what is told, and in what is refused."""
+    config = machine_of(tmp_path)
+    told = {**STATUS, "text": "b\udcf6hlen.ngc", "ratio": math.nan}
+    async with (
+        daemon_that(config, lambda request: {**told, "ok": request["request"] == "status", "code": "NoTable"}),
+        client_of(make_app(config), "operator", **OWN) as client,
+    ):
+        answer = await client.get("/api/machine")
+        refused = await client.post("/api/machine/disarm")
+    status = answer.json()["status"]
+    assert (answer.status_code, status["text"], status["ratio"]) == (200, "b?hlen.ngc", None)
+    assert (refused.status_code, refused.json()["text"]) == (409, "b?hlen.ngc")
 
 
 @pytest.mark.parametrize(

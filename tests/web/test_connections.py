@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from fdhil.web import connections, gate, serving
+from fdhil import connections
+from fdhil.web import gate, serving
 from fdhil.web.app import make_app
 from tests.web.clients import machine_of
 

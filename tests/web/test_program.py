@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from fdhil.errors import ProgramError
 from fdhil.prediction.models import nominal_models
 from fdhil.program import load_trajectory
 from fdhil.store.lessons import lesson_path, write_lesson
+from fdhil.web.answers import Refused
 from fdhil.web.app import make_app
 from fdhil.web.forecast import desk, process
 from fdhil.web.forecast.view import knots
@@ -204,6 +205,45 @@ def test_what_is_asked_wrongly_is_told(client: Client, judged: dict[str, Any]) -
     assert client.get(f"/api/program/{'0' * 64}").status_code == 404
     assert client.get("/api/program/..%2f..%2fetc").status_code in (404, 422)
     assert client.post("/api/program", params={"name": "a"}, content=b"", headers=WRITES).status_code == 422
+
+
+async def test_programs_that_are_being_sent_are_counted_as_those_that_wait(
+    machine: MachineConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def never(*_: Any) -> None:
+        await asyncio.Event().wait()
+
+    monkeypatch.setattr(desk.Desk, "_run", never)
+    taking, sent, places = desk.Desk(machine), asyncio.Event(), desk.MOST_WAITING + 1
+
+    async def pieces(content: bytes) -> AsyncIterator[bytes]:
+        yield content
+        await sent.wait()
+
+    empty = [asyncio.create_task(taking.take("empty.ngc", pieces(b""))) for _ in range(places)]
+    await asyncio.sleep(0)
+    sent.set()
+    assert await asyncio.gather(*empty, return_exceptions=True) == [AnyRefusal("BadRequest")] * places
+    sent.clear()
+    programs = [asyncio.create_task(taking.take("a.ngc", pieces(b"G0 X%d" % k))) for k in range(places + 5)]
+    await asyncio.sleep(0)
+    sent.set()
+    answers = await asyncio.gather(*programs, return_exceptions=True)
+    assert [isinstance(answer, desk.Job) for answer in answers] == [True] * places + [False] * 5
+    assert answers[places:] == [AnyRefusal("TooMany")] * 5
+    await taking.close()
+
+
+class AnyRefusal:
+    """Equals a refusal of one class."""
+
+    def __init__(self, code: str) -> None:
+        self._code = code
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Refused) and other.document["code"] == self._code
+
+    __hash__ = None  # type: ignore[assignment]
 
 
 def test_a_faulty_program_is_refused_with_its_line(client: Client) -> None:

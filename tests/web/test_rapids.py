@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import math
+import os
 import sqlite3
+import threading
 from collections.abc import AsyncIterator, Iterator
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +26,7 @@ from fdhil.pipeline.overlay import Overlay, lay_over
 from fdhil.records import Window, frozen
 from fdhil.store.history import FILE_NAME, History
 from fdhil.store.windows import decode_window, read_window
-from fdhil.web import replayer
+from fdhil.web import file_answer, replayer
 from fdhil.web.answers import Refused
 from fdhil.web.app import make_app
 from fdhil.web.pages import rapid_list
@@ -170,6 +174,28 @@ async def test_a_recording_is_downloaded_as_its_file_is(client: httpx.AsyncClien
     assert answer.content == (machine.store.directory / WINDOWS_FOLDER / name).read_bytes()
 
 
+async def test_a_recording_is_sent_piece_by_piece(machine: MachineConfig) -> None:
+    path, asked, sent = machine.store.directory / WINDOWS_FOLDER / "large", iter([True]), list[int]()
+    path.touch()
+    os.truncate(path, 40 * file_answer.PIECE)
+
+    async def receive() -> Any:
+        if not next(asked, False):
+            await asyncio.Event().wait()
+        return {"type": "http.request", "body": b"", "more_body": False}
+
+    async def send(message: Any) -> None:
+        sent.append(len(message.get("body", b"")))
+
+    scope = {
+        "type": "http", "method": "GET", "path": f"/api/rapids/recordings/{path.name}", "query_string": b"",
+        "headers": [(b"host", b"localhost")], "scheme": "http", "root_path": "",
+    }  # fmt: skip
+    await make_app(machine)(scope, receive, send)
+    path.unlink()
+    assert (sum(sent), max(sent)) == (40 * file_answer.PIECE, file_answer.PIECE)
+
+
 @pytest.mark.fault("G4")
 @pytest.mark.parametrize(
     "name",
@@ -228,6 +254,24 @@ def test_a_replay_that_hangs_is_ended_and_one_that_has_ended_is_started_anew(
     process.wait()
     assert running.signals("X", 1) == before
     assert running._process is not process
+
+
+async def test_who_asks_beyond_the_few_that_may_wait_for_a_replay_is_told_to_come_again(
+    machine: MachineConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    app, replayed = make_app(machine), threading.Event()
+    monkeypatch.setattr(replayer_of(app), "_asked", lambda _: b"+{}\n" if replayed.wait() else b"")
+    more = 3
+    async with _client(app) as client:
+        asked = [asyncio.create_task(client.get("/api/rapids/X/1/signals")) for _ in range(replayer.MOST_ASKING + more)]
+        try:
+            async with asyncio.timeout(60):
+                refused = [await first for first in islice(asyncio.as_completed(asked), more)]
+        finally:
+            replayed.set()
+            answers = [answer.status_code for answer in await asyncio.gather(*asked)]
+    assert [(answer.status_code, answer.json()["code"]) for answer in refused] == [(503, "Busy")] * more
+    assert answers.count(200) == replayer.MOST_ASKING
 
 
 def test_a_rapid_whose_recording_the_disk_refused_says_so(tmp_path: Path) -> None:

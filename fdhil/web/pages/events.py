@@ -9,10 +9,10 @@ from fastapi.responses import Response
 from pydantic import BaseModel, Field
 
 from fdhil.daemon.notice_book import MOST_NOTE
-from fdhil.drivers.cia402.candump_samples import LARGEST_LOG
 from fdhil.store.history import RECENT_NOTICES
 from fdhil.web.answers import granted
 from fdhil.web.context import Asking, Here
+from fdhil.web.file_answer import FileAnswer
 from fdhil.web.pages.black_boxes import BlackBox, Envelope, envelope, listed, opened
 from fdhil.web.pages.event_list import MOST_PAGE, Events, Severity, page
 
@@ -74,7 +74,4 @@ def black_box(name: str, here: Here) -> Envelope:
 @router.get("/black-boxes/{name}/file", response_class=Response)
 def black_box_file(name: str, here: Here) -> Response:
     """Return a black box as it is: a log that candump's tools read."""
-    with opened(here.config.store.directory, name) as file:
-        content = file.read(LARGEST_LOG)
-    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
-    return Response(content, media_type="text/plain; charset=us-ascii", headers=headers)
+    return FileAnswer(opened(here.config.store.directory, name), name, "text/plain; charset=us-ascii")

@@ -19,7 +19,7 @@ NEWEST_REVISIONS = 1000
 Documents = dict[str | None, tuple[tuple[int, ...], dict[str, Any]]]
 
 
-def _documents(request: Request) -> Documents:
+async def _documents(request: Request) -> Documents:
     state = request.app.state
     if not hasattr(state, "history"):
         state.history = {}

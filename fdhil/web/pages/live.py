@@ -42,7 +42,7 @@ def _feed_of(app: FastAPI) -> LiveFeed:
     return feed
 
 
-def _feed(connection: HTTPConnection) -> LiveFeed:
+async def _feed(connection: HTTPConnection) -> LiveFeed:
     return _feed_of(connection.app)
 
 

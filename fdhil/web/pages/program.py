@@ -11,7 +11,6 @@ from itertools import islice
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, FastAPI, Path, Query, Request
-from fastapi.responses import JSONResponse
 from pydantic import BaseModel
 from starlette.requests import HTTPConnection
 
@@ -22,6 +21,7 @@ from fdhil.web.forecast.desk import STATES, Desk, Job, Work
 from fdhil.web.forecast.lessons import lessons, passes
 from fdhil.web.forecast.view import Box, course, line_place, plane_of, view
 from fdhil.web.gate import LARGEST_PROGRAM
+from fdhil.web.json_answer import Json
 
 LARGEST_MM = 1e7
 MOST_LINES = 400
@@ -188,7 +188,7 @@ def part(
     bottom: Mm | None = None,
     top: Mm | None = None,
     factor: Annotated[float, Query(ge=0.0, le=10_000.0, allow_inf_nan=False)] = 0.0,
-) -> JSONResponse:
+) -> Json:
     """Tell the path in the plane of two axes: all of it, or what lies in a box (mm), there with the table's way.
 
     ``factor``: how many times as far the table is drawn from the path; 0 for what the view has room for.
@@ -204,7 +204,7 @@ def part(
         box = Box(left, right, bottom, top)
         if not (left < right and bottom < top):
             raise Refused(422, "BadRequest", "the box is empty", "give left < right and bottom < top")
-    return JSONResponse(view(forecast, plane, box, factor))
+    return Json(view(forecast, plane, box, factor))
 
 
 @router.get("/{digest}/course")
@@ -213,22 +213,22 @@ def over_time(
     desk: Programming,
     start_s: Annotated[float, Query(ge=0.0, allow_inf_nan=False)] = 0.0,
     end_s: Annotated[float | None, Query(ge=0.0, allow_inf_nan=False)] = None,
-) -> JSONResponse:
+) -> Json:
     """Tell contour errors and feed over time."""
     forecast = desk.forecast(digest)
     rows = len(forecast.line)
     first = min(int(min(start_s / forecast.dt_s, rows)), rows - 1)
     last = rows if end_s is None else int(min(end_s / forecast.dt_s, rows))
-    return JSONResponse(course(forecast, first, max(last, first + 1)))
+    return Json(course(forecast, first, max(last, first + 1)))
 
 
 @router.get("/{digest}/line/{line}")
-def place_of_line(digest: Digest, line: Annotated[int, Path(ge=1, le=10**9)], desk: Programming) -> JSONResponse:
+def place_of_line(digest: Digest, line: Annotated[int, Path(ge=1, le=10**9)], desk: Programming) -> Json:
     """Tell where a line of the program has its largest error."""
     found = line_place(desk.forecast(digest), line)
     if found is None:
         raise Refused(404, "NotFound", f"line {line} of the program orders no motion", "choose a line that moves")
-    return JSONResponse(found)
+    return Json(found)
 
 
 @router.get("/{digest}/text")

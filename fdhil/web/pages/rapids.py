@@ -15,8 +15,8 @@ from starlette.requests import HTTPConnection
 from fdhil.daemon.outcome_store import WINDOWS_FOLDER
 from fdhil.errors import StoreError
 from fdhil.store.named_file import open_named
-from fdhil.store.windows import MAX_FILE_BYTES
 from fdhil.web.context import Asking, Context, Here
+from fdhil.web.file_answer import FileAnswer
 from fdhil.web.pages.rapid_list import (
     LARGEST_ID,
     Counts,
@@ -51,7 +51,7 @@ def replayer_of(app: FastAPI) -> Replayer:
     return replayer
 
 
-def _replayer(connection: HTTPConnection) -> Replayer:
+async def _replayer(connection: HTTPConnection) -> Replayer:
     return replayer_of(connection.app)
 
 
@@ -88,13 +88,11 @@ def counts(here: Here, axis: Annotated[str | None, Query(pattern="^[A-Z]$")] = N
 def recording(here: Here, asking: Asking, name: str) -> Response:
     """Return a recording as its file is, for ``fdhil replay`` and ``fdhil export``."""
     try:
-        with open_named(_folder(here), name) as file:
-            content = file.read(MAX_FILE_BYTES)
+        return FileAnswer(open_named(_folder(here), name), name, PARQUET)
     except StoreError as error:
         if error.code == "BadName":
             LOG.warning("BadName: %a asked for a recording %a", asking.name, name[:200])
         raise
-    return Response(content, media_type=PARQUET, headers={"Content-Disposition": f'attachment; filename="{name}"'})
 
 
 @router.get("/{axis}/{number}")

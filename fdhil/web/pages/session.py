@@ -39,7 +39,7 @@ class LoggedIn(Who):
 
 
 @router.get("")
-def who(request: Request, here: AtEntry) -> Who:
+async def who(request: Request, here: AtEntry) -> Who:
     """Tell who asks."""
     asker = here.access.asker(token_of(request.headers))
     acting = here.web.acting
@@ -57,7 +57,7 @@ async def log_in(login: Login, request: Request, here: AtEntry) -> LoggedIn:
 
 
 @router.delete("")
-def log_out(request: Request, here: AtEntry) -> Who:
+async def log_out(request: Request, here: AtEntry) -> Who:
     """Log out: the token is worth nothing from now on."""
     here.access.log_out(token_of(request.headers))
-    return who(request, here)
+    return await who(request, here)

@@ -1,6 +1,7 @@
 """Keeps the connections from being taken by who only holds them, so that no stranger locks anybody out of disarming.
 
-One that does nothing is ended; and where there are too many, the longest idle of whoever has the most makes room.
+One that does nothing is ended; and where there are too many, the longest idle of whoever has the most makes room. How
+many may be there is the server's ``limit_concurrency``: beyond it, it would refuse whoever comes.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ class BoundedHttp(H11Protocol):
         super().connection_made(transport)
         self.since_s = self.loop.time()
         self._look = self.loop.call_later(QUIET_S, self._end_if_quiet)
-        if len(self.connections) >= MOST_CONNECTIONS:
+        if self.limit_concurrency is not None and len(self.connections) >= self.limit_concurrency:
             _make_room([each for each in self.connections if isinstance(each, Bounded) and each is not self])
 
     @property

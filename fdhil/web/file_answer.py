@@ -1,0 +1,25 @@
+"""Sends a file as it is: a recording, a black box."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import BinaryIO
+
+from fastapi.responses import StreamingResponse
+from starlette.types import Receive, Scope, Send
+
+PIECE = 64 * 1024
+
+
+class FileAnswer(StreamingResponse):
+    """An open file, piece by piece: of however many ask at once and read slowly, no more is held in memory."""
+
+    def __init__(self, file: BinaryIO, name: str, media_type: str) -> None:
+        self._file = file
+        headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+        super().__init__(iter(partial(file.read, PIECE), b""), headers=headers, media_type=media_type)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send it, and close it."""
+        with self._file:
+            await super().__call__(scope, receive, send)
