@@ -17,9 +17,13 @@ from fdhil.config import MachineConfig
 from fdhil.daemon.kernel_warmup import nominal_rapid
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import AxisPipeline, Record, analyse
+from fdhil.pipeline.axis import WAITING_RAPIDS
 from fdhil.pipeline.recent_samples import RecentSamples
 from fdhil.records import (
     AxisSamples,
+    MoveEvent,
+    MoveKind,
+    NcMove,
     Notice,
     Outcome,
     ParameterSet,
@@ -335,3 +339,22 @@ def test_nothing_is_published_from_one_direction_while_the_other_is_refused(
         told.append([type(o).__name__ for o in outcomes if isinstance(o, Notice | ParameterSet)])
     # the first came before the other direction was known to be refused; then it is said once
     assert told == [["ParameterSet"], [], ["Notice"], [], [], []]
+
+
+def test_rapids_whose_samples_never_come_are_bounded(config: MachineConfig) -> None:
+    pipeline = AxisPipeline("X", config)
+    for k in range(2 * WAITING_RAPIDS):
+        for kind, tick in ((MoveKind.RAPID, 2000 * k), (MoveKind.REST, 2000 * k + 800)):
+            assert pipeline.feed(MoveEvent("X", kind, tick, "test")) == []
+    assert len(pipeline._rapids) == WAITING_RAPIDS
+    after = 4000 * WAITING_RAPIDS
+    assert len(windows_of(fed(pipeline, rapids(config, "X", 1, first_tick=after)))) == 1
+
+
+def test_a_program_whose_name_is_no_unicode_is_told_escaped(config: MachineConfig) -> None:
+    records = [
+        replace(record, nc=NcMove(7, "/nc/b\udcf6hlen.ngc")) if isinstance(record, MoveEvent) else record
+        for record in rapids(config, "X", 1)
+    ]
+    (cut,) = windows_of(fed(AxisPipeline("X", config), records))
+    assert cut.nc == NcMove(7, "/nc/b\\udcf6hlen.ngc")

@@ -38,7 +38,10 @@ def kept(store: Path) -> list[BlackBox]:
         match = _NAME.fullmatch(path.name)
         if match is None or path.is_symlink() or not path.is_file():
             continue
-        written = datetime.strptime(match[2], _TIME).replace(tzinfo=UTC)
+        try:
+            written = datetime.strptime(match[2], _TIME).replace(tzinfo=UTC)
+        except ValueError:  # no such date
+            continue
         found.append(BlackBox(path, int(match[1] or 0), written, match[3]))
     return sorted(found, key=lambda box: box.number)
 

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+from fdhil.daemon.journal import printable
 from fdhil.records import MoveKind, NcState, Notice
 
 FRESH_S = 1.0
@@ -31,7 +32,8 @@ class NcWatch:
 
     def note(self, state: NcState, now_s: float) -> list[Notice]:
         """Take a state; return what begins to be unusual, and what no longer is."""
-        self._state, self._heard_s = state, now_s
+        program = None if state.program is None else printable(state.program)
+        self._state, self._heard_s = replace(state, program=program), now_s
         if state.motion is MoveKind.UNKNOWN:
             return []
         found = dict(_unusual(state))
@@ -41,8 +43,8 @@ class NcWatch:
         return begun + over
 
     def placed(self, notice: Notice, now_s: float) -> Notice:
-        """Return a notice with the line that the NC works at, where it is known and the notice is no mere news."""
-        state = self._state
+        """Return a notice as it is told: printable, and unless it is mere news with the line that the NC works at."""
+        state, notice = self._state, replace(notice, text=printable(notice.text))
         if state is None or notice.severity == "info" or state.line is None or state.motion not in WORKING:
             return notice
         if now_s - self._heard_s > FRESH_S:

@@ -65,7 +65,8 @@ class NoticeBook:
             if unknown := [number for number in numbers if number not in self._known]:
                 text = f"there is no notice {', '.join(map(str, unknown[:5]))} that asks to be acknowledged"
                 raise NotAcknowledged("NoSuchNotice", text, "fdhil status shows the numbers of those that do")
-        return [number for number in waiting if number in set(numbers)]
+        named = set(numbers)
+        return [number for number in waiting if number in named]
 
     def acknowledged(self, given: Acknowledgement) -> None:
         """Note that notices were acknowledged."""

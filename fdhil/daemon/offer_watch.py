@@ -11,7 +11,7 @@ MOST = 20  # that are looked at: the folder is another user's
 
 
 class OfferWatch:
-    """Tells of each offer once; nothing without [offers] trust."""
+    """Tells of each offer once while it lies there; nothing without [offers] trust."""
 
     def __init__(self, config: MachineConfig) -> None:
         self._folder = config.offers_directory if config.offers.trust else None
@@ -24,6 +24,6 @@ class OfferWatch:
             found = waiting(self._folder, self._store) if self._folder is not None else []
         except StoreError as error:
             found = [str(error)]
-        new = [offer for offer in found[:MOST] if offer not in self._told]
-        self._told.update(new)
+        before, self._told = self._told, set(found[:MOST])
+        new = [offer for offer in found[:MOST] if offer not in before]
         return [Notice("OfferWaits", "minor", f"the works offers a change: {offer}") for offer in new]

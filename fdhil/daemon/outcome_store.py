@@ -6,6 +6,7 @@ import math
 import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 from fdhil.arming.answers import Answer
@@ -30,12 +31,15 @@ from fdhil.records import (
     frozen,
 )
 from fdhil.store import WINDOWS_FOLDER as WINDOWS_FOLDER
+from fdhil.store.atomic import sync_folder
 from fdhil.store.history import FILE_NAME, History
 from fdhil.store.outbox import Outbox
 from fdhil.store.rows import Revision, Stamp, StoredWindow
 from fdhil.store.windows import RawScale, Scales, WindowStore
 
 SKILLS = 3
+# of the history: its newest rows may be in the log alone, which goes aside first; beside no file SQLite removes it
+SUFFIXES = ("-wal", "-shm", "")
 
 
 def raw_scales(config: MachineConfig, axis: str) -> Scales:
@@ -93,6 +97,7 @@ class OutcomeStore:
         self._accepted = {axis: deque[tuple[int, int]](maxlen=HISTORY) for axis in config.axis}  # start tick and row
         self.notices = NoticeBook()
         self.fault: str | None = None
+        self._told_left = False
         self.strays: tuple[str, ...] = ()
 
     def open(self) -> list[Notice]:
@@ -121,7 +126,7 @@ class OutcomeStore:
             self._history = History.open(self._directory, *adding)
         folder = self._directory / WINDOWS_FOLDER
         self._windows = WindowStore(folder, self._config.store.keep_windows, self._config.digest)
-        self.strays = self._windows.strays
+        self.strays = tuple(map(journal.printable, self._windows.strays))
 
     def _damaged_rows(self) -> list[Notice]:
         """Put damaged rows aside, so that they are told once."""
@@ -144,12 +149,14 @@ class OutcomeStore:
     def _put_aside(self, error: StoreError) -> list[Notice]:
         path = self._directory / FILE_NAME
         k = 1
-        while (aside := path.with_name(f"{FILE_NAME}.corrupt-{k}")).exists():
+        while any(path.with_name(f"{FILE_NAME}.corrupt-{k}{suffix}").exists() for suffix in SUFFIXES):
             k += 1
+        aside = path.with_name(f"{FILE_NAME}.corrupt-{k}")
         try:
-            path.rename(aside)
-            for suffix in ("-wal", "-shm"):  # they belong to the damaged one
-                path.with_name(FILE_NAME + suffix).unlink(missing_ok=True)
+            for suffix in SUFFIXES:
+                with suppress(FileNotFoundError):
+                    path.with_name(FILE_NAME + suffix).rename(path.with_name(aside.name + suffix))
+            sync_folder(self._directory)
             self._open()
         except (OSError, StoreError):
             return self._refused(error)
@@ -205,11 +212,20 @@ class OutcomeStore:
                     self._keep(outcome)
             except StoreError as error:
                 return self._refused(error)
+            told = self._left_files()
             if self.fault is not None and any(isinstance(outcome, WindowOutcome) for outcome in outcomes):
                 self.fault = None
                 text = "The store can be written again; what came in between was not kept, arm again when needed."
-                return [Notice("StoreRecovered", "info", text)]
-        return []
+                told.append(Notice("StoreRecovered", "info", text))
+        return told
+
+    def _left_files(self) -> list[Notice]:
+        """Tell once that a window's file is there that should have gone."""
+        left = self._windows.left if self._windows is not None else None
+        if left is None or self._told_left:
+            return []
+        self._told_left = True
+        return [Notice("StrayFiles", "minor", str(left))]
 
     def acknowledge(self, request: Mapping[str, Any]) -> Answer:
         """Store who has seen which notices, so that they are open no more; StoreError when the disk refuses."""

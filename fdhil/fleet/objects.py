@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 from pathlib import Path
 
 from fdhil.errors import StoreError
@@ -28,7 +29,9 @@ def keep(folder: Path, name: str, window: bytes) -> None:
         make_folder(path.parent)
     except OSError as error:
         raise store_error(path, error) from None
-    write_file(path, window)
+    # of another collector's half file no byte may come under the name; one that a kill leaves behind goes as a window
+    # that no row names
+    write_file(path, window, part=path_of(folder, f"{name}-{secrets.token_hex(8)}"))
 
 
 def check_folder(folder: Path) -> None:

@@ -46,6 +46,7 @@ RECENT_S = 30.0  # a rapid that is longer than this is cut short, and then refus
 LEAD_S = 0.25  # standstill wanted before a rapid
 SETTLE_S = 0.30  # after the demand has ended: the shaft comes to rest, and stays there for the window's margin
 VOLTAGE_PATIENCE_S = 1.0  # how much later than the drive's samples a separate sensor may deliver
+WAITING_RAPIDS = 300  # for their samples: one each 0.1 s; older ones' samples are no longer kept when they come
 POOL_WINDOWS = 4  # both directions twice: enough to tell viscous from dry friction, few enough to follow drift
 
 JUMPS = {"LoadChanged", "ParameterJump"}
@@ -114,7 +115,7 @@ class AxisPipeline:
         self._period_s = config.machine.sync_period_s
         known = known or Known()
         self._recent = RecentSamples(axis, config.axis[axis], self._ticks(RECENT_S), self._period_s)
-        self._rapids: deque[_Rapid] = deque()
+        self._rapids: deque[_Rapid] = deque(maxlen=WAITING_RAPIDS)
         self._temperature: Temperature | None = None
         self._pool: list[_Pooled] = []
         self._held: list[_Pooled] = []
@@ -167,7 +168,7 @@ class AxisPipeline:
         if self._rapids and self._rapids[-1].end is None:
             self._rapids[-1] = replace(self._rapids[-1], end=event.tick)
         if event.kind is MoveKind.RAPID:
-            self._rapids.append(_Rapid(event.tick, None, event.source, event.nc))
+            self._rapids.append(_Rapid(event.tick, None, event.source, _in_unicode(event.nc)))
 
     def _cut_what_is_over(self) -> list[Outcome]:
         outcomes: list[Outcome] = []
@@ -298,6 +299,13 @@ class AxisPipeline:
             )
         except ValueError:  # too few whole rows to compare
             return None
+
+
+def _in_unicode(nc: NcMove | None) -> NcMove | None:
+    """Return what the NC said so that JSON and UTF-8 take it: what is no Unicode in its program's name is escaped."""
+    if nc is None or nc.program is None:
+        return nc
+    return replace(nc, program=nc.program.encode("utf-8", "backslashreplace").decode())
 
 
 def _since_jump(known: Known) -> Sequence[Member]:

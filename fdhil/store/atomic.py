@@ -40,14 +40,15 @@ def store_error(path: Path, error: OSError) -> StoreError:
     return StoreError(f"{path} could not be written: {cause}", code)
 
 
-def write_file(path: Path, content: bytes, like: os.stat_result | None = None) -> None:
+def write_file(path: Path, content: bytes, like: os.stat_result | None = None, part: Path | None = None) -> None:
     """Write ``content`` under a temporary name, fsync, rename, fsync the folder. StoreError when any step fails.
 
     ``like``: with the mode and the owner of another file.
 
-    The temporary name is fixed (``.NAME.part``), so that what a power cut leaves behind is overwritten, never piled up.
+    The temporary name is fixed (``.NAME.part``), so that what a power cut leaves behind is overwritten, never piled up;
+    ``part`` is another one, where several may write the same file at once.
     """
-    part = path.with_name(f".{path.name}.part")
+    part = part or path.with_name(f".{path.name}.part")
     try:
         descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
         try:

@@ -29,7 +29,7 @@ from fdhil.store.schema import Also, told
 FILE_NAME = HISTORY_FILE
 CHECKED = 5_000  # newest rows of a table that are looked at whatever they say: a start must not last longer every year
 KEEP_NOTICES = 100_000
-RECENT_NOTICES = 5_000  # the newest: an older one asks nobody any more
+RECENT_NOTICES = 5_000  # the newest that ask to be acknowledged: an older one asks nobody any more
 KEEP_COMPARISONS = 10_000
 KEEP_ACKNOWLEDGEMENTS = 10_000
 Tell = Callable[[str], object]
@@ -69,7 +69,7 @@ class History:
                 schema.bring_up(db, path)
                 if begin is not None:
                     begin(db)
-            except (sqlite3.Error, StoreError):
+            except BaseException:
                 db.close()
                 raise
         return cls(db, path, schema.SCHEMA_VERSION, also=also)
@@ -294,10 +294,13 @@ class History:
 
     def chosen_windows(self, condition: str, values: Mapping[str, Any], limit: int) -> list[StoredWindow]:
         """Return the first ``limit`` sound windows that an SQL condition, order included, chooses."""
+        return self._chosen("windows", condition, values, limit)
+
+    def _chosen(self, table: str, condition: str, values: Mapping[str, Any], limit: int | None) -> list[Any]:
         with told(self._path), closing(self._db.cursor()) as cursor:
             cursor.row_factory = sqlite3.Row
-            rows = map(dict, cursor.execute(f"SELECT * FROM windows WHERE {condition}", values))
-            return list(islice((it for row in rows if (it := self._believed("windows", row)) is not None), limit))
+            rows = map(dict, cursor.execute(f"SELECT * FROM {table} WHERE {condition}", values))
+            return list(islice((it for row in rows if (it := self._believed(table, row)) is not None), limit))
 
     def figures(self, query: str, values: Mapping[str, Any] | Sequence[Any]) -> list[tuple[Any, ...]]:
         """Return what an SQL query counts; it is a figure for people, and damaged rows are in it."""
@@ -308,9 +311,14 @@ class History:
         """Return the skills of recorded moves, oldest first."""
         return self._read("skills", _of(axis), limit)
 
-    def notices(self, axis: str | None = None, limit: int | None = None) -> list[StoredNotice]:
-        """Return the notices, each with its newest acknowledgement, oldest first; with ``limit`` the newest so many."""
-        found: list[StoredNotice] = self._read("notices", _of(axis), limit)
+    def notices(self, limit: int | None = None) -> list[StoredNotice]:
+        """Return the notices, each with its newest acknowledgement, oldest first.
+
+        With ``limit`` the newest so many that ask to be acknowledged, and as many others: mere news displaces none.
+        """
+        kinds = (f"severity {kind} 'info' ORDER BY id DESC" for kind in ("IS NOT", "IS"))
+        found: list[StoredNotice] = [each for kind in kinds for each in self._chosen("notices", kind, {}, limit)]
+        found.sort(key=lambda notice: notice.number)
         given = {number: one for one in self.acknowledgements() for number in one.notices} if found else {}
         return [replace(notice, acknowledged=given.get(notice.number)) for notice in found]
 

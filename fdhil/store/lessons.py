@@ -29,9 +29,13 @@ def kept_lessons(folder: Path, config_digest: str) -> list[tuple[float, str, Les
     """
     found = []
     for path in folder.glob(f"*-{config_digest}.npz"):
+        try:
+            written_s = path.stat().st_mtime
+        except FileNotFoundError:  # the daemon let it go meanwhile
+            continue
         lesson = read_lesson(path)
         if lesson is not None:
-            found.append((path.stat().st_mtime, path.name.partition("-")[0], lesson))
+            found.append((written_s, path.name.partition("-")[0], lesson))
     return sorted(found, key=lambda kept: -kept[0])
 
 

@@ -18,6 +18,7 @@ from fdhil.errors import StoreError
 from fdhil.store.atomic import CAUSES, is_full, store_error, sync_folder
 
 _CODES = {"SQLITE_FULL": "DiskFull", "SQLITE_READONLY": "ReadOnlyStore", "SQLITE_CANTOPEN": "ReadOnlyStore"}
+_NOT_WRITABLE = ("SQLITE_READONLY", "SQLITE_CANTOPEN")
 # SQLITE_ERROR: our own statements are right, so the tables are not what their version says
 _DAMAGE = {"SQLITE_NOTADB", "SQLITE_CORRUPT", "SQLITE_ERROR"}
 _STAMP = "wall_s REAL NOT NULL, boot TEXT NOT NULL, monotonic_ns INTEGER NOT NULL"
@@ -90,7 +91,7 @@ def told(path: Path) -> Iterator[None]:
     """Turn SQLite's errors into one sentence."""
     try:
         yield
-    except UnicodeError:
+    except UnicodeDecodeError:
         raise _damaged(path, "a name in it is no text") from None
     except sqlite3.Error as error:
         name = getattr(error, "sqlite_errorname", "") or ""
@@ -144,15 +145,15 @@ def open_to_read(path: Path, checked: set[tuple[int, int]] | None = None) -> tup
     place = path.stat()
     known = checked is not None and (place.st_dev, place.st_ino) in checked
     with told(path):
-        for flags in ("mode=ro", "mode=ro&immutable=1"):  # without a shared-memory file only the latter opens
+        # where no shared-memory file can be made only the latter opens; nowhere else, since it heeds no lock
+        for flags in ("mode=ro", "mode=ro&immutable=1"):
             db = sqlite3.connect(f"{path.resolve().as_uri()}?{flags}", uri=True, timeout=5.0)
             try:
                 version = check_file(db, path, least=1, pages=not known)
-            except sqlite3.OperationalError:
+            except BaseException as error:
                 db.close()
-                continue
-            except (sqlite3.Error, StoreError):
-                db.close()
+                if str(getattr(error, "sqlite_errorname", "")).startswith(_NOT_WRITABLE):
+                    continue
                 raise
             if checked is not None:
                 checked.add((place.st_dev, place.st_ino))
@@ -181,8 +182,7 @@ def bring_up(db: sqlite3.Connection, path: Path) -> None:
     while (version := version_of(db)) < SCHEMA_VERSION:
         if not new:
             _keep_copy(db, path.with_name(f"{path.name}.schema-{version}"))
-        db.execute("BEGIN IMMEDIATE")
-        try:
+        with _all_or_nothing(db):
             if version_of(db) == version:  # else another process made the same step in between
                 sound = _sound_rows(db) if version >= WITH_DIGESTS else None
                 for statement in _STEPS[version].split(";"):
@@ -190,10 +190,18 @@ def bring_up(db: sqlite3.Connection, path: Path) -> None:
                 if version + 1 >= WITH_DIGESTS:
                     _sign(db, sound)
                 db.execute(f"PRAGMA user_version = {version + 1}")
-            db.execute("COMMIT")
-        except sqlite3.Error:
-            db.rollback()
-            raise
+
+
+@contextmanager
+def _all_or_nothing(db: sqlite3.Connection) -> Iterator[None]:
+    """Make one transaction of what is done within; whatever ends it early leaves none open."""
+    db.execute("BEGIN IMMEDIATE")
+    try:
+        yield
+        db.execute("COMMIT")
+    except BaseException:
+        db.rollback()
+        raise
 
 
 def _keep_copy(db: sqlite3.Connection, path: Path) -> None:
@@ -246,8 +254,8 @@ def insert(db: sqlite3.Connection, table: str, row: Mapping[str, Any], also: Als
     """Add a row with the digest of what the file then holds of it, and what ``also`` adds; return its number."""
     names = ", ".join(row)
     marks = ", ".join(f":{name}" for name in row)
-    db.execute("BEGIN IMMEDIATE")
-    try:
+    row = {name: _storable(value) for name, value in row.items()}
+    with _all_or_nothing(db):
         number = int(db.execute(f"INSERT INTO {table} ({names}, digest) VALUES ({marks}, '')", row).lastrowid or 0)
         cursor = db.execute(f"SELECT * FROM {table} WHERE id = ?", (number,))
         stored = dict(zip([column[0] for column in cursor.description], cursor.fetchone(), strict=True))
@@ -255,24 +263,20 @@ def insert(db: sqlite3.Connection, table: str, row: Mapping[str, Any], also: Als
         db.execute(f"UPDATE {table} SET digest = ? WHERE id = ?", (stored["digest"], number))
         if also is not None:
             also(db, table, stored)
-        db.execute("COMMIT")
-    except sqlite3.Error:
-        db.rollback()
-        raise
     return number
+
+
+def _storable(value: Any) -> Any:
+    """Return a value as SQLite takes it: what is no Unicode in a text, as in a file's Latin-1 name, is escaped."""
+    return value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
 
 
 def put_aside(db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
     """Move a damaged row, as it is read now, to the table where nothing is believed."""
-    db.execute("BEGIN IMMEDIATE")
-    try:
+    with _all_or_nothing(db):
         content = (table, row["id"], ascii(dict(row)))
         db.execute("INSERT INTO quarantine (of, row, content) VALUES (?, ?, ?)", content)
         db.execute(f"DELETE FROM {table} WHERE id = ?", (row["id"],))
-        db.execute("COMMIT")
-    except sqlite3.Error:
-        db.rollback()
-        raise
 
 
 def named(rows: Mapping[tuple[str, int], Any]) -> str:

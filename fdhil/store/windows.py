@@ -12,6 +12,7 @@ import io
 import json
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -290,12 +291,14 @@ class WindowStore:
             raise store_error(folder, error) from None
         listing = list_windows(folder)
         self.strays = listing.strays
+        self.left: StoreError | None = None  # why the first file that should have gone is still there
         self._files = list(listing.windows)
 
     def append(self, window: Window, scales: Scales | None = None, at_least: int = 0) -> WindowFile:
         """Write a window durably and return its file; its number exceeds every stored one and ``at_least``.
 
-        StoreError when it cannot be written: nothing half-written is left under the window's name.
+        StoreError when it cannot be written: nothing half-written is left under the window's name. An old file that
+        cannot be removed is left there, ``left`` says why; it is tried again by the next store that is opened.
         """
         number = max(self._files[-1].number if self._files else 0, at_least) + 1
         file = WindowFile(number, window.axis, self.folder / f"w{number:08d}-{window.axis}.parquet")
@@ -305,12 +308,13 @@ class WindowStore:
         return file
 
     def _prune(self) -> None:
-        if len(self._files) <= self._keep:
-            return
-        try:
-            while len(self._files) > self._keep:
-                self._files[0].path.unlink(missing_ok=True)
-                self._files.pop(0)
-            sync_folder(self.folder)
-        except OSError as error:
-            raise store_error(self._files[0].path, error) from None
+        old = [self._files.pop(0).path for _ in range(len(self._files) - self._keep)]
+        for path in old:
+            try:
+                path.unlink(missing_ok=True)
+            except OSError as error:
+                text = f"{path} cannot be removed ({error.strerror}): it stays there, new windows are stored as before"
+                self.left = self.left or StoreError(f"{text}; check the disk and the file's rights")
+        if old:
+            with suppress(OSError):  # what a power cut brings back goes later
+                sync_folder(self.folder)

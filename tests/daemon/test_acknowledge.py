@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -93,3 +94,18 @@ def test_only_the_newest_notices_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     for number in range(1, 6):
         book.stored(DOWN, number, STAMP)
     assert [told["number"] for told in book.status()["newest"]] == [3, 4, 5]
+
+
+def test_a_long_list_of_numbers_is_gone_through_a_few_times_however_many_wait() -> None:
+    class Counted(list[int]):
+        times = 0
+
+        def __iter__(self) -> Iterator[int]:
+            self.times += 1
+            return super().__iter__()
+
+    book = NoticeBook()
+    book.begin([StoredNotice(number, DOWN, STAMP) for number in range(1, 101)])
+    numbers = Counted(range(1, 101))
+    assert len(book.chosen({"notices": numbers})) == 100
+    assert numbers.times < 5

@@ -90,3 +90,11 @@ def test_a_disk_that_refuses_is_told(tmp_path: Path) -> None:
     (tmp_path / "blackbox").write_text("in the way")
     told = blackbox.dump(tmp_path, "SyncLost", dict)
     assert (told.code, told.severity) == ("StoreFault", "minor")
+
+
+def test_a_file_of_an_impossible_date_is_none(tmp_path: Path) -> None:
+    (tmp_path / "blackbox").mkdir()
+    (tmp_path / "blackbox" / "000007-20260230T101010.000000Z-GuardTripped.log").write_text("x")  # 30 February
+    assert blackbox.kept(tmp_path) == []
+    assert blackbox.dump(tmp_path, "SyncLost", dict).code == "BlackBox"
+    assert [box.number for box in blackbox.kept(tmp_path)] == [1]

@@ -54,3 +54,13 @@ def test_the_status_says_what_the_nc_does() -> None:
     status = watch.status(5.0)
     assert status is not None
     assert nc_line(status) == "NC: not heard for 3 s, its moves are unknown"
+
+
+def test_a_name_that_is_no_unicode_is_told_escaped() -> None:
+    watch = NcWatch()
+    watch.note(replace(WORKING, program="/nc/b\udcf6hlen.ngc"), 1.0)
+    assert watch.placed(TROUBLE, 1.5).text == "the drive has a fault (the NC is at line 12 of b\\udcf6hlen.ngc)"
+    assert watch.placed(replace(TROUBLE, severity="info", text="\udcf6"), 1.5).text == "\\udcf6"
+    status = watch.status(1.5)
+    assert status is not None
+    assert status["program"] == "/nc/b\\udcf6hlen.ngc"

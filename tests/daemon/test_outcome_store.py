@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fdhil.daemon import outcome_store
 from fdhil.daemon.outcome_json import as_document
 from fdhil.daemon.outcome_store import OutcomeStore, raw_scales
 from fdhil.identification.pooling import member
@@ -166,3 +167,65 @@ def test_a_load_is_part_of_what_is_told_in_json() -> None:
     told = as_document(outcome())
     assert (told["terms"], told["warnings"], told["unexplained_um"]) == ({}, [], None)
     assert told["friction_at_rapid"]["value"] == pytest.approx(5.0 + 0.05 * 157.08, abs=0.01)
+
+
+@pytest.mark.fault("F17")
+def test_the_log_of_a_damaged_history_is_kept_beside_it(tmp_path: Path) -> None:
+    path = tmp_path / "fdhil-data" / FILE_NAME
+    store, _ = opened(tmp_path)
+    for k in range(50):
+        assert store.keep([Notice("A", "MAJOR", f"record {k} " + "x" * 500)]) == []
+    store.close()
+    store, _ = opened(tmp_path)
+    assert store.keep([Notice("A", "MAJOR", "the newest, in the log alone")]) == []
+    reader = sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)  # as of fdhil web: the log outlives the daemon
+    reader.execute("SELECT count(*) FROM notices").fetchone()
+    store.close()
+    log = path.with_name(FILE_NAME + "-wal").read_bytes()
+    assert b"in the log alone" in log
+    with path.open("r+b") as file:
+        file.seek(14 * 4096)
+        file.write(b"\xff" * 4096)
+    store, said = opened(tmp_path)
+    assert [notice.code for notice in said] == ["CorruptFile"]
+    store.close()
+    reader.close()
+    assert path.with_name(f"{FILE_NAME}.corrupt-1-wal").read_bytes() == log
+
+
+def test_an_old_window_that_cannot_be_removed_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = OutcomeStore(config_of(tmp_path, store={"keep_windows": 2}))
+    store.open()
+
+    def refuse(path: Path, **_: Any) -> None:
+        if path.suffix == ".parquet":
+            raise OSError(errno.EPERM, os.strerror(errno.EPERM))
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    said = [notice for _ in range(6) for notice in store.keep([outcome()])]
+    assert [(notice.code, notice.severity) for notice in said] == [("StrayFiles", "minor")]
+    assert "w00000001-X.parquet cannot be removed" in said[0].text
+    assert (store.counts("X"), store.fault) == ((6, 0), None)
+    store.close()
+
+
+def test_what_waits_to_be_acknowledged_waits_after_a_restart_whatever_news_came(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(outcome_store, "NEWEST", 3)
+    store, _ = opened(tmp_path)
+    store.keep([Notice("MaintenanceDue", "MAJOR", "the screw"), *(Notice("A", "info", str(k)) for k in range(9))])
+    store.close()
+    again, _ = opened(tmp_path)
+    assert again.notices.status()["count"] == 1
+    assert again.acknowledge({"notices": [1], "by": "anna"})["ok"]
+    again.close()
+
+
+def test_a_stray_whose_name_is_no_unicode_is_named_escaped(tmp_path: Path) -> None:
+    folder = tmp_path / "fdhil-data" / "windows"
+    folder.mkdir(parents=True)
+    (folder / "b\udcf6hlen.txt").write_text("")
+    store, _ = opened(tmp_path)
+    assert store.strays == ("b\\udcf6hlen.txt",)
+    store.close()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import stat
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -19,6 +21,7 @@ from fdhil.errors import StoreError
 from fdhil.fleet import objects
 from fdhil.fleet.collector import Collector, Received, _fetch, _give_back, _next
 from fdhil.fleet.message import Message, Unread, of_entry
+from fdhil.store import atomic
 from fdhil.store.outbox import Entry
 
 DIGEST, STORE = "a" * 64, "5" * 32
@@ -131,3 +134,28 @@ def test_a_window_is_written_once_under_the_name_of_its_content(tmp_path: Path) 
         objects.keep(tmp_path, name, b"PAR1")
     assert objects.path_of(tmp_path, name).read_bytes() == b"PAR1"
     assert sorted(path.name for path in tmp_path.rglob("*.part")) == []
+
+
+def test_a_collector_that_is_killed_spoils_no_window_that_another_one_keeps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name, window, fsync = "ab" + "0" * 62, b"w" * 5_000, os.fsync
+
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    def other_begins(descriptor: int) -> None:
+        """Let another one begin the same window, and end, between this one's last byte and its rename."""
+        fsync(descriptor)
+        if stat.S_ISREG(os.fstat(descriptor).st_mode):
+            with monkeypatch.context() as inner:
+                inner.setattr(atomic, "write_all", killed)
+                with pytest.raises(KeyboardInterrupt):
+                    objects.keep(tmp_path, name, window)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", other_begins)
+        objects.keep(tmp_path, name, window)
+    assert objects.path_of(tmp_path, name).read_bytes() == window
+    left = [path.stem for path in tmp_path.rglob("*") if path.is_file() and path.stem != name]
+    assert [objects.path_of(tmp_path, each).is_file() for each in left] == [True], "retention finds what is left behind"

@@ -179,3 +179,15 @@ def test_a_change_that_cannot_be_offered_is_2(old: str, new: str, words: str, wo
     signed = ["fleet", "sign", "change.toml", "--key", "works.key", "--by", "Anna", "--machine", "mill-1"]
     code, _, said = fdhil(*signed, "--out", "stick.offer", capsys=capsys)
     assert (code, words in said, Path("stick.offer").exists()) == (2, True, False), said
+
+
+def test_the_daemon_remembers_of_the_offers_those_alone_that_lie_there(works: Works, file: Path) -> None:
+    config = lay(works, file)
+    watch = OfferWatch(config)
+    watch.look()
+    for number in range(1, 60):
+        for old in config.offers_directory.glob("*.offer"):
+            old.unlink()
+        (config.offers_directory / f"other-{number}.offer").touch()
+        assert [each.text for each in watch.look()] == [f"the works offers a change: other version {number}"]
+    assert len(watch._told) == 1

@@ -317,3 +317,53 @@ def test_a_reader_that_comes_again_and_again_looks_at_a_whole_file_once(
     with History.read(tmp_path):
         pass
     assert checks == [True, True], "a new file is looked at anew, and so is any for who keeps nothing"
+
+
+LATIN_1 = "/nc/b\udcf6hlen.ngc"  # as Linux hands a Latin-1 file name over
+
+
+def test_a_text_that_is_no_unicode_is_stored_escaped(tmp_path: Path) -> None:
+    with History.open(tmp_path) as history:
+        history.add_notice(Notice("ArmRefused", "minor", f"{LATIN_1} cannot be read"), STAMP)
+        history.add_comparison(replace(comparison(1.0), name=LATIN_1), STAMP)
+        assert [each.notice.text for each in history.notices()] == ["/nc/b\\udcf6hlen.ngc cannot be read"]
+        assert [found.name for _, found in history.comparisons("a" * 64, 2)] == ["/nc/b\\udcf6hlen.ngc"]
+
+
+class Interrupted(BaseException):
+    """What ends a thread in the middle of a row."""
+
+
+def test_whatever_ends_a_row_early_the_next_one_is_stored(tmp_path: Path) -> None:
+    fails = [True]
+
+    def also(*_: Any) -> None:
+        if fails.pop():
+            raise Interrupted
+
+    with History.open(tmp_path, also) as history:
+        with pytest.raises(Interrupted):
+            history.add_notice(Notice("BusDown", "MAJOR", "lost"), STAMP)
+        fails.append(False)
+        history.add_notice(Notice("BusDown", "MAJOR", "kept"), STAMP)
+        assert [each.notice.text for each in history.notices()] == ["kept"]
+
+
+def test_what_waits_is_not_displaced_by_news(tmp_path: Path) -> None:
+    with History.open(tmp_path) as history:
+        for severity, text in (("MAJOR", "old"), ("minor", "b"), ("MAJOR", "c"), *(("info", str(k)) for k in range(5))):
+            history.add_notice(Notice("Tested", severity, text), STAMP)  # type: ignore[arg-type]
+        assert [each.notice.text for each in history.notices(limit=2)] == ["b", "c", "3", "4"]
+
+
+def test_a_locked_history_is_not_read_past_its_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    connect = sqlite3.connect
+    History.open(tmp_path).close()
+    db = connect(tmp_path / FILE_NAME, isolation_level=None)
+    db.execute("PRAGMA journal_mode = DELETE")
+    db.execute("BEGIN EXCLUSIVE")
+    monkeypatch.setattr("fdhil.store.schema.sqlite3.connect", lambda *a, **k: connect(*a, **{**k, "timeout": 0.0}))
+    with pytest.raises(StoreError, match="locked") as error:
+        History.read(tmp_path)
+    db.close()
+    assert error.value.code == "StoreFault"

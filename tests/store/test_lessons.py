@@ -9,6 +9,7 @@ import pytest
 
 from fdhil.correction.learning import Lesson
 from fdhil.errors import StoreError
+from fdhil.store import lessons
 from fdhil.store.lessons import MOST_PROGRAMS, lesson_path, read_lesson, write_lesson
 
 LESSON = Lesson({"X": np.linspace(-3.0, 3.0, 50), "Y": np.zeros(50)}, 1.5, 0.35, (1.5, 0.6, 0.4))
@@ -48,3 +49,19 @@ def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     (tmp_path / "lessons").write_text("no folder")
     with pytest.raises(StoreError, match="could not be written"):
         write_lesson(tmp_path / "lessons" / "a.npz", LESSON)
+
+
+def test_a_lesson_that_goes_while_all_are_listed_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    paths = [lesson_path(tmp_path, letter * 64, "d") for letter in "ab"]
+    for path in paths:
+        write_lesson(path, LESSON)
+    read = lessons.read_lesson
+
+    def both_go(path: Path) -> Lesson | None:
+        found = read(path)
+        for each in paths:
+            each.unlink(missing_ok=True)
+        return found
+
+    monkeypatch.setattr(lessons, "read_lesson", both_go)
+    assert len(lessons.kept_lessons(tmp_path, "d")) == 1

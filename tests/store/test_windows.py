@@ -201,3 +201,25 @@ def test_a_short_write_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr("fdhil.store.atomic.os.write", lambda fd, data: write(fd, bytes(data[:1000])))
     made: Window = window()
     assert same(read_window(WindowStore(tmp_path, 5, "d").append(made).path), made)
+
+
+def test_a_file_that_cannot_be_removed_holds_up_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = WindowStore(tmp_path, keep=2, config_digest="d")
+    first = store.append(window(n=60)).path
+    real = Path.unlink
+
+    def unlink(path: Path, missing_ok: bool = False) -> None:
+        if path == first:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        real(path, missing_ok)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", unlink)
+        for _ in range(5):
+            store.append(window(n=60))
+    assert [file.number for file in list_windows(tmp_path).windows] == [1, 5, 6]
+    assert str(first) in str(store.left)
+    again = WindowStore(tmp_path, keep=2, config_digest="d")
+    again.append(window(n=60))
+    assert [file.number for file in list_windows(tmp_path).windows] == [6, 7]
+    assert again.left is None
