@@ -103,7 +103,7 @@ class StoreError(FdhilError):
 
 
 class RecordingError(FdhilError):
-    """A recording cannot be read: it is truncated, empty, misses a column, or holds text where a number belongs."""
+    """A recording or demand cannot be read: truncated, empty, without a column, or with text where a number belongs."""
 
 
 class OutputError(FdhilError):

@@ -56,16 +56,44 @@ def test_all_faults_are_told_at_once() -> None:
         ),
         ({"current_kp": -1.0}, "axis.X.regulators.current_kp"),
         ({"structure": "p_pi"}, "did you mean 'p_pi_pi'?"),
-        ({"voltage_limit_v": "300"}, ""),
+        ({"voltage_limit_v": "300"}, "axis.X.regulators.voltage_limit_v: must be a number, not '300'"),
     ],
 )
 def test_regulators(change: dict[str, Any], expected: str) -> None:
     document = bench_document()
     document["axis"]["X"]["regulators"].update(change)
-    if not expected:  # a number in quotes is read as the number
-        assert config.parse(document).axis["X"].regulators.voltage_limit_v == 300.0
-    else:
-        assert expected in faults(document)
+    assert expected in faults(document)
+
+
+@pytest.mark.parametrize("value", [True, "1", "1e3", "yes"])
+def test_a_number_is_neither_text_nor_a_switch(value: object) -> None:
+    document = bench_document()
+    document["axis"]["X"]["nominal"]["R"] = value
+    document["axis"]["X"]["correction"] = {"max_offset_um": value}
+    document["sim"] = {"seed": value, "axis": {"X": {"limit_switches_mm": [value, 1.0]}}}
+    document["bus"] = {"can0": {"bitrate": value}}
+    told = faults(document)
+    keys = ("axis.X.nominal.R", "axis.X.correction.max_offset_um", "sim.seed", "bus.can0.bitrate")
+    for key in (*keys, "sim.axis.X.limit_switches_mm.0"):
+        assert f"{key}: must be a number, not {value!r}" in told
+
+
+@pytest.mark.parametrize("value", [1, 0.0, "yes", "true"])
+def test_a_switch_is_true_or_false(value: object) -> None:
+    document = bench_document()
+    document["sim"] = {"nc": value}
+    assert f"sim.nc: must be true or false, not {value!r}" in faults(document)
+
+
+def test_whole_numbers_paths_and_options_of_an_adapter_are_taken_as_they_are_written() -> None:
+    document = bench_document()
+    document["axis"]["X"]["nominal"]["R"] = 1
+    document["store"] = {"directory": "data"}
+    options = {"text": "1", "switch": True, "whole": 1, "number": 1.5}
+    document["bus"] = {"can0": {"bitrate": 1e6, "options": options}}
+    read = config.parse(document)
+    assert (read.axis["X"].nominal.R, read.store.directory, read.bus["can0"].bitrate) == (1.0, Path("data"), 1_000_000)
+    assert repr(dict(read.bus["can0"].options)) == repr(options)
 
 
 def test_limits_that_cannot_be_ramped_down_in_time_are_refused() -> None:

@@ -8,9 +8,7 @@ from pathlib import Path
 import click
 
 from fdhil.cli.compiling import forewarn
-from fdhil.cli.options import OutputFile, Positive, Writing
-
-FILE = click.Path(path_type=Path)
+from fdhil.cli.options import FILE, OutputFile, Positive, Writing
 
 
 @click.command(cls=Writing)

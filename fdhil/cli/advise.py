@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import click
 
 from fdhil.cli.compiling import forewarn
-from fdhil.cli.options import OutputFile, Positive, Writing
-from fdhil.cli.prediction import FILE, inputs
+from fdhil.cli.options import FILE, OutputFile, Positive, Writing
+from fdhil.cli.prediction import inputs
 
 if TYPE_CHECKING:
     from fdhil.config import MachineConfig

@@ -10,10 +10,11 @@ from typing import Any
 import click
 
 from fdhil import config as machine_config
+from fdhil.cli.options import FILE
 
 
 @click.command()
-@click.argument("config", type=click.Path(path_type=Path))
+@click.argument("config", type=FILE)
 @click.option("--last", type=click.IntRange(min=1), default=20, show_default=True, help="How many entries to show.")
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
 def audit(config: Path, last: int, as_json: bool) -> int:

@@ -15,11 +15,12 @@ from typing import Any
 from fdhil.cli.compiling import forewarn
 from fdhil.cli.failing import error_document
 from fdhil.config import Axis, Identification, MachineConfig
-from fdhil.errors import FdhilError
+from fdhil.errors import FdhilError, RecordingError
 from fdhil.fleet.spread import Crew
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse_windows, pool
 from fdhil.records import Estimate, LoopEstimate, Reason, Recording, Verdict, Window, WindowOutcome
+from fdhil.store import suffixes
 from fdhil.store.accelerometer_csv import with_accelerometer
 from fdhil.store.column_map import ColumnMap
 from fdhil.store.recording_parquet import stored_window
@@ -124,6 +125,9 @@ def analyse_file(
 
 def _read(path: Path, accelerometer: Path | None, columns: ColumnMap | None) -> Recording | Window:
     """Read a recording; a stored window is one rapid already, and is taken as it is, to the bit."""
+    if next(os.walk(path), None) is not None:  # a folder: what is in it would be given in its place
+        known = ", ".join(suffixes.RECORDINGS)
+        raise RecordingError(f"{path} has no recordings ({known}); give the folder that has them")
     if accelerometer is None and columns is None and (stored := stored_window(path)) is not None:
         return stored
     recording = read_recording(path, columns)

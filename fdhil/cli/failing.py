@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TextIO, TypeVar
 
 import click
 
@@ -35,7 +35,7 @@ def run_safely(command: click.Command) -> int:
         result = command.main(standalone_mode=False)
         sys.stdout.flush()
     except click.exceptions.NoArgsIsHelpError as error:
-        error.show()
+        _say(error.format_message())
         return error.exit_code
     except click.exceptions.Abort:
         return tell("Stopped", "stopped by the operator", STOPPED)
@@ -46,13 +46,14 @@ def run_safely(command: click.Command) -> int:
     except FdhilError as error:
         return tell(type(error).__name__, str(error), error.exit_code, _details(error))
     except (SystemExit, BrokenPipeError):  # whoever read the answer has seen enough of it; click raises the former
-        _drop_stdout()
+        _drop(sys.stdout)
         return 0
     except OSError as error:
-        _drop_stdout()
         place = f"{error.filename}: " if error.filename else ""
         text = f"{place}{error.strerror or error}; nothing more was done, check the disk, the path and its rights"
-        return tell(type(error).__name__, text, TROUBLE)
+        tell(type(error).__name__, text, TROUBLE)
+        _drop(sys.stdout)  # it may be what takes nothing
+        return TROUBLE
     except RuntimeError as error:
         if "no locator available" not in str(error):  # numba's words
             raise
@@ -71,7 +72,7 @@ def verdict(command: Callable[Given, Result]) -> Callable[Given, Result]:
             result = command(*given, **options)
             sys.stdout.flush()
         except BrokenPipeError:
-            _drop_stdout()
+            _drop(sys.stdout)
             click.get_current_context().exit(TROUBLE)
         return result
 
@@ -82,16 +83,16 @@ def prepare_streams() -> None:
     """Make standard output and error take whatever is said: a terminal without ± shows ?, a closed one nothing.
 
     What was closed is /dev/null from here on, also in programs started from here: a bus that was opened in its place
-    would be sent what is said.
+    would be sent what is said. A closed standard input is one that is at its end.
     """
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= STANDARD_ERROR:
         os.set_inheritable(descriptor, True)
     os.close(descriptor)
-    for name in ("stdout", "stderr"):
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         stream = getattr(sys, name)
         if stream is None:
-            setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115 (for as long as the process lives)
-        elif isinstance(stream, io.TextIOWrapper):
+            setattr(sys, name, Path(os.devnull).open(mode))  # noqa: SIM115 (for as long as the process lives)
+        elif mode == "w" and isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
 
 
@@ -102,7 +103,7 @@ def tell(kind: str, text: str, code: int, details: dict[str, Any] | None = None)
         with contextlib.suppress(OSError):
             click.echo(json.dumps(document))
     else:
-        click.echo(f"fdhil: {text}", err=True)
+        _say(f"fdhil: {text}")
     return code
 
 
@@ -132,9 +133,7 @@ def _tell_config(error: ConfigError) -> int:
         return tell(type(error).__name__, str(error), error.exit_code, _details(error))
     if len(error.faults) == 1:
         return tell("", f"{error.source} cannot be used: {error.faults[0]}", error.exit_code)
-    click.echo(f"fdhil: {error.source} cannot be used:", err=True)
-    for fault in error.faults:
-        click.echo(f"  {fault}", err=True)
+    _say("\n".join([f"fdhil: {error.source} cannot be used:", *(f"  {fault}" for fault in error.faults)]))
     return error.exit_code
 
 
@@ -146,9 +145,17 @@ def _usage(error: click.ClickException) -> str:
     return f"{text}; {command} --help tells how it is called"
 
 
-def _drop_stdout() -> None:
-    """Let nothing more be written to an output that takes nothing: the interpreter would complain at its end."""
+def _say(text: str) -> None:
+    """Say it on standard error; where that takes nothing, the exit code still tells."""
+    try:
+        click.echo(text, err=True)
+    except OSError:
+        _drop(sys.stderr)
+
+
+def _drop(stream: TextIO) -> None:
+    """Let nothing more be written to a stream that takes nothing: the interpreter would complain at its end."""
     with contextlib.suppress(OSError, ValueError):
         descriptor = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(descriptor, sys.stdout.fileno())
+        os.dup2(descriptor, stream.fileno())
         os.close(descriptor)

@@ -10,9 +10,9 @@ from typing import Any
 
 import click
 
+from fdhil.cli.options import FILE
 from fdhil.errors import FdhilError
 
-FILE = click.Path(path_type=Path)
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
 LINES = click.option("--json", "as_json", is_flag=True, help="Write each line of the log as a JSON object to stdout.")
 BY = click.option("--by", default="type", show_default=True, help="The label by which machines are of one kind.")

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 import click
 
 from fdhil import tables
-from fdhil.cli.fleet import AS_JSON, BY, FILE, with_extra
+from fdhil.cli.fleet import AS_JSON, BY, with_extra
+from fdhil.cli.options import FILE
 
 if TYPE_CHECKING:
     from fdhil.config import MachineConfig

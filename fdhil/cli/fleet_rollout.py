@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil.cli.fleet import with_extra
-from fdhil.cli.options import OutputFile, Writing
+from fdhil.cli.options import FILE, OutputFile, Writing
 
 if TYPE_CHECKING:
     from fdhil.fleet.offer import Change, Offer
     from fdhil.fleet.rollout import Standing, Told
 
-FILE = click.Path(path_type=Path)
 CHANGE = click.argument("change", type=FILE)
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
 MACHINES = click.option("--machine", "machines", multiple=True, help="A machine, by its name in the works; repeatable.")

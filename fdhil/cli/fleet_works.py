@@ -9,7 +9,8 @@ from typing import Any
 
 import click
 
-from fdhil.cli.fleet import AS_JSON, FILE, with_extra
+from fdhil.cli.fleet import AS_JSON, with_extra
+from fdhil.cli.options import FILE
 from fdhil.config.fleet import load
 
 

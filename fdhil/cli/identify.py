@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
@@ -15,8 +16,7 @@ import click
 
 from fdhil import tables
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import COLUMNS, OutputFile, Writing
-from fdhil.errors import RecordingError
+from fdhil.cli.options import COLUMNS, FILE, OutputFile, Writing
 from fdhil.records import INTERVAL_95, unit_of
 from fdhil.report.parameter_view import MEANING, cell, head
 from fdhil.store import suffixes
@@ -31,8 +31,8 @@ UNREADABLE = 3
 
 
 @click.command(cls=Writing)
-@click.argument("recordings", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RECORDING...")
-@click.option("--config", "config_path", type=click.Path(path_type=Path), help="Machine configuration (TOML).")
+@click.argument("recordings", nargs=-1, required=True, type=FILE, metavar="RECORDING...")
+@click.option("--config", "config_path", type=FILE, help="Machine configuration (TOML).")
 @click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Estimator; left out: the best there is.")
 @click.option(
     "--write-model",
@@ -43,7 +43,7 @@ UNREADABLE = 3
 @click.option("--loops", "with_loops", is_flag=True, help="Identify the drive's own loops, too.")
 @click.option(
     "--accelerometer",
-    type=click.Path(path_type=Path),
+    type=FILE,
     help="What an accelerometer at the table recorded of the same run (CSV, as Klipper writes it); for one RECORDING.",
 )
 @COLUMNS
@@ -76,7 +76,9 @@ def identify(
         raise click.UsageError("--accelerometer belongs to one recording: give each with its own")
     settings, machine = _settings(config_path, method)
     axes = machine.axis if machine is not None else {}
-    results = [_against_data_sheet(r, axes) for r in _analyse(recordings, settings, machine, accelerometer, columns)]
+    results = _analyse(recordings, settings, machine, accelerometer, columns)
+    if machine is not None:
+        results = [_against_data_sheet(result, axes) for result in results]
     if model is not None:
         from fdhil.cli.model_file import write_model
 
@@ -96,18 +98,29 @@ def identify(
 
 
 def _files(recordings: Sequence[Path]) -> Iterator[Path]:
-    """Yield the files, of a folder all that are named as recordings are; RecordingError where it has none."""
+    """Yield the files, of a folder all that are named as recordings are.
+
+    A folder that has none, or cannot be looked into, is yielded itself: who reads it tells why.
+    """
     for path in recordings:
-        if not path.is_dir():
-            yield path
-            continue
-        found = sorted(
-            file for file in path.rglob("[!.]*") if file.suffix.lower() in suffixes.RECORDINGS and file.is_file()
-        )
-        if not found:
-            known = ", ".join(suffixes.RECORDINGS)
-            raise RecordingError(f"{path} has no recordings ({known}); give the folder that has them")
-        yield from found
+        yield from sorted(_within(path)) or [path]
+
+
+def _within(place: Path) -> Iterator[Path]:
+    closed: list[Path] = []  # also a place that is no folder
+    for folder, _, names in os.walk(place, onerror=lambda error: closed.append(Path(error.filename))):
+        for file in (Path(folder, name) for name in names if not name.startswith(".")):
+            if file.suffix.lower() in suffixes.RECORDINGS and _may_be_read(file):
+                yield file
+    yield from closed
+
+
+def _may_be_read(file: Path) -> bool:
+    """Whether it is a regular file, as far as this user may know."""
+    try:
+        return file.is_file()
+    except OSError:  # reading it tells why
+        return True
 
 
 def _settings(path: Path | None, method: str | None) -> tuple[Identification, MachineConfig | None]:
@@ -119,19 +132,23 @@ def _settings(path: Path | None, method: str | None) -> tuple[Identification, Ma
 
 
 def _against_data_sheet(result: FileResult, axes: Mapping[str, Axis]) -> FileResult:
-    """Refuse a pool that only a sensor's gain takes to the axis' nominal values."""
+    """Refuse a pool that only a sensor's gain takes to the axis' nominal values; warn where there is no such axis."""
     from dataclasses import replace
 
-    from fdhil.records import Parameters
+    from fdhil.records import Parameters, Reason
     from fdhil.validation.data_sheet import gain_error
 
-    axis = axes.get(result.axis or "")
-    if axis is None or result.pooled is None or not result.verdict.accepted:
+    verdict = result.verdict
+    if result.axis is not None and result.axis not in axes:
+        text = f"axis {result.axis} is not in the configuration: nothing was compared with its nominal values"
+        unknown = Reason("NoSuchAxis", text, f"add [axis.{result.axis}], or give the configuration of its machine")
+        return replace(result, verdict=replace(verdict, warnings=(*verdict.warnings, unknown)))
+    if result.axis is None or result.pooled is None or not verdict.accepted:
         return result
-    reason = gain_error(result.pooled, Parameters(**axis.nominal.model_dump()))
+    reason = gain_error(result.pooled, Parameters(**axes[result.axis].nominal.model_dump()))
     if reason is None:
         return result
-    return replace(result, verdict=replace(result.verdict, accepted=False, reasons=(reason,)))
+    return replace(result, verdict=replace(verdict, accepted=False, reasons=(reason,)))
 
 
 def _analyse(

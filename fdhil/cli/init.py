@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import config as machine_config
-from fdhil.cli.options import OutputFile, Writing
-from fdhil.errors import ConfigError, OutputError
+from fdhil.cli.options import FILE, OutputFile, Writing
+from fdhil.errors import ConfigError, ConfigFault, OutputError
 
 if TYPE_CHECKING:
     from fdhil.commissioning.init.draft import Asked, Draft
@@ -34,11 +34,11 @@ NEXT = (
 
 @click.command(cls=Writing)
 @click.argument("file", type=OutputFile(".toml"))
-@click.option("--answers", type=click.Path(path_type=Path),
+@click.option("--answers", type=FILE,
               help="TOML with answers, its keys those of the configuration; then nothing is asked.")  # fmt: skip
-@click.option("--from-linuxcnc", "ini", type=click.Path(path_type=Path), metavar="INI",
+@click.option("--from-linuxcnc", "ini", type=FILE, metavar="INI",
               help="Take axes, speeds and scales from this LinuxCNC machine and its HAL files.")  # fmt: skip
-@click.option("--eds", "places", multiple=True, type=click.Path(path_type=Path),
+@click.option("--eds", "places", multiple=True, type=FILE,
               help="EDS or DCF file, or a folder of them; left out: the folder of FILE.")  # fmt: skip
 @click.option("--offline", is_flag=True, help="Look at no bus: what drives would tell is asked.")
 @click.option("--dry-run", is_flag=True, help="Write no file; print what it would be.")
@@ -117,7 +117,13 @@ def _ask(asked: Asked) -> Any:
         click.echo(f"  proposed: {asked.proposal.value} ({asked.proposal.source})", err=True)
     while True:
         default = None if asked.proposal is None else str(asked.proposal.value)
-        said = str(click.prompt("  value", default=default, show_default=default is not None, err=True)).strip()
+        try:
+            said = str(click.prompt("  value", default=default, show_default=default is not None, err=True)).strip()
+        except click.Abort as stopped:
+            if sys.stdin.isatty() or not isinstance(stopped.__context__, EOFError):
+                raise
+            fault = ConfigFault(asked.path, "is asked for, and nobody is there to answer", "give --answers FILE")
+            raise ConfigError("standard input", [fault]) from None
         if said == default:
             return None
         try:

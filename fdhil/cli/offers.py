@@ -11,14 +11,15 @@ import click
 from fdhil import config as machine_config
 from fdhil.cli.audited import audited
 from fdhil.cli.fleet import with_extra
+from fdhil.cli.options import FILE
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault
 
 if TYPE_CHECKING:
     from fdhil.fleet.offered import Judged
 
-CONFIG = click.argument("config", type=click.Path(path_type=Path))
-OFFER = click.argument("offer", type=click.Path(path_type=Path))
+CONFIG = click.argument("config", type=FILE)
+OFFER = click.argument("offer", type=FILE)
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
 BY = click.option("--by", required=True, help="Who answers: your name, which the works is told.")
 MOST_BY, MOST_REASON = 64, 200
@@ -34,7 +35,7 @@ def offers() -> None:
 
 @offers.command("list")
 @CONFIG
-@click.argument("files", nargs=-1, type=click.Path(path_type=Path))
+@click.argument("files", nargs=-1, type=FILE)
 @AS_JSON
 def list_(config: Path, files: tuple[Path, ...], as_json: bool) -> int:
     """Show the offers for the machine of CONFIG.

@@ -11,9 +11,12 @@ import click
 
 from fdhil.store.output import check_output
 
+# whether it can be read is seen where it is read: a file that cannot is trouble, not a wrong call
+FILE = click.Path(path_type=Path, readable=False)
+FOLDER = click.Path(path_type=Path, readable=False, file_okay=False)
 COLUMNS = click.option(
     "--columns",
-    type=click.Path(path_type=Path),
+    type=FILE,
     help="Column map (TOML): which column of another program's file is which signal, in which unit.",
 )
 
@@ -36,7 +39,7 @@ class OutputFile(click.Path):
     """A file to be written, looked at before the work is done; with ``suffixes`` its name must end in one of them."""
 
     def __init__(self, *suffixes: str) -> None:
-        super().__init__(path_type=Path)
+        super().__init__(path_type=Path, readable=False)
         self._suffixes = suffixes
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
@@ -64,9 +67,10 @@ class Writing(click.Command):
 
 def _same_file(path: Path, there: Path) -> bool:
     """Whether two names are of one regular file, one that is there or one that is to be."""
-    if path.exists():
-        return path.is_file() and there.exists() and path.samefile(there)
-    return os.path.realpath(path) == os.path.realpath(there)
+    try:
+        return path.samefile(there) and path.is_file()
+    except OSError:  # one is not there, or nobody may look
+        return os.path.realpath(path) == os.path.realpath(there)
 
 
 def _paths(value: Any) -> list[Path]:

@@ -13,7 +13,7 @@ import click
 
 from fdhil import tables
 from fdhil.cli.compiling import forewarn
-from fdhil.cli.options import OutputFile, Positive, Writing
+from fdhil.cli.options import FILE, OutputFile, Positive, Writing
 from fdhil.records import INTERVAL_95
 from fdhil.report.parameter_view import MEANING
 
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from fdhil.prediction.gain import Gain
     from fdhil.records import Correction, Float, Parameters, Prediction, Trajectory
 
-FILE = click.Path(path_type=Path)
 MANY_ZONES = 12
 
 
@@ -288,9 +287,9 @@ def _show_prediction(
     from fdhil.correction import document
     from fdhil.prediction.gain import plus_minus
 
-    contour = document.contour(predicted)
+    contour, time_s = document.contour(predicted), predicted.reference.time_s
     click.echo(
-        f"{predicted.reference.time_s[-1]:.2f} s of path: contour error {contour['rms_um']:.1f} um RMS,"
+        f"{time_s[-1] - time_s[0]:.2f} s of path: contour error {contour['rms_um']:.1f} um RMS,"
         f" {contour['max_um']:.1f} um at most" + (f"; {MEANING}" if told and "std_um" in told[0] else "")
     )
     entries = document.zones(predicted) if told is None else told

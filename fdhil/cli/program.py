@@ -10,11 +10,13 @@ from pathlib import Path
 
 import click
 
+from fdhil.cli.options import FILE
+
 _SPOOL_CHARACTERS = 8_000_000
 
 
 @click.command()
-@click.argument("program", type=click.Path(path_type=Path))
+@click.argument("program", type=FILE)
 @click.option("--json", "as_document", is_flag=True, help="Print one JSON document instead of a table.")
 @click.option("--max-blocks", type=click.IntRange(min=1), default=10_000_000, show_default=True,
               help="Blocks that may be executed before the program is refused.")  # fmt: skip

@@ -9,6 +9,7 @@ import click
 
 from fdhil import config as machine_config
 from fdhil import tables
+from fdhil.cli.options import FILE
 from fdhil.config import MachineConfig
 from fdhil.errors import FdhilError
 
@@ -17,10 +18,10 @@ EXTRAS: Mapping[str, str] = {"prometheus": "web", "mtconnect": ""}  # the others
 
 @click.command()
 @click.argument("protocol", type=click.Choice(list(tables.PUBLISHERS)))
-@click.argument("config", type=click.Path(path_type=Path))
+@click.argument("config", type=FILE)
 @click.option(
     "--devices",
-    type=click.Path(path_type=Path),
+    type=FILE,
     help="With mtconnect: write the Devices.xml that its agent needs to this file, and stop.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Write each line of the log as a JSON object to stdout.")

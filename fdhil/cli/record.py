@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import config as machine_config
-from fdhil.cli.options import OutputFile, Positive, Writing
+from fdhil.cli.options import FILE, OutputFile, Positive, Writing
 
 if TYPE_CHECKING:
     from fdhil.drivers import Record
@@ -19,7 +19,7 @@ _SHOWN_GAPS = 5
 
 
 @click.command(cls=Writing)
-@click.argument("config", type=click.Path(path_type=Path))
+@click.argument("config", type=FILE)
 @click.option("--out", required=True, type=OutputFile(), help="The demand CSV to write.")
 @click.option("--seconds", type=Positive(), help="Record no longer than this.")
 @click.option(

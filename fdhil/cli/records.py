@@ -12,7 +12,7 @@ import click
 from fdhil import config as machine_config
 from fdhil import tables
 from fdhil.cli.compiling import forewarn
-from fdhil.cli.options import COLUMNS, OutputFile, Writing
+from fdhil.cli.options import COLUMNS, FILE, OutputFile, Writing
 from fdhil.errors import RecordingError
 from fdhil.store import suffixes
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from fdhil.records import Outcome, Window
 
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
-FILE = click.Path(path_type=Path)
 HEALTH = ("slopes", "trends", "limits", "changes", "windows")
 
 

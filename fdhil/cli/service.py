@@ -15,12 +15,13 @@ from fdhil import config as machine_config
 from fdhil import tables
 from fdhil.cli.audited import write_after, write_before
 from fdhil.cli.failing import verdict
+from fdhil.cli.options import FILE
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
 
 if TYPE_CHECKING:
     from fdhil.arming.guard_client import GuardClient
 
-CONFIG = click.argument("config", type=click.Path(path_type=Path))
+CONFIG = click.argument("config", type=FILE)
 DISARM_S = 15.0  # the daemon waits for the guard's answer and for the ramp
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
 
@@ -75,7 +76,7 @@ def status(config: Path, as_json: bool) -> None:
 
 @click.command()
 @CONFIG
-@click.argument("program", type=click.Path(path_type=Path), required=False)
+@click.argument("program", type=FILE, required=False)
 @click.option("--method", type=click.Choice(list(tables.CORRECTIONS)), help="Left out: the best there is.")
 @click.option("--whole", is_flag=True, help="Arm only when all of a long PROGRAM has passed, however long that takes.")
 @AS_JSON

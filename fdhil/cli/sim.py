@@ -9,25 +9,23 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fdhil.cli.options import OutputFile, Writing
+from fdhil.cli.options import FILE, OutputFile, Writing
 
 if TYPE_CHECKING:
     from fdhil.config import MachineConfig
     from fdhil.records import Trajectory
 
-_FILE = click.Path(path_type=Path)
-
 
 @click.command(cls=Writing)
-@click.argument("config", type=_FILE)
+@click.argument("config", type=FILE)
 @click.option("--json", "as_json", is_flag=True, help="Write events as JSON, one line each; the first is 'ready'.")
-@click.option("--faults", type=_FILE, help="A fault script: what breaks when (TOML).")
+@click.option("--faults", type=FILE, help="A fault script: what breaks when (TOML).")
 @click.option(
     "--demand",
-    type=_FILE,
+    type=FILE,
     help="A demand CSV that the NC plays at once; - takes it from standard input, row by row, as it comes.",
 )
-@click.option("--program", type=_FILE, help="An NC program that the NC plays at once.")
+@click.option("--program", type=FILE, help="An NC program that the NC plays at once.")
 @click.option("--trace", type=OutputFile(), help="Record what is played first: reference, true table and offset (CSV).")
 def sim(
     config: Path, as_json: bool, faults: Path | None, demand: Path | None, program: Path | None, trace: Path | None

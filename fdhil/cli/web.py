@@ -10,11 +10,12 @@ from pathlib import Path
 import click
 
 from fdhil import config as machine_config
+from fdhil.cli.options import FILE
 from fdhil.config.users import Role
 from fdhil.config.web import Web
 from fdhil.errors import ConfigError, ConfigFault
 
-CONFIG = click.argument("config", type=click.Path(path_type=Path))
+CONFIG = click.argument("config", type=FILE)
 
 
 @click.command()

@@ -5,9 +5,10 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 # no quantity of a machine lies beyond, in the units used here; a key states its own range where that is narrower
 SMALLEST, LARGEST = 1e-12, 1e9
@@ -26,10 +27,49 @@ Finite = Annotated[float, Field(allow_inf_nan=False), AfterValidator(_of_a_machi
 AxisName = Annotated[str, Field(pattern="^[A-Z]$")]
 
 
-class Section(BaseModel):
-    """A table of the TOML file: frozen, and a key it does not know is a fault."""
+def _check_types(plan: Any, of: type[BaseModel]) -> None:
+    """Put the check of the type where the plan of ``of`` reads a number or a switch; other tables have theirs."""
+    if isinstance(plan, list | tuple):
+        for part in plan:
+            _check_types(part, of)
+    elif isinstance(plan, dict) and plan.get("cls", of) is of:
+        kind = plan.get("type")
+        if kind in ("int", "float", "bool"):
+            inner = dict(plan)
+            plan.clear()
+            plan.update(core_schema.no_info_before_validator_function(_switch if kind == "bool" else _number, inner))
+        else:
+            for part in plan.values():
+                _check_types(part, of)
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
+
+def _number(value: Any) -> Any:
+    if isinstance(value, bool | str):
+        raise PydanticCustomError("no_number", "must be a number")
+    return value
+
+
+def _switch(value: Any) -> Any:
+    if not isinstance(value, bool):
+        raise PydanticCustomError("no_switch", "must be true or false")
+    return value
+
+
+class Section(BaseModel):
+    """A table of the TOML file: frozen, and a key it does not know is a fault.
+
+    Numbers and switches are taken as TOML writes them: no text for either, no true for 1, no 1 for true. (The library
+    is told to be strict of nothing: a path, or a word of several, is always text.)
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: type[BaseModel], handler: GetCoreSchemaHandler, /) -> CoreSchema:
+        """Return the library's plan of the checks, with those of a number's and a switch's type before the others."""
+        plan = handler(source)
+        _check_types(handler.resolve_ref_schema(plan), cls)
+        return plan
 
 
 class SectionWithFiles(Section):

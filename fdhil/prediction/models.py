@@ -52,6 +52,14 @@ def nominal_models(config: MachineConfig) -> dict[str, Parameters]:
     return {name: Parameters(**axis.nominal.model_dump()) for name, axis in config.axis.items()}
 
 
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object of JSON; ValueError where it has a name twice, of which one would be passed over in silence."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError(f"{max(found, key=[name for name, _ in pairs].count)[:SHOWN_CHARS]!r} is there twice")
+    return found
+
+
 def load_model_file(path: Path) -> ModelFile:
     """Read a model file; ConfigError with all its faults: missing or unknown keys, no numbers, negative values."""
     try:
@@ -62,9 +70,9 @@ def load_model_file(path: Path) -> ModelFile:
     if len(raw) > MAX_BYTES:
         raise _cannot(path, "is larger than 64 KiB", "a model file has six numbers per axis")
     try:
-        document = json.loads(raw.decode("utf-8"))
+        document = json.loads(raw.decode("utf-8"), object_pairs_hook=_once)
     except (UnicodeDecodeError, ValueError, RecursionError) as error:
-        raise _cannot(path, f"is no JSON: {str(error)[:120]}", "fdhil identify --json gives the values") from None
+        raise _cannot(path, f"is no model: {str(error)[:120]}", "fdhil identify --json gives the values") from None
     if not isinstance(document, dict) or not document:
         raise _cannot(path, "holds no axis", 'write {"X": {"R": .., "L": .., "K": .., "Jt": .., "ft": .., "Cd": ..}}')
     faults: list[ConfigFault] = []

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.csv_text import check_lengths, read_csv_text
+from fdhil.csv_text import check_lengths, read_csv_text, shown
 from fdhil.errors import ConfigError, ConfigFault, RecordingError
 from fdhil.records import Float, Trajectory, frozen, frozen_ints
 
@@ -22,22 +22,34 @@ _MOVED_MM = 1e-9
 _TOO_FAST = 20.0  # times the rapid speed, over most of the rows that move
 _TOO_SLOW, _SMALL_MM = 2e-3, 2.0  # of the rapid speed, and of travel: both is no job, but may be a test
 
+_OTHER_MARKS = {";": "semicolons", "\t": "tabs", "|": "bars", '"': "quotes"}  # of other kinds of CSV
+
 
 def read_demand_csv(path: Path, config: MachineConfig) -> Trajectory:
     """Read a demand CSV as the reference of a machine.
 
-    RecordingError when it cannot be read: a column is missing, text or nothing stands where a number belongs, times are
-    not uniform, or an axis moves that the machine lacks. ConfigError when its step is not the SYNC period.
+    RecordingError when it cannot be read: a column is missing or there twice, the file was cut off, text or nothing
+    stands where a number belongs, times are not uniform, or an axis moves that the machine lacks. ConfigError when its
+    step is not the SYNC period.
     """
     text = read_csv_text(path)
-    names = [name.strip() for name in text.partition("\n")[0][:4096].split(",")]
+    lines = text.splitlines() or [""]
+    check_lengths(lines, 1, str(path))
+    names = [name.strip() for name in lines[0].split(",")]
     wanted = ["time_s", *(f"{axis}_mm" for axis in config.axis if axis in "XYZ")]
     if absent := [name for name in wanted if name not in names]:
-        what = f"there is no column {', '.join(absent)}; a demand begins with the line {','.join(wanted)}"
-        raise RecordingError(f"{path}: {what}")
-    table = _numbers(path, text, len(names))
-    columns = {name: table[:, names.index(name)] for name in names}
-    _check_times(path, columns["time_s"], config.machine.sync_period_s)
+        found = [what for mark, what in _OTHER_MARKS.items() if mark in lines[0]]
+        instead = f"; its first line has {' and '.join(found)}, and names are parted by commas alone" if found else ""
+        begins = f"a demand begins with the line {','.join(wanted)}"
+        raise RecordingError(f"{path}: there is no column {', '.join(absent)}{instead}; {begins}")
+    if twice := next((name for k, name in enumerate(names) if name in names[:k]), None):
+        raise RecordingError(f"{path} has two columns {shown(twice)}, and nothing says which holds; leave one out")
+    if not text.endswith("\n"):
+        cut = f"line {len(lines)} has no end of line, so its last number may be cut"
+        raise RecordingError(f"{path} is truncated: {cut}; copy it again")
+    table = _numbers(path, lines, names)
+    columns = {name: table[:, k] for k, name in enumerate(names)}
+    _check_times(path, lines, columns["time_s"], config.machine.sync_period_s)
     moved = {name.removesuffix("_mm"): column for name, column in columns.items() if name.endswith("_mm")}
     for axis, column in moved.items():
         if axis not in config.axis and np.ptp(column) > _MOVED_MM:
@@ -51,24 +63,38 @@ def read_demand_csv(path: Path, config: MachineConfig) -> Trajectory:
     return Trajectory(config.machine.sync_period_s, time_s, position_mm, rapid, frozen_ints(still))
 
 
-def _numbers(path: Path, text: str, width: int) -> Float:
-    rows = text.splitlines()[1:]
-    check_lengths(rows, 2, str(path))
-    if not any(row.strip() for row in rows):
+def _numbers(path: Path, lines: Sequence[str], names: Sequence[str]) -> Float:
+    rows = [line for line in lines[1:] if line.strip()]
+    if not rows:
         raise RecordingError(f"{path}: there is no row of data; record or export it again")
     try:
         table = np.loadtxt(rows, delimiter=",", ndmin=2, comments=None)
-    except ValueError as error:
-        raise RecordingError(f"{path} cannot be read ({str(error)[:120]}); each row wants {width} numbers") from None
-    if table.shape[1] != width:
-        raise RecordingError(f"{path}: {table.shape[1]} numbers a row under {width} columns; export it again")
-    wrong = np.flatnonzero(~np.isfinite(table).all(axis=1))
-    if wrong.size:
-        raise RecordingError(f"{path}: row {int(wrong[0]) + 2} holds a value that is no finite number; record it again")
+    except ValueError:
+        raise _bad_row(path, lines, names) from None
+    if table.shape[1] != len(names) or not np.isfinite(table).all():
+        raise _bad_row(path, lines, names)
     return np.asarray(table, dtype=np.float64)
 
 
-def _check_times(path: Path, time_s: Float, sync_period_s: float) -> None:
+def _bad_row(path: Path, lines: Sequence[str], names: Sequence[str]) -> RecordingError:
+    """Return the error that names the first line at fault."""
+    for number, line in enumerate(lines[1:], 2):
+        cells = line.split(",")
+        if line.strip() and len(cells) != len(names):
+            what = f"has {len(cells)} values under {len(names)} columns"
+            return RecordingError(f"{path} line {number} {what}; record or export it again")
+        for cell in cells if line.strip() else []:
+            try:
+                finite = math.isfinite(float(cell))
+            except ValueError:
+                finite = False
+            if not finite:
+                what = f"has {shown(cell.strip())} where a finite number belongs"
+                return RecordingError(f"{path} line {number} {what}; record or export it again")
+    return RecordingError(f"{path} cannot be read as numbers; export it again")
+
+
+def _check_times(path: Path, lines: Sequence[str], time_s: Float, sync_period_s: float) -> None:
     if time_s.size < 2:
         raise RecordingError(f"{path}: one row is no demand; record or export it again")
     steps = np.diff(time_s)
@@ -79,10 +105,9 @@ def _check_times(path: Path, time_s: Float, sync_period_s: float) -> None:
         raise ConfigError(str(path), [fault])
     off = np.flatnonzero(np.abs(steps - sync_period_s) > _JITTER_TOLERANCE * sync_period_s + 2 * _ROUNDING_S)
     if off.size:
-        row = int(off[0]) + 3
-        raise RecordingError(
-            f"{path}: row {row} is {steps[off[0]]:g} s after the one before it; rows must be one SYNC apart"
-        )
+        number = [number for number, line in enumerate(lines, 1) if line.strip()][off[0] + 2]  # the names, one row more
+        text = f"{path} line {number} is {steps[off[0]]:g} s after the row before it; rows must be one SYNC apart"
+        raise RecordingError(text)
 
 
 def _check_speeds(path: Path, columns: Mapping[str, Float], config: MachineConfig) -> None:
@@ -99,7 +124,7 @@ def _check_speeds(path: Path, columns: Mapping[str, Float], config: MachineConfi
     name = max(ratios, key=lambda axis: ratios[axis])
     if ratios[name] > _TOO_FAST:
         raise RecordingError(
-            f"{path}: axis {name} moves at {speeds[name]:.3g} mm/s, {ratios[name]:.0f} times its rapid speed; "
+            f"{path}: axis {name} moves at {speeds[name]:.3g} mm/s, {ratios[name]:.3g} times its rapid speed; "
             f"is {name}_mm in um or in increments? give it in mm, or correct rapid_speed_mm_s"
         )
     if ratios[name] < _TOO_SLOW and max(float(np.ptp(values)) for values in columns.values()) < _SMALL_MM:

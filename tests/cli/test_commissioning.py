@@ -20,8 +20,13 @@ import pytest
 
 from fdhil.cli.main import cli, run_safely
 from fdhil.commissioning.bus_listener import LISTEN_S
+from fdhil.commissioning.compare import POINT
+from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.record import load_record
+from fdhil.commissioning.void import is_void, void_record
+from fdhil.config import load
 from fdhil.sim.wire.hub import Hub
+from tests.arming.guard_peer import Guard
 from tests.sim.hub_thread import HubThread
 from tests.sim.twin_process import TwinProcess, write_config
 
@@ -226,6 +231,39 @@ def test_a_sensor_is_read_and_a_silent_one_is_told(fdhil: Said, bench: Bench) ->
     code, out, _ = fdhil("check", bench.config("dumb.toml", voltage='source = "modbus"\nport = 1'))
     assert code == 1
     assert "axis X: the Modbus device 127.0.0.1:1 cannot be reached; check its supply, host and port" in out
+
+
+def test_what_is_seen_while_drives_are_compared_speaks_against_them(
+    fdhil: Said, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """X boots again, which a daemon hears, and so does Y, which the guard alone has heard: both stay void."""
+    path = write_config(tmp_path, bus='interface = "virtual"')
+    config = load(path)
+    store = config.store.directory
+    config.guard_directory.mkdir(parents=True, exist_ok=True)
+    guard, said = Guard(config.guard_directory), {"ok": True, "state": "OFF", "touched": {"X": 3, "Y": 0}}
+    void = {"code": "RecordVoid", "axis": "Y", "text": "axis Y: it has booted", "advice": "run fdhil check"}
+
+    def compare(*_: object) -> list[tuple[str, Finding]]:
+        void_record(store, "X", "booted again")
+        guard.says = lambda kind: {"ok": False, "refused": [void]} if kind == "compared" else said
+        return [(f"axis {axis}", Finding(POINT, "f", "f")) for axis in "XY"]
+
+    monkeypatch.setattr("fdhil.commissioning.config_check.check_machine", compare)
+    guard.says = lambda _kind: said
+    for axis in "XY":
+        void_record(store, axis, "booted")
+    code, _, err = fdhil("check", path, "--json")
+    assert code == 0
+    assert guard.requests[-1]["touched"] == {"X": 3, "Y": 0}
+    assert [is_void(store, axis) for axis in "XY"] == [True, True]
+    assert "RecordVoid: axis X: something was seen against it since it was compared" in err
+    assert "RecordVoid: axis Y: it has booted; run fdhil check again" in err
+    guard.close()
+    (config.guard_directory / "guard.sock").unlink()
+    monkeypatch.setattr("fdhil.commissioning.config_check.check_machine", lambda *_: compare()[1:])
+    assert fdhil("check", path, "--json")[0] == 0
+    assert [is_void(store, axis) for axis in "XY"] == [True, False]
 
 
 def test_nobody_moves_without_a_yes(fdhil: Said, bench: Bench) -> None:

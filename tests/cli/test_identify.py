@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -149,6 +152,38 @@ def test_one_bad_recording_does_not_end_a_batch(shuttle: Path, tmp_path: Path) -
     assert "all 2" in shown.stdout
     assert " ".join(shown.stdout.split()).count("not identified") == 2
     assert [line.split(" cannot")[0].split(":")[0] for line in shown.stderr.splitlines()] == ["fdhil", "fdhil"]
+
+
+@pytest.mark.parametrize("place", ["empty", "closed", "a" * 300])
+def test_a_bad_place_does_not_end_a_batch(place: str, shuttle: Path, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "closed").mkdir()
+    (tmp_path / "closed" / "in").mkdir(mode=0)
+    result = identified_without_rights(tmp_path / place, shuttle)
+    assert result.returncode == 3, result.stderr
+    bad, good = json.loads(result.stdout)["files"]
+    assert good["pooled"]["validated"] is True
+    why = {"empty": "has no recordings (.csv", "closed": "closed/in cannot be read (Permission denied)"}
+    assert why.get(place, "cannot be read (File name too long)") in bad["error"]["text"]
+
+
+def identified_without_rights(*recordings: Path) -> subprocess.CompletedProcess[str]:
+    """Run ``fdhil identify`` as one who may not read everything."""
+    command = [sys.executable, "-m", "fdhil", "identify", "--json", *map(str, recordings)]
+    if os.geteuid() == 0:
+        command = ["setpriv", "--bounding-set=-dac_override,-dac_read_search", *command]
+    return subprocess.run(command, capture_output=True, text=True, timeout=100)
+
+
+def test_an_axis_that_the_config_lacks_is_told(shuttle: Path, tmp_path: Path) -> None:
+    """It is compared with no nominal values; without a config nobody asked for that."""
+    shuttle.write_text(shuttle.read_text().replace("# axis: X", "# axis: Q", 1))
+    (tmp_path / "machine.toml").write_text(_config(500.0))
+    (told,) = told_document(invoke(shuttle, "--json", "--config", tmp_path / "machine.toml"))["files"]
+    assert told["pooled"]["validated"] is True
+    assert [text for text in told["pooled"]["warnings"] if "NoSuchAxis: axis Q is not in the configuration" in text]
+    (told,) = told_document(invoke(shuttle, "--json"))["files"]
+    assert "NoSuchAxis" not in str(told)
 
 
 def test_unreadable_recording_is_exit_3_in_one_sentence(

@@ -9,6 +9,7 @@ import tomllib
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import can
@@ -201,7 +202,12 @@ def test_an_eds_that_cannot_be_read_is_asked_again(fdhil: Said, tmp_path: Path) 
     assert (made.drive.profile, made.drive.eds) == ("cia402", tmp_path / "elmo.eds")
 
 
-def test_who_goes_away_leaves_nothing(fdhil: Said, tmp_path: Path) -> None:
+def test_who_goes_away_leaves_nothing(fdhil: Said, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At a terminal that is the operator's will; else nobody is there, and a file of answers is what helps."""
+    code, _, err = fdhil("init", tmp_path / "m.toml", "--offline", said="socketcan\n")
+    assert code == 2
+    assert "bus.can0.channel: is asked for, and nobody is there to answer (give --answers FILE)" in err
+    monkeypatch.setattr("fdhil.cli.init.sys", SimpleNamespace(stdin=SimpleNamespace(isatty=lambda: True)))
     code, _, err = fdhil("init", tmp_path / "m.toml", "--offline", said="socketcan\n")
     assert code == 130
     assert "stopped by the operator" in err

@@ -72,6 +72,14 @@ def test_text_for_people(bench: Path) -> None:
     assert "corner" in result.stdout
 
 
+def test_the_time_of_a_path_is_that_of_the_path(bench: Path) -> None:
+    """Not the clock's, where the times of a demand begin at another time than 0."""
+    names, *rows = (bench / "demand.csv").read_text().splitlines()
+    shifted = [f"{float(t) + 1.7e9:.6f},{rest}" for t, _, rest in (row.partition(",") for row in rows)]
+    (bench / "later.csv").write_text("".join(f"{line}\n" for line in [names, *shifted]))
+    assert invoke("predict", bench / "later.csv", "--config", bench / "bench.toml").stdout.startswith("3.09 s of path")
+
+
 def test_sensitivity_names_the_parameter(bench: Path) -> None:
     """Per zone: what 1 % of each parameter does."""
     arguments = ["predict", bench / "demand.csv", "--config", bench / "bench.toml", "--sensitivity"]

@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 import os
 import socket
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
+import click
 import pytest
 
 from fdhil.cli.main import cli, leaves
@@ -202,6 +205,39 @@ def test_a_file_that_cannot_be_written_is_3_and_found_at_once(out: str, words: s
         assert words in told(capsys, TROUBLE, command, *(text.format(out=name) for text in arguments))
     assert Path("dir").is_dir()
     assert Path("pipe").is_fifo()
+
+
+LOOK_BEFORE = {"play", "scan", "check", "commission"}  # whether a path can be read: not mended yet
+
+
+def test_a_file_without_the_right_to_read_it_is_3_and_a_configuration_2() -> None:
+    """In a process that has not root's way past the rights."""
+    for suffix in (".toml", ".ngc", ".csv"):
+        Path(f"locked{suffix}").write_text("")
+        Path(f"locked{suffix}").chmod(0)
+    others = {command: arguments for command, arguments in WITH_FILE.items() if command not in LOOK_BEFORE}
+    calls = [[command, *(t.format(file="locked.ngc") for t in arguments)] for command, arguments in others.items()]
+    configs = [["predict", "part.ngc", "--config", "locked.toml"], ["history", "locked.toml"]]
+    script = (
+        "import json, sys; from fdhil.cli.main import cli, run_safely\n"
+        "def code(given):\n    sys.argv = ['fdhil', *given]\n    return run_safely(cli)\n"
+        "print(json.dumps([code(given) for given in json.load(sys.stdin)]), file=sys.stderr)"
+    )
+    command = [sys.executable, "-c", script]
+    if os.geteuid() == 0:
+        command = ["setpriv", "--bounding-set=-dac_override,-dac_read_search", *command]
+    as_json = ["arm", "bench.toml", "locked.ngc", "--json"]
+    given = json.dumps([as_json, *calls, *configs])
+    done = subprocess.run(command, input=given, capture_output=True, text=True, timeout=300)
+    *told, codes = done.stderr.splitlines()
+    assert json.loads(codes) == [TROUBLE] * len([as_json, *calls]) + [USAGE] * len(configs), told
+    assert len(told) == len(calls) + len(configs)
+    assert "locked.ngc: Permission denied" in json.loads(done.stdout)["error"]["text"]
+
+
+def test_no_command_looks_at_the_rights_of_a_path_before_it_reads_it() -> None:
+    types = [(name, option.type) for name, command in LEAVES.items() for option in command.params]
+    assert {name for name, kind in types if isinstance(kind, click.Path) and kind.readable} <= LOOK_BEFORE
 
 
 def test_nothing_is_written_over_what_is_read(capsys: Any) -> None:

@@ -49,6 +49,31 @@ def test_an_output_that_takes_nothing_is_no_traceback(sink: str, tmp_path: Path)
     assert done.stderr.count("\n") == (sink == "> /dev/full")
 
 
+def said_by_shell(command: str, redirected: str) -> tuple[int, str]:
+    """Run fdhil from a shell; the exit code and what stands on stderr."""
+    line = f"{sys.executable} -m fdhil {command} {redirected}"
+    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, timeout=100)
+    return done.returncode, done.stderr
+
+
+def test_a_closed_standard_input_is_one_at_its_end(tmp_path: Path) -> None:
+    path = write_config(tmp_path)
+    path.write_text(path.read_text() + '[web]\nusers_file = "users.json"\n')
+    for command, word in (
+        (f"init {tmp_path}/new.toml --offline", "--answers FILE"),
+        (f"web-user {path} bob", "password"),
+    ):
+        code, err = said_by_shell(command, "<&-")
+        assert (code, "Traceback" in err) == (2, False), err
+        assert word in err
+    assert not (tmp_path / "new.toml").exists()
+
+
+@pytest.mark.parametrize(("command", "code"), [("interpret absent.ngc", 3), ("predict", 2), ("run absent.toml", 2)])
+def test_a_standard_error_that_takes_nothing_leaves_the_exit_code(command: str, code: int) -> None:
+    assert said_by_shell(command, "2> /dev/full")[0] == code
+
+
 def test_a_bus_without_drives_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     hub = HubThread(Hub("can0"))
     hub.start()

@@ -116,6 +116,14 @@ def test_refuses_other_files(tmp_path: Path, text: str) -> None:
         load_model_file(write(tmp_path, text))
 
 
+@pytest.mark.parametrize("text", ['{"X": {"R": 1}, "X": {"R": 2}}', '{"X": {"R": 1, "R": 2}}'])
+def test_what_is_there_twice_is_refused(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "model.json"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match="is there twice"):
+        load_model_file(file)
+
+
 def test_all_faults_at_once(tmp_path: Path) -> None:
     """Not only the first fault is told."""
     with pytest.raises(ConfigError) as caught:

@@ -52,7 +52,7 @@ ROWS = [f"{k / 1000:.3f},{k * 0.1:.4f},0.0" for k in range(20)]
     ],
 )
 def test_a_broken_demand_is_a_recording_error(lines: list[str], tmp_path: Path) -> None:
-    (tmp_path / "d.csv").write_text("\n".join(lines))
+    (tmp_path / "d.csv").write_text("".join(f"{line}\n" for line in lines))
     with pytest.raises(RecordingError):
         load_trajectory(tmp_path / "d.csv", bench_config())
 
@@ -64,6 +64,32 @@ def test_a_missing_column_is_told_with_the_line_that_is_wanted(tmp_path: Path) -
         RecordingError, match="no column Y_mm, Z_mm; a demand begins with the line time_s,X_mm,Y_mm,Z_mm"
     ):
         load_trajectory(tmp_path / "d.csv", bench_config("XYZ"))
+
+
+NAMES = "time_s,X_mm,Y_mm\n"
+DATA = "".join(f"{row}\n" for row in ROWS)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (NAMES + DATA[:-1], "is truncated: line 21 has no end of line, so its last number may be cut"),
+        (NAMES + "\n" + DATA.replace("0.005,0.5000,0.0", "0.005,0.5000"), "line 8 has 2 values under 3 columns"),
+        (NAMES + "\n" + DATA.replace("0.5000", "abc"), "line 8 has 'abc' where a finite number belongs"),
+        (NAMES + "\n" + DATA.replace("0.5000", "inf"), "line 8 has 'inf' where a finite number belongs"),
+        (NAMES + "\n" + DATA.replace("0.005,0.5000,0.0\n", "\n"), "line 9 is 0.002 s after the row before it"),
+        (NAMES.replace("X", "Y") + DATA, "no column X_mm; a demand"),
+        ("time_s,X_mm,Y_mm,X_mm\n" + DATA.replace("\n", ",0\n"), "has two columns 'X_mm'"),
+        (NAMES.replace(",", ";") + DATA.replace(",", ";"), "its first line has semicolons, and names are parted by"),
+        ('"time_s"\t"X_mm"\n', "its first line has tabs and quotes, and names are parted by commas alone"),
+        (NAMES + "".join(f"{k / 1000},{k % 2}e300,0\n" for k in range(9)), "axis X moves at 1e+303 mm/s, 2e+300 times"),
+    ],
+)
+def test_what_is_wrong_with_a_demand_is_told_with_its_line(text: str, told: str, tmp_path: Path) -> None:
+    (tmp_path / "d.csv").write_text(text)
+    with pytest.raises(RecordingError) as caught:
+        load_trajectory(tmp_path / "d.csv", bench_config())
+    assert told in str(caught.value)
 
 
 def test_another_step_than_the_sync_period_is_a_config_error(tmp_path: Path) -> None:

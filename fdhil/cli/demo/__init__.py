@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fdhil.cli.options import FOLDER
+
 if TYPE_CHECKING:
     from fdhil.cli.demo.realistic import Realistic
     from fdhil.cli.demo.report import Loop, Published
@@ -16,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("out"), show_default=True,
+@click.option("--out", type=FOLDER, default=Path("out"), show_default=True,
               help="Folder for the report, the recordings and the logs.")  # fmt: skip
 @click.option(
     "--realtime", is_flag=True, help="Run the twin on the host's clock instead of as fast as the bus answers."

@@ -14,6 +14,7 @@ import click
 from fdhil import config as machine_config
 from fdhil.cli.doctor.trouble import Trouble
 from fdhil.cli.failing import verdict
+from fdhil.cli.options import FILE
 from fdhil.daemon.clock import newest_record_s
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ SCHEMA = "fdhil-doctor-1"
 
 
 @click.command()
-@click.argument("config", type=click.Path(path_type=Path))
+@click.argument("config", type=FILE)
 @click.option("--offline", is_flag=True, help="Look at this PC alone, and leave buses and sensors in peace.")
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
 @verdict

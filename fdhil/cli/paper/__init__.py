@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from fdhil.cli.options import FOLDER
 from fdhil.errors import OutputError
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ RUNS = 50
 
 
 @click.command()
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), required=True,
+@click.option("--out", type=FOLDER, required=True,
               help="Folder for paper.html, paper.json and the pictures.")  # fmt: skip
 @click.option("--runs", type=click.IntRange(2, 10_000), default=RUNS, show_default=True,
               help="Noisy recordings behind each error of an estimator.")  # fmt: skip
