@@ -29,7 +29,6 @@ from tests.guard.wire import Wire
 
 EPISODE = 5000
 AXES = ("X", "Y")
-COMPARED = Request("compared", True, compared=dict.fromkeys(AXES, RECORD))
 ADOPT = Request("adopt", True)
 FORGETS: Pair = (0, 0)
 
@@ -157,6 +156,12 @@ class Walk:
         self.wires[node].foreign(value)
 
 
+def compared(walk: Walk, valid: bool = True) -> Request:
+    """Both drives were compared now, and found as they were commissioned."""
+    touched = {name: axis.touched for name, axis in zip(AXES, walk.machine.state.axes, strict=True)}
+    return Request("compared", valid, compared=dict.fromkeys(AXES, RECORD), touched=touched)
+
+
 def armed(walk: Walk) -> None:
     """All good again: compared, adopted where something stands, armed and into the path."""
     machine = walk.machine
@@ -168,7 +173,8 @@ def armed(walk: Walk) -> None:
     machine.listener.error("active")
     machine.main_alive, machine.rest, machine.playing, machine.row = True, None, False, 0
     arm = feed_request() if walk.fed and walk.rng.random() < 0.6 else arm_request()
-    for request in (COMPARED, None, ADOPT, None, arm):
+    walk.cycle()
+    for request in (compared(walk), None, ADOPT, None, arm):
         walk.cycle(request)
         for _ in range(45):
             walk.cycle()
@@ -246,10 +252,12 @@ def requested(walk: Walk) -> None:
     """Any request at any time, one to arm what must not be on beside what is on included."""
     valid = walk.rng.random() < 0.8
     kind = walk.rng.choice(("arm", "feedforward", "disarm", "adopt", "adopt", "stop", "compared"))
-    if kind in ("arm", "feedforward"):
+    if kind == "compared":
+        walk.cycle(compared(walk, valid))
+    elif kind in ("arm", "feedforward"):
         walk.cycle((arm_request if kind == "arm" else feed_request)(token_valid=valid))
     else:
-        walk.cycle(Request(kind, valid, compared=COMPARED.compared))
+        walk.cycle(Request(kind, valid))
 
 
 def no_sync(walk: Walk) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hmac
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -16,6 +17,7 @@ from fdhil.arming.checked_program import CheckedProgram
 from fdhil.arming.guard_link import GuardLink
 from fdhil.arming.knowledge import Knowledge
 from fdhil.arming.lessons import ahead_of_motors_mm, taught
+from fdhil.arming.own_thread import in_own_thread
 from fdhil.arming.passes import Passes
 from fdhil.arming.preparing import (
     Armament,
@@ -70,6 +72,7 @@ class ArmingDesk:
         self._standstill = Standstill(config)
         self._feeder: StreamFeeder | None = None
         self._given_up = False
+        self._hung_up: Callable[[], bool] = lambda: False
         self._disarms: int | None = None
         self._disarming: asyncio.Future[Answer] | None = None
         self.guard = GuardLink(config.guard.run_directory or run_directory, config.store.directory)
@@ -101,18 +104,23 @@ class ArmingDesk:
         armed, summary = self._armed
         return {**summary, **armed.progress()}
 
-    async def arm(self, request: Mapping[str, Any]) -> Answer:
-        """Plan, load and arm one program; every no has its class, cause and next action."""
+    async def arm(self, request: Mapping[str, Any], hung_up: Callable[[], bool] = lambda: False) -> Answer:
+        """Plan, load and arm one program; every no has its class, cause and next action.
+
+        ``hung_up`` is asked in a thread, right before the guard is: nothing is armed for one who has left.
+        """
         token, program, method = (request.get(key) for key in ("token", "program", "method"))
-        if not isinstance(token, str) or not hmac.compare_digest(token.encode(), self._token.encode()):
+        if not isinstance(token, str) or not hmac.compare_digest(
+            token.encode("utf-8", "surrogatepass"), self._token.encode()
+        ):
             return refusal("AuthRequired", "the operator's token is missing or wrong", "use the run directory's token")
         feeding = program is None and method == "flatness"
-        if not (feeding or isinstance(program, str)) or not (method is None or method in tables.CORRECTIONS):
+        if not (feeding or _is_name(program)) or not (method is None or method in tables.CORRECTIONS):
             return refusal("BadRequest", "program or method is no name", f"methods: {', '.join(tables.CORRECTIONS)}")
         if self._arming.locked():
             return refusal("NotOff", "another program is being armed", "wait for its answer")
         async with self._arming:
-            self._given_up = False
+            self._given_up, self._hung_up = False, hung_up
             if not await self._landed():
                 text = f"what was armed before is still on, in state {self.guard.state}"
                 return refusal("NotOff", text, "run fdhil disarm or wait until it has ended, then arm again")
@@ -127,7 +135,7 @@ class ArmingDesk:
 
     async def _landed(self) -> bool:
         """Wait a moment for the end of what ramps down; return whether the guard is at rest, or absent."""
-        await asyncio.to_thread(landed, self.guard.look, LANDING_S, LANDING)
+        await in_own_thread(landed, self.guard.look, LANDING_S, LANDING)
         if self.guard.state in REST:
             self._release()
         return self.guard.state in REST
@@ -160,13 +168,16 @@ class ArmingDesk:
         """Ask the guard in a thread; what it grants is armed, what it refuses is answered with what was planned."""
         prepared.facts["journal_writable"] = self._store.fault is None
         try:
-            answer = await asyncio.to_thread(ask, prepared, token, lambda: self._given_up, self._disarms)
+            answer = await in_own_thread(ask, prepared, token, self._unwanted, self._disarms)
         except DeviceError as error:
             return self._without_guard(error)
         if not answer["ok"]:
             return {**answer, "planned": summary}
         self._armed = (prepared, summary)
         return dict(answer)
+
+    def _unwanted(self) -> bool:
+        return self._given_up or self._hung_up()
 
     async def _arm(self, program: Path, method: str | None, token: str, asked: Mapping[str, Any]) -> Answer:
         request = await asyncio.to_thread(prepare, program, method, self._config, self.knowledge.now())
@@ -230,7 +241,7 @@ class ArmingDesk:
 
     async def _to_zero(self) -> Answer:
         try:
-            answer = await asyncio.to_thread(self.guard.disarm)
+            answer = await in_own_thread(self.guard.disarm)
         except DeviceError as error:
             return self._without_guard(error)
         if not answer["ok"]:
@@ -255,7 +266,7 @@ class ArmingDesk:
         while True:
             self.guard.say_alive(self._facts())
             if looking is None and turn % round(REFRESH_S / ALIVE_S) == 0:
-                looking = asyncio.ensure_future(asyncio.to_thread(self.guard.refresh))
+                looking = asyncio.ensure_future(in_own_thread(self.guard.refresh))
             await asyncio.sleep(ALIVE_S)
             turn += 1
             if looking is not None and looking.done():
@@ -286,10 +297,18 @@ class ArmingDesk:
         self.abandon()
         if self.guard.connected:
             with contextlib.suppress(DeviceError):
-                await asyncio.to_thread(self.guard.disarm if self.guard.state not in REST else self.guard.look)
+                await in_own_thread(self.guard.disarm if self.guard.state not in REST else self.guard.look)
         await self._check.close()
-        await asyncio.to_thread(self.guard.close)
+        await in_own_thread(self.guard.close)
         return self.guard.standing
+
+
+def _is_name(program: Any) -> bool:
+    """Whether it is a text that can be a file's name."""
+    try:
+        return isinstance(program, str) and b"\0" not in os.fsencode(program)
+    except UnicodeEncodeError:
+        return False
 
 
 def _refused(refused: Refused) -> Answer:

@@ -109,9 +109,17 @@ class GuardClient:
         """Take over what the drives hold and ramp it to zero (after FROZEN, or a stale offset)."""
         return self.ask({"request": "adopt", "token": token})
 
-    def compared(self, token: str, axes: Mapping[str, str]) -> dict[str, Any]:
-        """Tell which drives were compared with their records; a fingerprint that is not the record's voids it."""
-        return self.ask({"request": "compared", "token": token, "axes": dict(axes)})
+    def touched(self, token: str) -> dict[str, int]:
+        """Return how often each drive was touched up to now: to be asked before drives are compared."""
+        self.compared(token, {}, {})  # without SYNC it counts what it heard only when something is asked for
+        return dict(self.status().get("touched", {}))
+
+    def compared(self, token: str, axes: Mapping[str, str], touched: Mapping[str, int]) -> dict[str, Any]:
+        """Tell which drives were compared with their records; a fingerprint that is not the record's voids it.
+
+        ``touched`` as it was before they were compared: one that was touched since is refused.
+        """
+        return self.ask({"request": "compared", "token": token, "axes": dict(axes), "touched": dict(touched)})
 
     def alive(self, facts: Mapping[str, bool] | None = None) -> None:
         """Say that the daemon is well, and what it still vouches for; GuardLost when the guard is gone."""

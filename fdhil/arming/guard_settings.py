@@ -11,7 +11,7 @@ from typing import Any
 
 from fdhil.arming.token import given_credential
 from fdhil.cia402 import first_axis_index
-from fdhil.commissioning.record import KEY_NAME, CommissioningRecord, holds, load_record
+from fdhil.commissioning.record import KEY_NAME, CommissioningRecord, load_record, of_config
 from fdhil.commissioning.void import is_void
 from fdhil.config import Axis, MachineConfig, OffsetBounds, share_fault
 from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
@@ -146,7 +146,7 @@ def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
 
 def _commissioned(machine: MachineConfig, name: str, record: CommissioningRecord | None) -> dict[str, Any]:
     """The fingerprint of the drive as it was signed off, and whether something against that was seen since."""
-    if record is None or not holds(record, machine, name):
+    if record is None or not of_config(record, machine, name):
         return {}
     return {"record": record.fingerprint, "record_void": is_void(machine.store.directory, name)}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Callable, Mapping, Set
@@ -76,8 +77,11 @@ def standing(status: Mapping[str, Any]) -> Standing:
 
 
 def _number(value: Any) -> float | None:
-    numeric = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    return float(value) if numeric else None
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return None
+    with contextlib.suppress(OverflowError):  # an integer of hundreds of digits
+        return float(value) if math.isfinite(value) else None
+    return None
 
 
 def _fed(told: Any) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -13,6 +14,7 @@ from fdhil.errors import StoreError
 from fdhil.store.atomic import write_file
 
 FILE_NAME = "may_stand.json"
+MOST_BYTES = 64 * 1024
 
 
 class StandingMark:
@@ -25,7 +27,8 @@ class StandingMark:
 
     def _read(self) -> Mapping[str, Any] | None:
         try:
-            told = json.loads(self._path.read_bytes())
+            with open(self._path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
+                told = json.loads(file.read(MOST_BYTES) or b"")  # None: a pipe in its place that nobody writes to
         except FileNotFoundError:
             return None
         except (OSError, ValueError, RecursionError):

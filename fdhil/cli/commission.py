@@ -17,6 +17,7 @@ from fdhil.cli.commission_guide import Asked, Guide, confirm, room_of, told
 from fdhil.cli.commission_steps import FEEDFORWARD, STEPS, moves_of, planned, trial_moves
 from fdhil.cli.commission_trial import try_commissioned
 from fdhil.cli.failing import verdict
+from fdhil.cli.options import FILE
 from fdhil.errors import ConfigError, ConfigFault, DriveFault
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ SCHEMA = "fdhil-commission-1"
 
 
 @click.command()
-@click.argument("config", type=click.Path(path_type=Path))
+@click.argument("config", type=FILE)
 @click.option("--axis", "only", help="Commission this axis; left out: all, one after the other.")
 @click.option("--room", nargs=2, type=float, metavar="BACK FORWARD",
               help="How far, mm, each axis may go from where it stands: -20 200. It is then tried by a jog and rapids, "

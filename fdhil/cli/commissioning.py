@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,15 +14,18 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cli.failing import verdict
+from fdhil.cli.options import FILE
 from fdhil.errors import DeviceError
 from fdhil.guard.protocol import SOCKET_NAME
 
 if TYPE_CHECKING:
     from fdhil.commissioning.config_check import Place
     from fdhil.commissioning.scan import BusScan, Description, Node
+    from fdhil.commissioning.void import Mark
     from fdhil.config import MachineConfig
 
-CONFIG = click.argument("config", type=click.Path(path_type=Path))
+TellGuard = Callable[[Mapping[str, str]], Sequence[Mapping[str, str]]]
+CONFIG = click.argument("config", type=FILE)
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
 SCAN_HEAD = ("node\naxis", "NMT state\nheartbeat", "device\nprofile", "vendor\nproduct", "revision\nserial", "EDS")
 STATES: Mapping[bool | None, tuple[str, str]] = {
@@ -33,7 +37,7 @@ STATES: Mapping[bool | None, tuple[str, str]] = {
 
 @click.command()
 @CONFIG
-@click.option("--eds", "places", multiple=True, type=click.Path(path_type=Path),
+@click.option("--eds", "places", multiple=True, type=FILE,
               help="EDS or DCF file, or a folder of them; left out: the folder of CONFIG.")  # fmt: skip
 @AS_JSON
 def scan(config: Path, places: tuple[Path, ...], as_json: bool) -> None:
@@ -124,9 +128,12 @@ def check(config: Path, as_json: bool) -> int:
     """
     machine = machine_config.load(config)
     from fdhil.commissioning.config_check import check_machine
+    from fdhil.commissioning.void import void_mark
 
-    found = check_machine(machine, _progress)
-    _tell_compared(machine, found)
+    marks = {axis: void_mark(machine.store.directory, axis) for axis in machine.axis}
+    with _guard(machine) as tell:
+        found = check_machine(machine, _progress)
+        _tell_compared(machine, found, tell, marks)
     differ = sum(finding.ok is False for _, finding in found)
     if as_json:
         click.echo(json.dumps(_check_document(found)))
@@ -135,10 +142,15 @@ def check(config: Path, as_json: bool) -> int:
     return int(differ > 0)
 
 
-def _tell_compared(machine: MachineConfig, found: Sequence[Place]) -> None:
-    """Drives that are as they were commissioned have their records hold again, others void; a running guard is told."""
+def _tell_compared(
+    machine: MachineConfig, found: Sequence[Place], tell: TellGuard, marks: Mapping[str, Mark | None]
+) -> None:
+    """Drives that are as they were commissioned have their records hold again, others void; a running guard is told.
+
+    What was seen against a drive since it was compared stays: in the guard, and where a mark is not as in ``marks``.
+    """
     from fdhil.commissioning.compare import POINT
-    from fdhil.commissioning.void import confirm_record, void_record
+    from fdhil.commissioning.void import confirm_record, is_void, void_record
 
     directory, seen = machine.store.directory, {}
     for place, finding in found:
@@ -147,30 +159,44 @@ def _tell_compared(machine: MachineConfig, found: Sequence[Place]) -> None:
             seen[axis] = finding.found if finding.ok else ""
             if not finding.ok:
                 void_record(directory, axis, finding.cause)
-    refused = _guard_told(machine, seen)
-    for axis, digest in seen.items():
-        if digest and axis not in refused:
-            confirm_record(directory, axis)
+    refused = [each for each in tell(seen) if seen.get(each["axis"]) != ""] if seen else []
+    for each in refused:
+        advice = "run fdhil check again; where it is refused again, stop fdhil-guard and start it again"
+        click.echo(f"{each['code']}: {each['text']}; {advice}", err=True)
+    for axis in {axis for axis, digest in seen.items() if digest} - {each["axis"] for each in refused}:
+        confirm_record(directory, axis, marks[axis])
+        if is_void(directory, axis):
+            text = "something was seen against it since it was compared, its record stays void"
+            click.echo(f"RecordVoid: axis {axis}: {text}; run fdhil check again", err=True)
 
 
-def _guard_told(machine: MachineConfig, seen: Mapping[str, str]) -> set[str]:
-    """Tell the guard, where one runs, which drives were compared; return the axes whose records stay void there."""
+@contextmanager
+def _guard(machine: MachineConfig) -> Iterator[TellGuard]:
+    """Ask a running guard how often each drive was touched, and give what tells it which drives were compared since.
+
+    That returns what the guard refuses. The connection is held meanwhile: a guard that is started anew has not heard
+    what this one did.
+    """
     from fdhil.arming.guard_client import GuardClient
     from fdhil.arming.token import operator_token
 
-    directory = machine.guard_directory
-    if not seen or not (directory / SOCKET_NAME).exists():
-        return set()
-    try:
-        with GuardClient(directory) as guard:
-            answer = guard.compared(operator_token(machine.run_directory), seen)
-    except DeviceError as error:
-        click.echo(f"the guard was not told: {error}", err=True)
-        return set()
-    told = [each for each in answer.get("refused", []) if seen.get(each["axis"]) != ""]
-    for each in told:
-        click.echo(f"{each['code']}: {each['text']}; stop fdhil-guard and start it again", err=True)
-    return {each["axis"] for each in told}
+    def tell(seen: Mapping[str, str]) -> Sequence[Mapping[str, str]]:
+        try:
+            return guard.compared(token, seen, touched).get("refused", []) if touched is not None else []
+        except DeviceError as error:
+            click.echo(f"the guard was not told: {error}", err=True)
+            return []
+
+    directory, touched = machine.guard_directory, None
+    with ExitStack() as held:
+        if (directory / SOCKET_NAME).exists():
+            try:
+                token = operator_token(machine.run_directory)
+                guard = held.enter_context(GuardClient(directory))
+                touched = guard.touched(token)
+            except DeviceError as error:
+                click.echo(f"the guard is not told: {error}", err=True)
+        yield tell
 
 
 def _check_document(found: Sequence[Place]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import select
 import signal
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ import click
 from fdhil import config as machine_config
 from fdhil.cli.audited import audited
 from fdhil.cli.failing import verdict
+from fdhil.cli.options import FILE
 from fdhil.errors import DeviceError, DriveFault
 from fdhil.guard.protocol import SOCKET_NAME
 
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from fdhil.commissioning.set_points import SetPoints
     from fdhil.config import MachineConfig
 
-_FILE = click.Path(path_type=Path)
 NOBODY = "nobody is there to press Enter, and nothing was played; leave --hold out"
 MARKED_S = 1.0  # a daemon beside the guard marks a record that late
 SIGNALS: Mapping[int, str] = {
@@ -38,8 +38,8 @@ SIGNALS: Mapping[int, str] = {
 
 
 @click.command()
-@click.argument("program", type=_FILE)
-@click.option("--config", "config_path", required=True, type=_FILE, help="The machine (TOML).")
+@click.argument("program", type=FILE)
+@click.option("--config", "config_path", required=True, type=FILE, help="The machine (TOML).")
 @click.option("--go-to-start", is_flag=True, help="Go to the first set-point slowly, where the axes are not there.")
 @click.option("--hold", is_flag=True, help="Hold the axes at the start until Enter is pressed: arm a correction there.")
 @click.option("--dry-run", is_flag=True, help="Check the program and say what would move; opens no bus.")
@@ -96,7 +96,7 @@ def _play(machine: MachineConfig, plan: Plan, program: Path, go_to_start: bool, 
         if not yes:
             _ask(bench, program, here)
         ended = held.enter_context(audited(machine, "play", program=str(program)))
-        with bench.led(lambda: _tell_guard(machine, records)):
+        with bench.led(lambda: _vouch(machine, records, bench.as_compared)):
             stopped = bench.go_to_start(_stopping, go_to_start)
             if stopped is not None:
                 raise DriveFault("the way to the start", f"{stopped}; nothing was played")
@@ -118,24 +118,48 @@ def _entered() -> bool:
     return True
 
 
-def _tell_guard(machine: MachineConfig, records: Mapping[str, CommissioningRecord]) -> None:
-    """Tell a running guard that the drives are those of their records: they were compared, and 0x1016 was ours."""
+def _vouch(
+    machine: MachineConfig, records: Mapping[str, CommissioningRecord], as_compared: Callable[[], set[str]]
+) -> None:
+    """Have the records of those drives hold that are ``as_compared``: what was written to 0x1016 since was ours.
+
+    That is asked each time after what is known against a drive: what comes later stays.
+    """
+    from fdhil.commissioning.void import confirm_record, void_mark
+
+    try:
+        refused = _guard_told(machine, records, as_compared)
+        marks = {axis: void_mark(machine.store.directory, axis) for axis in records}
+        holding = as_compared()
+    except DeviceError as error:
+        click.echo(f"the guard was not told that the drives were compared: {error}", err=True)
+        return
+    for axis in sorted({*records} - holding):
+        text = f"axis {axis}: its drive has booted since it was compared, and nothing can be armed there"
+        click.echo(f"RecordVoid: {text}; switch the NC off and run fdhil check", err=True)
+    for each in refused:
+        click.echo(f"{each['code']}: {each['text']}; {each['advice']}", err=True)
+    if all(each["axis"] for each in refused):  # else the guard has taken nothing of it
+        for axis in holding - {each["axis"] for each in refused}:
+            confirm_record(machine.store.directory, axis, marks[axis])
+
+
+def _guard_told(
+    machine: MachineConfig, records: Mapping[str, CommissioningRecord], as_compared: Callable[[], set[str]]
+) -> Sequence[Mapping[str, str]]:
+    """Tell a running guard which drives are as they were compared; return what it refuses of that. DeviceError."""
     from fdhil.arming.guard_client import GuardClient
     from fdhil.arming.token import operator_token
-    from fdhil.commissioning.void import confirm_record
 
     directory = machine.guard_directory
-    if (directory / SOCKET_NAME).exists():
-        try:
-            with GuardClient(directory) as guard:
-                seen = {axis: record.fingerprint for axis, record in records.items()}
-                guard.compared(operator_token(machine.run_directory), seen)
-        except DeviceError as error:
-            click.echo(f"the guard was not told that the drives were compared: {error}", err=True)
-            return
-        time.sleep(MARKED_S)
-    for axis in records:
-        confirm_record(machine.store.directory, axis)
+    if not (directory / SOCKET_NAME).exists():
+        return []
+    token = operator_token(machine.run_directory)
+    with GuardClient(directory) as guard:
+        touched = guard.touched(token)
+        answer = guard.compared(token, {axis: records[axis].fingerprint for axis in as_compared()}, touched)
+    time.sleep(MARKED_S)
+    return list(answer.get("refused", []))
 
 
 def _say(text: str) -> None:
@@ -164,7 +188,9 @@ def _stopping(path: SetPoints) -> Iterator[None]:
 def _told(plan: Plan, program: Path) -> str:
     """What would move: from where to where, how fast, how long."""
     trajectory = plan.trajectory
-    lines = [f"{program.name}: {trajectory.time_s.size} set-points, {trajectory.time_s[-1]:.3f} s"]
+    lines = [
+        f"{program.name}: {trajectory.time_s.size} set-points, {trajectory.time_s[-1] - trajectory.time_s[0]:.3f} s"
+    ]
     for axis, path in trajectory.position_mm.items():
         speed = abs(path[1:] - path[:-1]).max(initial=0.0) / trajectory.dt_s
         lines.append(

@@ -13,7 +13,7 @@ from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import CommissioningRecord, fingerprint, load_record
 from fdhil.commissioning.survey import Survey, survey
-from fdhil.commissioning.void import confirm_record, void_record
+from fdhil.commissioning.void import confirm_record, void_mark, void_record
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.bus import CanBus
 from fdhil.errors import DeviceError, StoreError
@@ -74,9 +74,10 @@ def compare_again(config: MachineConfig, bus: str, say: Callable[[str], None]) -
     if not records or _an_nc_runs(config, bus):
         return
     for record in records:
+        mark = void_mark(config.store.directory, record.axis)
         compared = compare_drive(config, record)
         if compared.ok:
-            confirm_record(config.store.directory, record.axis)
+            confirm_record(config.store.directory, record.axis, mark)
             continue
         void_record(config.store.directory, record.axis, compared.cause)
         text = f"RecordVoid: axis {record.axis}: {compared.cause}; nothing can be armed or adopted there"

@@ -27,6 +27,7 @@ from fdhil.errors import DeviceTimeout
 class Heard:
     """The drive's newest: mapped objects by key, EMCY frames, its NMT state; and frames and error frames of the bus.
 
+    ``boots`` counts its boot-ups.
     ``master`` is what shows that another master runs the bus, None while nothing does.
     """
 
@@ -34,6 +35,7 @@ class Heard:
     cycle: dict[tuple[int, int], int] = field(default_factory=dict)
     emergencies: list[bytes] = field(default_factory=list)
     nmt: int | None = None
+    boots: int = 0
     master: str | None = None
     frames: int = 0
     errors: int = 0
@@ -152,6 +154,7 @@ class Master:
             heard.emergencies.append(data)
         elif can_id == cia402.COB_HEARTBEAT + node and data:
             heard.nmt = data[0] & 0x7F
+            heard.boots += heard.nmt == cia402.Nmt.BOOT_UP
         elif can_id in self._guarded:
             self.loop.offsets_heard.add(can_id)
         elif (sign := shows_master(can_id)) is not None:

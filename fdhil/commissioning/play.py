@@ -21,7 +21,7 @@ from fdhil.commissioning.cycle import Cycle, Lateness
 from fdhil.commissioning.finding import read_optional
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.moving import following, undisturbed, watch_power
-from fdhil.commissioning.record import CommissioningRecord, holds, load_record
+from fdhil.commissioning.record import CommissioningRecord, load_record, of_config
 from fdhil.commissioning.set_points import Bounds, SetPoints, straight
 from fdhil.commissioning.steps import enable, prepare
 from fdhil.commissioning.survey import listen, require, require_alone, survey
@@ -117,7 +117,7 @@ def valid_records(config: MachineConfig) -> dict[str, CommissioningRecord]:
     found = {}
     for name in config.axis:
         record = load_record(config.store.directory, name, config.store.commissioning_key)
-        if record is None or not holds(record, config, name) or record.watchdog != "proven":
+        if record is None or not of_config(record, config, name) or record.watchdog != "proven":
             what = "it is not commissioned with this configuration"
             raise DriveFault(f"drive {name}", f"{what}, and nothing was sent; run fdhil commission --axis {name}")
         if is_void(config.store.directory, name):
@@ -133,6 +133,7 @@ class Bench:
     def __init__(self, plan: Plan, loop: Cycle, masters: Sequence[Master], say: Callable[[str], None]) -> None:
         self.plan, self.loop, self.masters, self._say = plan, loop, tuple(masters), say
         self._config = plan.config
+        self._boots: dict[str, int] = {}
 
     # nothing is sent but SDO requests
 
@@ -143,6 +144,7 @@ class Bench:
             listen(next(master for master in self.masters if master.bus is bus))
         self._say("comparing the drives with their commissioning records; nothing moves")
         for master in self.masters:
+            self._boots[master.axis] = master.heard.boots
             finding = compare_record(records[master.axis], survey(master))
             require(master, [finding])
             held = read_optional(master, master.profile.offset[0], master.profile.offset[1], signed=True)
@@ -166,6 +168,11 @@ class Bench:
         if len(counters) > 1:
             shown = ", ".join(map(str, sorted(counters)))
             raise DriveFault("the drives", f"they want different SYNC counters (0x1019: {shown}); set all to one value")
+
+    def as_compared(self) -> set[str]:
+        """Return the axes whose drives have not booted since they were compared, while SYNC goes on."""
+        self.masters[0].wait_cycles(OFF_CYCLES)  # so that what others have heard by now is heard here too
+        return {master.axis for master in self.masters if master.heard.boots == self._boots[master.axis]}
 
     def here(self) -> list[int]:
         """Read where the axes stand, in increments."""

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from fdhil import tables
-from fdhil.commissioning.void import confirm_record
+from fdhil.commissioning.void import confirm_record, is_void, void_mark
 from fdhil.config import Drive, MachineConfig
 from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.errors import StoreError
@@ -91,6 +91,11 @@ def fingerprint(identity: Sequence[int], mapping_fingerprint: str, options: Mapp
 
 
 def holds(record: CommissioningRecord | None, config: MachineConfig, axis: str) -> bool:
+    """Whether there is a record, of this configuration, and nothing was seen against it since."""
+    return of_config(record, config, axis) and not is_void(config.store.directory, axis)
+
+
+def of_config(record: CommissioningRecord | None, config: MachineConfig, axis: str) -> bool:
     """Whether there is a record and it was made with this configuration."""
     return record is not None and record.readback_ok and record.config_digest == axis_digest(config, axis)
 
@@ -139,7 +144,7 @@ def save_record(record: CommissioningRecord, directory: Path, key: Path | None =
     seal = record.seal(sealing_key(key or directory / KEY_NAME))
     document = {"schema": SCHEMA, **asdict(record), "digest": record.digest, "seal": seal}
     write_file(path, json.dumps(document, indent=2).encode())
-    confirm_record(directory, record.axis)
+    confirm_record(directory, record.axis, void_mark(directory, record.axis))
     return path
 
 

@@ -23,6 +23,7 @@ from fdhil.commissioning.master import Master
 from fdhil.commissioning.moving import held_back
 from fdhil.commissioning.progress import Found, Progress
 from fdhil.commissioning.record import CommissioningRecord, axis_digest
+from fdhil.commissioning.set_points import straight
 from fdhil.commissioning.survey import (
     Survey,
     faulted,
@@ -127,16 +128,28 @@ def zero_offset(master: Master) -> None:
 
 
 def ramp(master: Master, goal: int, step: int | None = None) -> int:
-    """Move the offset from where it is to ``goal`` by ``step`` increments per cycle; return the cycle of the first."""
-    per_mm = master.config.axis[master.axis].scaling.increments_per_mm
-    step = step or max(1, round(_limits(master).max_speed_mm_s * per_mm * master.period_s / 4))
+    """Move the offset from where it is to ``goal``; return the cycle of the first that is sent.
+
+    By ``step`` increments per cycle; left out: within the limits, and at a quarter of the largest speed.
+    """
     start = master.drop_offsets()  # Ctrl-C may have come in the midst of another ramp
-    count = math.ceil(abs(goal - start) / step)
-    sign = 1 if goal > start else -1
-    first = master.play_offset([*(start + sign * step * k for k in range(1, count)), *([goal] if count else [])])
-    patience = 5.0 + 20 * count * master.period_s
+    if step is None:
+        values = _gently(master, start, goal)
+    else:
+        values = [*range(start, goal, step if goal > start else -step), goal][1:]
+    first = master.play_offset(values)
+    patience = 5.0 + 20 * len(values) * master.period_s
     master.wait(lambda: not master.playing, patience, "the offset was not sent; check the bus")
     return first
+
+
+def _gently(master: Master, start: int, goal: int) -> list[int]:
+    """Return the offsets from ``start`` to ``goal``, at rest at both."""
+    limits = _limits(master)
+    per_cycle = master.config.axis[master.axis].scaling.increments_per_mm * master.period_s
+    speed, acceleration = limits.max_speed_mm_s * per_cycle / 4, limits.max_acceleration_mm_s2 * per_cycle
+    rows = straight([start], [goal], [speed], [acceleration * master.period_s])
+    return [round(offset) for offset in rows[1:, 0].tolist()]
 
 
 def _limits(master: Master) -> CorrectionLimits:
@@ -150,7 +163,7 @@ def sign_test(master: Master) -> float:
     """
     settings = master.config.axis[master.axis]
     profile = master.profile
-    step = settings.scaling.to_increments(min(SIGN_TEST_UM, _limits(master).max_offset_um) / 1e3)
+    step = _sign_step(master)
     demand = master.average(profile.position_demand, AVERAGE_CYCLES)
     table = master.average(profile.position, AVERAGE_CYCLES)
     ramp(master, step, 1)
@@ -177,6 +190,16 @@ def sign_test(master: Master) -> float:
     ramp(master, 0, 1)
     master.wait_cycles(SETTLE_CYCLES)
     return settings.scaling.to_mm(moved) * 1e3
+
+
+def _sign_step(master: Master) -> int:
+    """Return by how many increments the sign test offsets the axis; DriveFault where that is less than one."""
+    scaling, um = master.config.axis[master.axis].scaling, min(SIGN_TEST_UM, _limits(master).max_offset_um)
+    if not um / 1e3 * scaling.increments_per_mm >= 1.0:
+        text = f"one increment is {1e3 / scaling.increments_per_mm:.3g} um, and the sign test moves it by {um:g} um"
+        advice = "let the drive count finer, and correct drive.increments_per_rev"
+        raise DriveFault(master.device, f"{text}: its scaling is too coarse for any correction; {advice}")
+    return scaling.to_increments(um / 1e3)
 
 
 def feedforward_test(master: Master) -> bool | None:
@@ -248,6 +271,7 @@ def check_axis(master: Master) -> Survey:
     """All that can be checked without moving; DriveFault for the first point that differs."""
     found = survey(master)
     require(master, found.findings)
+    _sign_step(master)
     return found
 
 

@@ -1,7 +1,8 @@
 """Marks a commissioning record as void: something against it was seen, and it was not compared since.
 
 A drive that has rebooted may have lost what is not stored in it; one that another master wrote to may be set up anew.
-The mark is a file of its own, so that it outlives every process; comparing the drive again removes it.
+The mark is a file of its own, so that it outlives every process; comparing the drive again removes it, unless
+something more was seen meanwhile: that makes another mark.
 """
 
 from __future__ import annotations
@@ -20,6 +21,10 @@ def void_path(directory: Path, axis: str) -> Path:
     return directory / f"commissioning-{axis}.void"
 
 
+Mark = tuple[int, int]
+"""What tells one mark from another."""
+
+
 def is_void(directory: Path, axis: str) -> bool:
     """Whether the axis' record is void; also where that cannot be told."""
     try:
@@ -31,28 +36,39 @@ def is_void(directory: Path, axis: str) -> bool:
     return True
 
 
+def void_mark(directory: Path, axis: str) -> Mark | None:
+    """Return which mark there is now: to be asked before the drive is compared. None: there is none."""
+    try:
+        status = void_path(directory, axis).lstat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_mtime_ns
+
+
 def void_record(directory: Path, axis: str, why: str) -> None:
-    """Mark the axis' record as void, with the first reason; StoreError when the mark cannot be written."""
+    """Mark the axis' record as void, with the newest reason; StoreError when the mark cannot be written."""
     path = void_path(directory, axis)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     text = json.dumps({"why": why, "seen_utc": datetime.now(UTC).isoformat(timespec="seconds")})
     try:
         make_folder(directory)
-        with path.open("x", encoding="utf-8") as file:  # it is a mark as soon as it is there, even without a word in it
+        with part.open("w", encoding="utf-8") as file:
+            part.rename(path)  # it is a mark as soon as it is there, even without a word in it
             sync_folder(directory)
             file.write(text + "\n")
             file.flush()
             os.fsync(file.fileno())
     except OSError as error:
-        if isinstance(error, FileExistsError) and path.exists():
-            return
         raise StoreError(
             f"{path} cannot be written ({error.strerror}); until then arm nothing after a restart of the guard"
         ) from None
 
 
-def confirm_record(directory: Path, axis: str) -> None:
-    """Remove the mark: the drive was compared with its record, or commissioned anew. StoreError."""
+def confirm_record(directory: Path, axis: str, seen: Mark | None) -> None:
+    """Remove the mark that was ``seen`` before the drive was compared with its record; another stays. StoreError."""
     path = void_path(directory, axis)
+    if seen is None or seen != void_mark(directory, axis):
+        return
     try:
         path.unlink(missing_ok=True)
     except OSError as error:

@@ -1,18 +1,20 @@
 """Has every request that changes something in the audit, with who asked for it and what he was answered.
 
 What makes the machine do more (arm, acknowledge) is written before it is done, and refused where it cannot be written.
-What makes it do less (disarm, stop) is done and answered first: no disk delays it.
+What makes it do less (disarm, stop) is done and answered first: no disk delays it. A flood becomes a few
+lines; the last of those that were held back is written a moment later, with how many there were.
 """
 
 from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fdhil.arming.answers import Answer, refusal
+from fdhil.arming.own_thread import in_own_thread
 from fdhil.daemon import journal
 from fdhil.daemon.peers import NEEDS, Peer
 from fdhil.errors import StoreError
@@ -23,6 +25,16 @@ LOOKING = ("status", "live")
 DONE_FIRST = ("disarm", "stop")
 TOLD = ("program", "method", "whole", "notices", "up_to", "note", "by")
 MOST_CHARACTERS = 500
+HELD_S = 1.0 / journal.REFILL_PER_S
+REFUSED_S = 60.0  # one line for all that a user may not ask for in that time: he may not fill the disk
+
+
+class _Held(NamedTuple):
+    """The last line of a kind that was held back, of how many, and whether they were allowed to ask."""
+
+    entry: dict[str, Any]
+    lines: int
+    allowed: bool
 
 
 class Audited:
@@ -32,6 +44,9 @@ class Audited:
         self._handle, self._folder = handle, folder
         self._gate = journal.FloodGate()
         self._writing: set[asyncio.Task[Answer | None]] = set()
+        self._held: dict[str, _Held] = {}
+        self._quiet_until_s: dict[str, float] = {}
+        self._disk = asyncio.Lock()
 
     async def of(self, request: Mapping[str, Any], peer: Peer) -> Answer:
         """Return the answer to a request; AuthRequired where the peer may not ask for that."""
@@ -42,35 +57,76 @@ class Audited:
             return answer
         if what in LOOKING or what not in (*NEEDS, *DONE_FIRST):
             return await self._handle(request)
-        if what in DONE_FIRST:
-            answer = await self._handle(request)
-            writing = asyncio.create_task(self._write(what, request, peer, answer))
-            self._writing.add(writing)
-            writing.add_done_callback(self._writing.discard)
-            return answer
-        if (trouble := await self._write(what, request, peer, None)) is not None:
+        if what not in DONE_FIRST and (trouble := await self._write(what, request, peer, None)) is not None:
             return trouble
-        answer = await self._handle(request)
-        await self._write(what, request, peer, answer)
+        answer = refusal("Stopped", "the daemon ended before it was answered", "start it, then ask again")
+        try:
+            answer = await self._handle(request)
+        except Exception as error:
+            answer = refusal(type(error).__name__, str(error))
+            raise
+        finally:
+            writing = self._begin(self._write(what, request, peer, answer))
+        if what not in DONE_FIRST:
+            await writing
         return answer
 
+    def _begin(self, write: Coroutine[Any, Any, Answer | None]) -> asyncio.Task[Answer | None]:
+        writing = asyncio.create_task(write)
+        self._writing.add(writing)
+        writing.add_done_callback(self._writing.discard)
+        return writing
+
     async def written(self) -> None:
-        """Wait until what was answered already is in the audit too."""
+        """Wait until what was answered already is in the audit too, also what was held back."""
+        await asyncio.gather(*self._writing)
+        for key in [*self._held]:
+            self._release(key)
         await asyncio.gather(*self._writing)
 
     async def _write(self, what: str, request: Mapping[str, Any], peer: Peer, answer: Answer | None) -> Answer | None:
         """Write one line, before the answer is known with None; return why it could not be."""
+        allowed = peer.may(what)
         kind = what if what in (*NEEDS, *DONE_FIRST) else "what there is not"
-        held = self._gate.admit(f"{peer.uid} {kind} {answer is None}", time.monotonic())
-        if held is None:
-            return refusal("Busy", f"{peer.user} asks for {what} too often to be written down", "ask again in a second")
-        entry = {**_entry(what, request, peer, answer), **({"not_written": held} if held else {})}
-        if answer is not None:
-            journal.write_line(f"{_asker(entry)} asked to {_short(what)}: {entry['result']}")
+        key = f"{peer.uid} {kind} {answer is None}" if allowed else f"{peer.uid}"
+        if self._admits(key, allowed):
+            held = self._held.pop(key, None)
+            return await self._append(_entry(what, request, peer, answer), held.lines if held else 0)
+        text = f"{peer.user} asks for {what} too often to be written down"
+        busy = refusal("Busy", text, "ask again in a second") if answer is None else None
+        if key not in self._held:
+            asyncio.get_running_loop().call_later(HELD_S if allowed else REFUSED_S, self._release, key)
+        count = self._held[key].lines if key in self._held else 0
+        self._held[key] = _Held(_entry(what, request, peer, busy or answer), count + 1, allowed)
+        return busy
+
+    def _admits(self, key: str, allowed: bool) -> bool:
+        now_s = time.monotonic()
+        if allowed:
+            return self._gate.admit(key, now_s) is not None
+        if now_s < self._quiet_until_s.get(key, now_s):
+            return False
+        self._quiet_until_s[key] = now_s + REFUSED_S
+        return True
+
+    def _release(self, key: str) -> None:
+        """Write the last line that was held back, unless a later one has told of it."""
+        if (held := self._held.pop(key, None)) is not None:
+            self._admits(key, held.allowed)  # it is one more of its kind
+            self._begin(self._append(held.entry, held.lines - 1))
+
+    async def _append(self, entry: dict[str, Any], held: int) -> Answer | None:
+        """Write one line, and how many were ``held`` back before it; return why it could not be."""
+        if held:
+            entry["not_written"] = held
+        what = entry.get("asked") or entry["answered"]
+        if "answered" in entry:
+            journal.write_line(f"{_asker(entry)} asked to {what}: {entry['result']}")
         try:
-            await asyncio.to_thread(audit.append, self._folder, entry)
+            async with self._disk:  # in the order of what was asked
+                await in_own_thread(audit.append, self._folder, entry)
         except StoreError as error:
-            text = f"{what} of {peer.user} is not in the audit: {error}"
+            text = f"{what} of {entry['who']['user']} is not in the audit: {error}"
             journal.write_line(text, "MAJOR")
             return refusal(error.code, text, "nothing was done; mend the store, then ask again")
         return None
@@ -82,8 +138,8 @@ def _asker(entry: Mapping[str, Any]) -> str:
 
 
 def _entry(what: str, request: Mapping[str, Any], peer: Peer, answer: Answer | None) -> dict[str, Any]:
+    told = {key: _short(request[key]) for key in TOLD if request.get(key) is not None and peer.may(what)}
     what = _short(what)
-    told = {key: _short(request[key]) for key in TOLD if request.get(key) is not None}
     who = {"user": peer.user, "uid": peer.uid, "pid": peer.pid}
     if answer is None:
         return {"who": who, "asked": what, **told}

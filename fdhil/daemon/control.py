@@ -2,17 +2,18 @@
 
 A request is {"request": "status" | "live" | "arm" | "disarm" | "stop", ...}; an answer is {"ok": true, ...} or
 {"ok": false, "code", "text", "advice"}. With "progress": true lines {"progress": {...}} come before an answer that
-takes its time; who closes the connection meanwhile abandons what is checked for him. Who is at the other end is
-what the kernel says, and what he may ask for what the config says (``peers``); arming needs the operator's token
-besides. After the answer to ``live`` the connection tells the samples as they pass (``fdhil.daemon.live``). Of sixteen
-connections the one that has been idle for longest makes room for one more; where all wait for their answers, four more
-may ask for ``status`` and ``disarm``.
+takes its time; who asks to arm and closes the connection meanwhile abandons what is checked for him. Who is at the
+other end is what the kernel says, and what he may ask for what the config says (``peers``); arming needs the operator's
+token besides. After the answer to ``live`` the connection tells the samples as they pass (``fdhil.daemon.live``). Of
+sixteen connections the one that has been idle for longest makes room for one more; where all wait for their answers,
+four more may ask for ``status`` and ``disarm``.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import json
 import select
 import socket
@@ -61,6 +62,12 @@ class ControlServer:
         # the clients in the order of their last answers, the longest idle first, and those that wait for one
         self._clients: dict[asyncio.Task[None], None] = {}
         self._busy: set[asyncio.Task[None]] = set()
+        self._arming: list[asyncio.StreamWriter] = []  # who waits for an arming: what is checked is for the first
+
+    @property
+    def hung_up(self) -> bool:
+        """Whether who has something checked and armed has left by now; may be asked from any thread."""
+        return any(map(_hung_up, self._arming[:1]))
 
     @asynccontextmanager
     async def serving(self, path: Path) -> AsyncIterator[None]:
@@ -115,7 +122,7 @@ class ControlServer:
         peer = peer_of(writer.get_extra_info("socket"), self._access)
         while line := await _in_time(reader.readline()):
             self._busy.add(task)
-            answer = await self._attended(line, peer, reader, writer)
+            answer = await self._attended(line, peer, writer)
             self._busy.discard(task)
             self._clients[task] = self._clients.pop(task, None)
             writer.write(json.dumps(answer).encode() + b"\n")
@@ -127,27 +134,33 @@ class ControlServer:
             if peer.role is Role.NOBODY:
                 return
 
-    async def _attended(
-        self, line: bytes, peer: Peer, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
-    ) -> Answer:
-        """Answer a request; tell its progress meanwhile where that is wanted."""
+    async def _attended(self, line: bytes, peer: Peer, writer: asyncio.StreamWriter) -> Answer:
+        """Answer a request; of one to arm tell the progress meanwhile, and see whether somebody waits for it."""
         try:
             request = json.loads(line)
         except (ValueError, RecursionError):
             return refusal("BadRequest", "the request is no JSON", "send one JSON object per line")
-        if isinstance(request, dict) and request.get("request") == "arm" and _hung_up(writer):
+        if not isinstance(request, dict) or request.get("request") != "arm" or not peer.may("arm"):
+            return await self._answer(request, peer)
+        if _hung_up(writer):
             return ABANDONED  # it waited while this process slept: nobody is there who wants it by now
         answering = asyncio.ensure_future(self._answer(request, peer))
-        wanted = isinstance(request, dict) and request.get("progress") is True
+        self._arming.append(writer)
         try:
-            while wanted and not (await asyncio.wait([answering], timeout=PROGRESS_S))[0]:
-                if reader.at_eof() or writer.is_closing():  # the latter where it left while progress was told
-                    self._abandon()
-                elif told := self._progress():
-                    writer.write(json.dumps({"progress": told}).encode() + b"\n")
+            while not (await asyncio.wait([answering], timeout=PROGRESS_S))[0]:
+                if self._arming[0] is writer:
+                    self._attend(writer, request.get("progress") is True)
             return await answering
         finally:
             answering.cancel()
+            self._arming.remove(writer)
+
+    def _attend(self, writer: asyncio.StreamWriter, wanted: bool) -> None:
+        """Tell how far what is checked is where that is wanted; abandon it where nobody waits for it."""
+        if _hung_up(writer):
+            self._abandon()
+        elif wanted and (told := self._progress()):
+            writer.write(json.dumps({"progress": told}).encode() + b"\n")
 
     async def _answer(self, request: Any, peer: Peer) -> Answer:
         if not isinstance(request, dict) or not isinstance(request.get("request"), str):
@@ -163,7 +176,10 @@ class ControlServer:
 def _hung_up(writer: asyncio.StreamWriter) -> bool:
     """Whether the other end is closed altogether, unlike one that only sends no more."""
     poll = select.poll()
-    poll.register(writer.get_extra_info("socket"), 0)
+    try:
+        poll.register(writer.get_extra_info("socket"), 0)
+    except ValueError:  # it left while it was told something, and is closed here too
+        return True
     return bool(poll.poll(0))
 
 
@@ -185,9 +201,9 @@ def ask(
 
     ConnectError when no daemon listens, DeviceTimeout when it does not answer.
     """
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
-        client.settimeout(timeout_s)
-        try:
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
+            client.settimeout(timeout_s)
             client.connect(str(path))
             wanted = {"progress": True} if progress else {}
             client.sendall(json.dumps({**request, **wanted}).encode() + b"\n")
@@ -196,12 +212,14 @@ def ask(
                 while progress and line.startswith(b'{"progress"'):
                     progress(json.loads(line)["progress"])
                     line = lines.readline()
-        except TimeoutError:
-            text = f"did not answer within {timeout_s:.0f} s; see its log"
-            raise DeviceTimeout("daemon", text) from None
-        except OSError as error:
-            text = f"is not running ({path}: {error.strerror or error}); start it with `fdhil run CONFIG`"
-            raise ConnectError("daemon", text) from None
+    except TimeoutError:
+        text = f"did not answer within {timeout_s:.0f} s; see its log"
+        raise DeviceTimeout("daemon", text) from None
+    except OSError as error:
+        text = f"is not running ({path}: {error.strerror or error}); start it with `fdhil run CONFIG`"
+        if error.errno in (errno.EMFILE, errno.ENFILE):
+            text = f"was not asked ({error.strerror}); close other connections or files, then try again"
+        raise ConnectError("daemon", text) from None
     if not line:
         raise ConnectError("daemon", "closed the connection without an answer; see its log")
     try:

@@ -84,8 +84,12 @@ class Service:
         self._queues = {axis: RecordQueue() for axis in config.axis}
         self._busy_since_s: dict[str, float] = {}
         self._notices = asyncio.Queue[Notice](NOTICE_QUEUE)
+        self._void_axes = asyncio.Queue[str]()  # each once at most: ``_void_by`` has the newest that speaks against it
+        self._void_by: dict[str, str] = {}
         self._gate = journal.FloodGate()
         self._audit = Audited(self._handle, config.store.directory)
+        desk, access = self._desk, config.access
+        self._control = ControlServer(self._audit.of, lambda: desk.checking, desk.abandon, access, self._live.serve)
         self._opened = asyncio.Event()
         self._stop = asyncio.Event()
         self._source: Source | None = None
@@ -130,14 +134,11 @@ class Service:
         self._tell(await asyncio.to_thread(self._store.open))
         self._say([Notice("ConfigUnlikely", "minor", text) for text in unlikely(self._config)])
         await asyncio.to_thread(self._prepare)
-        desk = self._desk
-        control = ControlServer(
-            self._audit.of, lambda: desk.checking, desk.abandon, self._config.access, self._live.serve
-        )
-        async with control.serving(self._run_directory / SOCKET_NAME), asyncio.TaskGroup() as tasks:
+        async with self._control.serving(self._run_directory / SOCKET_NAME), asyncio.TaskGroup() as tasks:
             acquiring = tasks.create_task(self._acquire(), name="acquire")
             others = [tasks.create_task(self._work(axis), name=f"axis {axis}") for axis in self._config.axis]
             others.append(tasks.create_task(self._keep_notices(), name="notices"))
+            others.append(tasks.create_task(self._void_records(), name="void"))
             others.append(tasks.create_task(self._desk.attend(self._tell), name="guard"))
             others.append(tasks.create_task(self._desk.stream(self._tell), name="stream"))
             others.append(tasks.create_task(self._feed_watchdog(), name="watchdog"))
@@ -149,7 +150,8 @@ class Service:
             await self._desk.stand_down()
             acquiring.cancel()
             await asyncio.wait([acquiring])
-            await asyncio.gather(*(queue.join() for queue in self._queues.values()), self._notices.join())
+            axes = (queue.join() for queue in self._queues.values())
+            await asyncio.gather(*axes, self._notices.join(), self._void_axes.join())
             for task in others:
                 task.cancel()
 
@@ -234,29 +236,38 @@ class Service:
     # what is said and kept -------------------------------------------------------------------------------------
 
     def _tell(self, notices: Sequence[Notice]) -> None:
-        """Show notices and have them stored; what a flood held back is not stored either."""
+        """Show notices and have them stored; what a flood held back is not stored either.
+
+        What voids a record does so whatever a flood holds back.
+        """
         now_s = time.monotonic()
-        for notice in self._say([self._watch.nc.placed(notice, now_s) for notice in notices]):
-            if isinstance(notice, Notice) and not self._notices.full():
-                self._notices.put_nowait(notice)
+        for notice in notices:
+            if notice.code in VOIDING:
+                if notice.axis not in self._void_by:
+                    self._void_axes.put_nowait(notice.axis)
+                self._void_by[notice.axis] = notice.text
+        for shown in self._say([self._watch.nc.placed(notice, now_s) for notice in notices]):
+            if isinstance(shown, Notice) and not self._notices.full():
+                self._notices.put_nowait(shown)
 
     async def _keep_notices(self) -> None:
         while True:
             notice = await self._notices.get()
             self._say(await asyncio.to_thread(self._store.keep, [notice]))
-            if notice.code in VOIDING:
-                await asyncio.to_thread(self._void, notice)
             if notice.code == TRIPPED and self._source is not None:
                 code, store = notice.text.partition(":")[0], self._config.store.directory
                 self._tell([await asyncio.to_thread(blackbox.dump, store, code, self._source.black_box)])
             self._notices.task_done()
 
-    def _void(self, notice: Notice) -> None:
-        """Mark the axis' commissioning record: the guard that is started next must know of it."""
-        try:
-            void_record(self._config.store.directory, notice.axis, notice.text)
-        except StoreError as error:
-            journal.write_line(str(error), "MAJOR")
+    async def _void_records(self) -> None:
+        """Mark commissioning records that are void: the guard that is started next must know of it."""
+        while True:
+            axis = await self._void_axes.get()
+            try:
+                await asyncio.to_thread(void_record, self._config.store.directory, axis, self._void_by.pop(axis))
+            except StoreError as error:
+                journal.write_line(str(error), "MAJOR")
+            self._void_axes.task_done()
 
     def _say(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
         """Show outcomes: one log line each (a flood becomes a count), the newest in the status. Return those shown."""
@@ -314,7 +325,7 @@ class Service:
         if request["request"] == "live":
             return self._live.begin()
         if request["request"] == "arm":
-            answer = await self._desk.arm(request)
+            answer = await self._desk.arm(request, lambda: self._control.hung_up)
             self._tell([_told(answer)])
             return answer
         if request["request"] == "disarm":

@@ -119,7 +119,10 @@ def _from_measured(state: State) -> State:
 
 
 def compared(state: State, request: Request, settings: Settings) -> tuple[State, Alarms]:
-    """A record holds again where the drive was found to be the one signed off; where it is another, it is void."""
+    """A record holds again where the drive was found to be the one signed off; where it is another, it is void.
+
+    So it is where the drive was touched since it was compared, as far as that is known.
+    """
     refused = [] if request.token_valid is True else [Alarm("AuthRequired")]
     if state.sending:
         refused.append(Alarm("NotOff", detail=state.mode.value))
@@ -128,11 +131,18 @@ def compared(state: State, request: Request, settings: Settings) -> tuple[State,
     axes = []
     for own, axis in zip(settings.axes, state.axes, strict=True):
         found = request.compared.get(own.name)
-        void = axis.record_void if found is None else not own.record or found != own.record
-        if found is not None and void:
-            refused.append(Alarm("RecordVoid", own.name, "it differs from the record that this guard knows"))
-        axes.append(axis._replace(record_void=void))
+        why = "" if found is None else _why_void(own.record, found, axis.touched != request.touched.get(own.name))
+        if why:
+            refused.append(Alarm("RecordVoid", own.name, why))
+        axes.append(axis._replace(record_void=bool(why) or (found is None and axis.record_void)))
     return state._replace(axes=tuple(axes)), tuple(refused)
+
+
+def _why_void(record: str, found: str, touched: bool) -> str:
+    """Return why a record is void after its drive was compared; empty: it holds."""
+    if not record or found != record:
+        return "it differs from the record that this guard knows"
+    return "that was after it was compared" if touched else ""
 
 
 def at_rest(axis: AxisState, offset: int) -> AxisState:

@@ -42,7 +42,8 @@ def parse_request(kind: Any, document: Mapping[str, Any], settings: Settings) ->
     valid = bool(settings.token_sha256) and hmac.compare_digest(digest, settings.token_sha256)
     facts = facts if isinstance(facts, dict) else {}
     laws, program = _laws(document.get("laws"), settings), _text(document, "program_digest")
-    return Request(kind, valid, program, facts, laws, _compared(document.get("axes"), settings))
+    compared, touched = _compared(document.get("axes"), settings), _touched(document.get("touched"), settings)
+    return Request(kind, valid, program, facts, laws, compared, touched)
 
 
 def _text(document: Mapping[str, Any], key: str) -> str:
@@ -55,6 +56,12 @@ def _compared(given: object, settings: Settings) -> dict[str, str]:
     """The fingerprints of the drives that were compared; what is no text is no drive's."""
     found = given if isinstance(given, dict) else {}
     return {axis.name: _text(found, axis.name) for axis in settings.axes if axis.name in found}
+
+
+def _touched(given: object, settings: Settings) -> dict[str, int]:
+    """How often each drive was touched before it was compared; what is no number is of none."""
+    found = given if isinstance(given, dict) else {}
+    return {axis.name: found[axis.name] for axis in settings.axes if type(found.get(axis.name)) is int}
 
 
 def _laws(given: object, settings: Settings) -> tuple[Law, ...]:

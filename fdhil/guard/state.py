@@ -23,7 +23,8 @@ NOT_SHOWN: Shown = (None, None)
 class Request:
     """What the operator or the daemon asks for; all but a disarm and a stop need the operator's token.
 
-    ``compared`` are the fingerprints, per axis, of drives that were found to be as they were commissioned.
+    ``compared`` are the fingerprints, per axis, of drives that were found to be as they were commissioned, ``touched``
+    how often each had been touched by what the status said before they were read.
     """
 
     kind: Literal["arm", "feedforward", "disarm", "adopt", "compared", "stop"]
@@ -32,6 +33,7 @@ class Request:
     facts: Mapping[str, object] = field(default_factory=dict)
     laws: tuple[Law, ...] = ()
     compared: Mapping[str, str] = field(default_factory=dict)
+    touched: Mapping[str, int] = field(default_factory=dict)
 
 
 class AxisInput(NamedTuple):

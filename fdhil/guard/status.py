@@ -63,6 +63,7 @@ def document(state: State, settings: Settings, path: CorrectedPath | None, not_g
         "offset_um": offset_um(state, settings),
         "may_stand_um": may_stand_um(state, settings),
         "missed_cycles": state.missed,
+        "touched": {s.name: a.touched for s, a in zip(settings.axes, state.axes, strict=True)},
         "late_frames": {s.name: a.late_echoes for s, a in zip(settings.axes, state.axes, strict=True)},
         "not_good": [told(alarm) for alarm in not_good],
     }

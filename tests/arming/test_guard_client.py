@@ -106,7 +106,7 @@ def test_a_connection_that_breaks_is_lost(far: Far, monkeypatch: pytest.MonkeyPa
 
 def test_a_table_goes_with_its_descriptor(far: Far) -> None:
     client = far(b'{"id": 1, "ok": true}\n{"id": 2, "ok": true}\n')
-    assert client.compared("token", {"X": "fingerprint"})["ok"]
+    assert client.compared("token", {"X": "fingerprint"}, {"X": 0})["ok"]
     before = len(list(Path("/proc/self/fd").iterdir()))
     assert client.load("X", {"X": [1, 2]}, {"X": [0, 0]}, "digest") == {"ok": True}
     assert len(list(Path("/proc/self/fd").iterdir())) == before

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -97,7 +97,7 @@ async def test_a_slow_guard_still_hears_that_the_daemon_lives(
     await asyncio.to_thread(desk.guard.close)
 
 
-@pytest.mark.parametrize("how", ["disarm", "abandon"])
+@pytest.mark.parametrize("how", ["disarm", "abandon", "hang up"])
 async def test_what_is_given_up_while_it_is_planned_is_not_armed(
     how: str, config: MachineConfig, guard: Guard, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -121,18 +121,53 @@ async def test_what_is_given_up_while_it_is_planned_is_not_armed(
     desk = ArmingDesk(config, OutcomeStore(config), folder)
     desk.begin({}, [])
     request = {"request": "arm", "program": "a.ngc", "token": read_token(folder)}
-    arming = asyncio.create_task(desk.arm(request))
+    hung_up = threading.Event()
+    arming = asyncio.create_task(desk.arm(request, hung_up.is_set))
     assert await asyncio.to_thread(planning.wait, 60.0)
     if how == "disarm":
         await desk.disarm()
-    else:
+    elif how == "abandon":
         desk.abandon()
+    else:
+        hung_up.set()
     planned.set()
     answer = await arming
     assert (answer["ok"], answer["code"]) == (False, "Abandoned")
     assert set(guard.heard) <= {"disarm", "status"}
     assert desk.armed is None
     desk.guard.close()
+
+
+@pytest.mark.fault("E18")
+async def test_a_disarm_waits_for_no_disk(config: MachineConfig, guard: Guard, folder: Path) -> None:
+    """Every thread of asyncio's pool waits for one, as where axes, history, notices and requests are to be stored."""
+    guard.says = lambda _kind: {**FINE, "state": "OFF"}
+    desk, answers = ArmingDesk(config, OutcomeStore(config), folder), threading.Event()
+    waiting = [asyncio.create_task(asyncio.to_thread(answers.wait, 60.0)) for _ in range(40)]
+    try:
+        await asyncio.sleep(0)
+        assert (await asyncio.wait_for(desk.disarm(), 30.0))["ok"]
+    finally:
+        answers.set()
+        await asyncio.gather(*waiting)
+        desk.guard.close()
+
+
+@pytest.mark.parametrize(
+    ("asked", "code"),
+    [
+        ({"token": "\ud800"}, "AuthRequired"),
+        ({"program": "a\0b.ngc"}, "BadRequest"),
+        ({"program": "\ud800.ngc"}, "BadRequest"),
+    ],
+)
+async def test_a_text_that_no_file_and_no_token_can_be_is_answered(
+    asked: Mapping[str, str], code: str, config: MachineConfig, folder: Path
+) -> None:
+    desk = ArmingDesk(config, OutcomeStore(config), folder)
+    desk.begin({}, [])
+    request = {"request": "arm", "program": "a.ngc", "token": read_token(folder), **asked}
+    assert (await desk.arm(request))["code"] == code
 
 
 async def test_a_disarm_that_is_answered_before_the_guard_is_asked_to_arm_is_the_last_word(

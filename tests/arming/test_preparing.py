@@ -27,6 +27,7 @@ from fdhil.arming.preparing import (
 from fdhil.arming.token import read_token
 from fdhil.arming.whole_plan import plan_whole
 from fdhil.commissioning.record import CommissioningRecord, axis_digest, save_record
+from fdhil.commissioning.void import void_record
 from fdhil.config import MachineConfig
 from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.errors import ProgramError
@@ -131,6 +132,15 @@ def test_a_good_machine_is_vouched_for(config: MachineConfig, program: Path) -> 
 def test_a_fact_that_does_not_hold_is_withheld(changes: dict[str, Any], withheld: str, config: MachineConfig) -> None:
     facts = standing_facts(["X", "Y"], config, known(config, **changes), gain_um=20.0)
     assert [name for name, holds in facts.items() if not holds] == [withheld]
+
+
+@pytest.mark.fault("A23")
+def test_a_record_that_something_was_seen_against_is_not_vouched_for(config: MachineConfig, program: Path) -> None:
+    save_records(config)
+    void_record(config.store.directory, "X", "booted")
+    armament = whole(program, config)
+    assert isinstance(armament, Armament)
+    assert [name for name, good in armament.facts.items() if not good] == ["commissioned"]
 
 
 @pytest.mark.fault("E7")

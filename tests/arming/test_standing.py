@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import socket
 import threading
 from collections.abc import Iterator, Mapping
@@ -148,7 +149,7 @@ class Law:
     facts: Mapping[str, bool] = {}
 
 
-@pytest.mark.parametrize("kept", ["", "[1]", '{"X": [], "Y": NaN}', "{" * 100_000])
+@pytest.mark.parametrize("kept", ["", "[1]", '{"X": [], "Y": NaN}', f'{{"X": 1{"0" * 400}}}', "{" * 100_000])
 def test_the_next_daemon_knows_what_the_one_before_it_left(tmp_path: Path, folder: Path, kept: str) -> None:
     """Both are killed in the cut, guard and daemon; the next daemon finds no guard, however it reads what was kept."""
     guard = Guard(folder)
@@ -178,6 +179,13 @@ def test_the_next_daemon_knows_what_the_one_before_it_left(tmp_path: Path, folde
     (folder / "guard.sock").unlink()
     assert [(n.code, n.severity) for n in after.refresh()] == [("GuardLost", "minor")]
     assert GuardLink(folder, tmp_path).state == "absent"
+
+
+@pytest.mark.timeout(60)
+def test_a_pipe_in_the_place_of_what_was_kept_holds_no_start_up(tmp_path: Path, folder: Path) -> None:
+    os.mkfifo(tmp_path / FILE_NAME)
+    after = GuardLink(folder, tmp_path)
+    assert (after.state, str(after.standing)) == ("lost", "an unknown offset may still be applied")
 
 
 def test_what_a_frozen_guard_holds_is_known_to_the_next_daemon_by_its_size(tmp_path: Path, folder: Path) -> None:

@@ -18,7 +18,9 @@ import can
 import numpy as np
 import pytest
 
+from fdhil.commissioning.void import is_void, void_record
 from fdhil.config import MachineConfig, load
+from tests.arming.guard_peer import Guard
 from tests.bench import axis_toml, bench_toml
 from tests.daemon.shop import fdhil
 from tests.drivers.peer import DrivePeer
@@ -129,6 +131,32 @@ def test_a_drive_that_trips_stops_the_others(floor: Floor) -> None:
     assert code == 1
     assert "axis Y: its drive fell from Operation enabled" in document["stopped"]
     assert floor.off()
+
+
+@pytest.mark.fault("A23")
+def test_a_drive_that_boots_while_it_plays_is_not_vouched_for(floor: Floor) -> None:
+    """A daemon marks both: of X it heard the boot-up, of Y what play writes to it."""
+
+    def boot() -> None:
+        for axis in "XY":
+            void_record(floor.config.store.directory, axis, "touched")
+        with can.Bus(interface="virtual", channel=floor.config.bus["can0"].channel) as bus:
+            bus.send(can.Message(arbitration_id=0x701, data=b"\x00", is_extended_id=False))
+
+    floor.config.guard_directory.mkdir(parents=True, exist_ok=True)
+    guard = Guard(floor.config.guard_directory)
+    guard.says = lambda _kind: {"ok": True, "state": "OFF", "touched": {"X": 4, "Y": 5}}
+    thread = floor.while_it_plays(boot)
+    code, _, err = floor.play(SLOW, "--yes")
+    thread.join()
+    guard.close()
+    assert code == 0, err
+    told = [request for request in guard.requests if request.get("axes")]
+    assert [sorted(request["axes"]) for request in told] == [["X", "Y"], ["Y"]]  # when it begins, and at its end
+    assert [request["touched"] for request in told] == [{"X": 4, "Y": 5}] * 2
+    assert [is_void(floor.config.store.directory, axis) for axis in "XY"] == [True, False]
+    assert "RecordVoid: axis X: its drive has booted since it was compared" in err
+    assert "axis Y" not in err
 
 
 def test_nothing_is_sent_beside_an_nc(floor: Floor, monkeypatch: pytest.MonkeyPatch) -> None:

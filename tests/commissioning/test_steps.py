@@ -27,7 +27,7 @@ from fdhil.commissioning.steps import (
     sign_test,
 )
 from fdhil.commissioning.watchdog import FEEDING_TRIES, watchdog_test
-from fdhil.config import MachineConfig
+from fdhil.config import CorrectionLimits, MachineConfig
 from fdhil.errors import ConnectError, DeviceError, DriveFault, ProtocolError
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
@@ -451,6 +451,15 @@ def test_states_are_shown(peer: tuple[DrivePeer, MachineConfig]) -> None:
         assert master.state() is State.OPERATION_ENABLED
 
 
+@pytest.mark.fault("E16")
+@pytest.mark.parametrize("per_mm", [40, 90])
+def test_a_scaling_that_knows_no_10_um_is_refused_before_anything_moves(per_mm: int) -> None:
+    settings = config(drive={"increments_per_rev": 20 * per_mm})
+    with DrivePeer(settings) as drive, pytest.raises(DriveFault, match=r"its scaling is too coarse .* count finer"):
+        commission(settings, "X")
+    assert not {0x000, 0x080, 0x201, 0x301} & set(drive.heard)
+
+
 class KeptOffsets(DrivePeer):
     """A simulated drive that keeps every offset it was sent, and fires Ctrl-C once one of them is ``interrupt_at``."""
 
@@ -487,6 +496,17 @@ def test_a_ramp_that_is_stopped_on_its_way_turns_round_there(interrupt_at: int) 
     assert max(offsets) <= 33
     assert offsets[-1] == 0
     assert drive.drive.power.state.name == "SWITCH_ON_DISABLED"
+
+
+def test_an_offset_is_taken_away_within_the_acceleration() -> None:
+    settings = config()
+    fast = settings.axis["X"].model_copy(update={"correction": CorrectionLimits(max_speed_mm_s=20.0)})
+    settings = settings.model_copy(update={"axis": {"X": fast}})
+    with KeptOffsets(settings) as drive:
+        enabled_and_rolled_back(settings, lambda master: steps.ramp(master, 150, 1))
+    assert max(drive.offsets) == 150
+    assert np.diff(drive.offsets).min() < -5  # 0.8 increments per cycle squared, and what is rounded
+    assert np.abs(np.diff(drive.offsets, 2)).max() <= 2
 
 
 def test_ctrl_c_while_all_is_rolled_back_is_heard_once_that_is_done() -> None:

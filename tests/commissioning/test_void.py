@@ -12,7 +12,7 @@ from fdhil.commissioning.compare import compare_again, compare_record, found_fin
 from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.record import CommissioningRecord, load_record, save_record
 from fdhil.commissioning.survey import Identity, Survey
-from fdhil.commissioning.void import confirm_record, is_void, void_path, void_record
+from fdhil.commissioning.void import confirm_record, is_void, void_mark, void_path, void_record
 from fdhil.errors import StoreError
 from tests.bench import bench_document
 
@@ -27,17 +27,31 @@ def test_a_mark_lasts_until_it_was_compared_or_commissioned_anew(tmp_path: Path)
     save_record(RECORD, store)
     assert not is_void(store, "X")
     void_record(store, "X", "the first reason")
-    void_record(store, "X", "another")
+    void_record(store, "X", "the newest reason")
     assert is_void(store, "X")
     assert not is_void(store, "Y")
-    assert "the first reason" in void_path(store, "X").read_text()
-    confirm_record(store, "X")
-    confirm_record(store, "X")
+    assert "the newest reason" in void_path(store, "X").read_text()
+    for _ in range(2):
+        confirm_record(store, "X", void_mark(store, "X"))
     assert not is_void(store, "X")
     void_record(store, "X", "again")
     save_record(RECORD, store)
     assert not is_void(store, "X")
     assert load_record(store, "X") == RECORD
+    assert not list(store.glob("*.part"))
+
+
+def test_what_is_seen_while_a_drive_is_compared_leaves_its_record_void(tmp_path: Path) -> None:
+    before = void_mark(tmp_path, "X")
+    void_record(tmp_path, "X", "booted")
+    confirm_record(tmp_path, "X", before)
+    assert is_void(tmp_path, "X")
+    before = void_mark(tmp_path, "X")
+    void_record(tmp_path, "X", "booted again")
+    confirm_record(tmp_path, "X", before)
+    assert is_void(tmp_path, "X")
+    confirm_record(tmp_path, "X", void_mark(tmp_path, "X"))
+    assert not is_void(tmp_path, "X")
 
 
 def test_a_store_that_cannot_be_read_voids(tmp_path: Path) -> None:
@@ -48,7 +62,7 @@ def test_a_store_that_cannot_be_read_voids(tmp_path: Path) -> None:
         void_record(file, "X", "why")
     void_path(tmp_path, "X").mkdir()
     with pytest.raises(StoreError, match="cannot be removed"):
-        confirm_record(tmp_path, "X")
+        confirm_record(tmp_path, "X", void_mark(tmp_path, "X"))
 
 
 def test_the_same_drive_is_found_again() -> None:

@@ -19,7 +19,7 @@ from click.testing import CliRunner
 from fdhil import config as machine_config
 from fdhil.cli.main import cli
 from fdhil.config import Access
-from fdhil.daemon.audited import Audited
+from fdhil.daemon.audited import TOLD, Audited
 from fdhil.daemon.control import ControlServer
 from fdhil.daemon.peers import NEEDS, Peer, role_of
 from fdhil.guard.peers import Role
@@ -130,6 +130,61 @@ async def test_a_flood_of_requests_does_not_fill_the_disk(tmp_path: Path) -> Non
     await audited.written()
     assert desk.done == ["disarm"] * 300
     assert len(list(audit.entries(tmp_path))) < 100
+
+
+async def test_a_disarm_that_a_flood_held_back_is_in_the_audit_a_moment_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fdhil.daemon.audited.HELD_S", 0.05)
+    desk, watcher = Desk(), Peer("looker", 4712, 1, Role.WATCH)
+    audited = Audited(desk.handle, tmp_path)
+
+    def told() -> int:
+        return sum(1 + entry.get("not_written", 0) for entry, _ in audit.entries(tmp_path))
+
+    for _ in range(60):
+        await audited.of({"request": "disarm"}, watcher)
+    async with asyncio.timeout(60.0):
+        while told() < 60:  # noqa: ASYNC110 - it is a file
+            await asyncio.sleep(0.01)
+    for _ in range(5):
+        await audited.of({"request": "disarm"}, watcher)
+    await audited.written()
+    assert (told(), len(desk.done)) == (65, 65)
+    assert len(list(audit.entries(tmp_path))) < 30
+
+
+@pytest.mark.fault("F12", "G1")
+async def test_of_who_may_not_ask_there_is_a_short_line_a_minute_whatever_he_asks_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = 1000.0
+    monkeypatch.setattr("fdhil.daemon.audited.time.monotonic", lambda: now_s)
+    audited, stranger = Audited(Desk().handle, tmp_path), Peer("stranger", 4713, 1, Role.NOBODY)
+    long = dict.fromkeys(TOLD, "\U0001f600" * 500)
+    for minute in range(3):
+        now_s = 1000.0 + 61.0 * minute
+        for what in (*NEEDS, "stop", "anything"):
+            for _ in range(10):
+                assert (await audited.of({**long, "request": what}, stranger))["code"] == "AuthRequired"
+    told = [entry.get("not_written", 0) for entry, _ in audit.entries(tmp_path)]
+    assert told == [0, 69, 69]
+    await audited.written()
+    assert sum(1 + entry.get("not_written", 0) for entry, _ in audit.entries(tmp_path)) == 210
+    assert (tmp_path / audit.FILE_NAME).stat().st_size < 4000
+
+
+async def test_what_ends_in_an_error_is_in_the_audit_too(tmp_path: Path) -> None:
+    async def handle(request: Mapping[str, Any]) -> dict[str, Any]:
+        raise ZeroDivisionError("made up")
+
+    audited, owner = Audited(handle, tmp_path), Peer("me", os.getuid(), 1, Role.COMMISSION)
+    for what in ("arm", "disarm"):
+        with pytest.raises(ZeroDivisionError):
+            await audited.of({"request": what}, owner)
+    await audited.written()
+    told = [(entry["answered"], entry["result"]) for entry, _ in audit.entries(tmp_path) if "answered" in entry]
+    assert told == [("arm", "ZeroDivisionError"), ("disarm", "ZeroDivisionError")]
 
 
 @pytest.mark.fault("F12")

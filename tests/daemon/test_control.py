@@ -7,6 +7,7 @@ import errno
 import json
 import os
 import re
+import resource
 import socket
 import sys
 import threading
@@ -25,6 +26,7 @@ from fdhil.daemon.lock import BusLocked, sole_owner
 from fdhil.daemon.notify import notify
 from fdhil.daemon.peers import Peer
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
+from fdhil.guard.peers import Role
 from fdhil.records import Notice, Skill
 from tests.store.made import outcome, published
 
@@ -70,7 +72,7 @@ async def test_what_takes_its_time_tells_its_progress_and_ends_when_nobody_waits
     free, abandoned = asyncio.Event(), asyncio.Event()
 
     async def handle(request: Mapping[str, Any], peer: Peer) -> Mapping[str, Any]:
-        await (free if request["request"] == "arm" else abandoned).wait()
+        await (abandoned if "of" in request else free).wait()
         return {"ok": True}
 
     def progress() -> Mapping[str, Any]:
@@ -85,8 +87,60 @@ async def test_what_takes_its_time_tells_its_progress_and_ends_when_nobody_waits
         assert answer == {"ok": True}
         assert told == [{"checked_s": 1}, {"checked_s": 2}]
         with pytest.raises(DeviceTimeout):
-            await asyncio.to_thread(ask, tmp_path / "c", {"request": "wait", "progress": True}, 0.01)
-        await asyncio.wait_for(abandoned.wait(), 300.0)
+            await asyncio.to_thread(ask, tmp_path / "c", {"request": "arm", "of": "one who leaves"}, 0.01)
+        await asyncio.wait_for(abandoned.wait(), 30.0)  # also where no progress was asked for
+
+
+async def asking(path: Path, *requests: Mapping[str, Any]) -> asyncio.StreamWriter:
+    """Connect and ask; the answer is not waited for."""
+    _, writer = await asyncio.open_unix_connection(str(path))
+    writer.writelines(json.dumps(request).encode() + b"\n" for request in requests)
+    return writer
+
+
+@pytest.mark.fault("G1")
+@pytest.mark.parametrize("role", [Role.NOBODY, Role.WATCH, Role.OPERATE])
+async def test_a_check_is_told_to_and_abandoned_by_whom_it_is_for_alone(
+    role: Role, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An operator's check goes on while another asks to arm, who may not, or comes second, and then leaves."""
+    monkeypatch.setattr("fdhil.daemon.control.PROGRESS_S", 0.01)
+    roles = iter([Role.OPERATE, role])
+    monkeypatch.setattr("fdhil.daemon.control.peer_of", lambda *_: Peer("somebody", 4711, 1, next(roles)))
+    heard, free, abandoned = asyncio.Semaphore(0), asyncio.Event(), asyncio.Event()
+
+    async def handle(request: Mapping[str, Any], peer: Peer) -> Mapping[str, Any]:
+        heard.release()
+        await free.wait()
+        return {"ok": True}
+
+    server = ControlServer(handle, lambda: {"program": "secret.ngc"}, abandoned.set, Access())
+    async with server.serving(tmp_path / "c"):
+        operator = await asking(tmp_path / "c", {"request": "arm"})
+        await heard.acquire()
+        reader, other = await asyncio.open_unix_connection(str(tmp_path / "c"))
+        other.write(b'{"request": "arm", "progress": true}\n')
+        await heard.acquire()
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(reader.readline(), 0.3)
+        other.close()
+        await asyncio.sleep(0.3)
+        assert (abandoned.is_set(), server.hung_up) == (False, False)
+        operator.close()
+        await asyncio.wait_for(abandoned.wait(), 30.0)
+        assert server.hung_up
+        free.set()
+    assert not server.hung_up
+
+
+def test_who_has_no_descriptor_left_is_told_so(tmp_path: Path, listener: socket.socket) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (1, hard))
+    try:
+        with pytest.raises(ConnectError, match=r"was not asked \(Too many open files\); close"):
+            ask(tmp_path / "s", {"request": "status"})
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 async def test_who_left_before_the_daemon_came_to_it_arms_nothing(tmp_path: Path) -> None:

@@ -204,8 +204,25 @@ async def test_a_drive_that_boots_voids_its_record(tmp_path: Path, capsys: pytes
     void_path(config.store.directory, "X").unlink()
     (tmp_path / "file").write_text("")
     blocked = config.model_copy(update={"store": config.store.model_copy(update={"directory": tmp_path / "file"})})
-    Service(blocked, Machine().open)._void(booted)
+    async with serving(blocked, Machine([booted])) as path:
+        await status_when(path, lambda s: s["notices"])
     assert "cannot be written" in capsys.readouterr().err
+
+
+@pytest.mark.fault("A23", "F12")
+async def test_a_boot_that_a_flood_or_a_full_queue_holds_back_voids_its_record_all_the_same(tmp_path: Path) -> None:
+    """X boots again and again, Y once; and no notice can be stored, as where the disk hangs."""
+    config = config_of(tmp_path, ("X", "Y"))
+    service = Service(config, Machine().open)
+    for k in range(300):
+        service._tell([Notice("NodeRebooted", "MAJOR", f"boot {k}", "X"), Notice(f"Code{k}", "minor", "flood")])
+    assert service._notices.full()
+    service._tell([Notice("NodeRebooted", "MAJOR", "Drive Y booted", "Y")])
+    voiding = asyncio.create_task(service._void_records())
+    await service._void_axes.join()
+    voiding.cancel()
+    assert "boot 299" in void_path(config.store.directory, "X").read_text()
+    assert "Drive Y booted" in void_path(config.store.directory, "Y").read_text()
 
 
 def test_the_watchdog_starves_when_the_source_hangs_but_not_when_the_bus_is_silent(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ DEMAND, OFFSET = smooth_path()
 class Wire(CanSocket):
     """``sent`` are (COB-ID, data); ``down``: the bus is gone, ``full``: nothing leaves the queue.
 
-    Frames of the COB-IDs in ``stuck`` do not leave; at the first of those in ``ends_at`` the bus goes down.
+    Frames of the COB-IDs in ``kept_back`` do not leave; at the first of those in ``ends_at`` the bus goes down.
     """
 
     def __init__(self, allowed: frozenset[int]) -> None:
@@ -37,7 +37,7 @@ class Wire(CanSocket):
         self._waiting: list[Frame] = []
         self.sent: list[tuple[int, bytes]] = []
         self.down = self.full = False
-        self.stuck: Collection[int] = ()
+        self.kept_back: Collection[int] = ()
         self.ends_at: Collection[int] = ()
 
     def feed(self, frames: Sequence[Frame]) -> None:
@@ -59,7 +59,7 @@ class Wire(CanSocket):
         self.down = self.down or cob_id in self.ends_at
         if self.down:
             raise OSError(100, "Network is down")
-        left = not self.full and cob_id not in self.stuck
+        left = not self.full and cob_id not in self.kept_back
         if left:
             self.sent.append((cob_id, data))
         return left

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import pytest
@@ -392,7 +392,8 @@ def test_a_touched_drive_is_not_armed_until_it_was_compared(touch: Callable[[Ben
     touch(machine)
     machine.settle()
     assert codes(machine.arm()) == {"RecordVoid"}
-    compared = Request("compared", True, compared={"X": RECORD})
+    touched = {"X": machine.state.axes[0].touched, "Y": 0}
+    compared = Request("compared", True, compared={"X": RECORD}, touched=touched)
     assert codes(machine.sync(replace(compared, token_valid=False)).refused) == {"AuthRequired"}
     assert codes(machine.sync(replace(compared, compared={"X": "another"})).refused) == {"RecordVoid"}
     assert machine.sync(replace(compared, compared={"Y": RECORD})).refused == ()
@@ -400,6 +401,24 @@ def test_a_touched_drive_is_not_armed_until_it_was_compared(touch: Callable[[Ben
     assert machine.sync(compared).refused == ()
     assert machine.arm() == ()
     assert codes(machine.sync(compared).refused) == {"NotOff"}
+
+
+@pytest.mark.parametrize("touched", [{"X": 1}, {"X": 3}, {"Y": 2}, {}])
+@pytest.mark.fault("A17")
+def test_a_drive_that_was_touched_after_it_was_compared_stays_void(touched: Mapping[str, int]) -> None:
+    machine = bench()
+    machine.settle()
+    restart(machine)
+    machine.settle()
+    restart(machine)
+    machine.settle()
+    asked = Request("compared", True, compared={"X": RECORD}, touched=touched)
+    told = Alarm("RecordVoid", "X", "that was after it was compared")
+    assert machine.sync(asked).refused == (told,)
+    assert codes(machine.arm()) == {"RecordVoid"}
+    restart(machine)  # in the very cycle in which the guard is told
+    assert machine.sync(replace(asked, touched={"X": 2})).refused == (told,)
+    assert machine.sync(replace(asked, touched={"X": 3})).refused == ()
 
 
 def test_a_write_while_it_runs_ends_nothing_and_arms_nothing_more() -> None:

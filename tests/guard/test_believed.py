@@ -232,6 +232,8 @@ def test_adopting_and_comparing_are_refused_while_it_sends(mode: Mode) -> None:
 def test_a_drive_that_is_another_is_told_by_its_axis() -> None:
     told = Alarm("RecordVoid", "Y", "it differs from the record that this guard knows")
     for found, refused in (({"X": RECORD, "Y": "another"}, (told,)), ({"X": RECORD}, ())):
-        state, answer = compared(held(0, 0), Request("compared", True, compared=found), MADE)
+        state, answer = compared(
+            held(0, 0), Request("compared", True, compared=found, touched=dict.fromkeys("XY", 0)), MADE
+        )
         assert answer == refused
         assert [axis.record_void for axis in state.axes] == [False, bool(refused)]

@@ -182,7 +182,7 @@ def test_a_reboot_freezes_until_the_drive_was_compared_and_adopted(cutting: Benc
     assert len(cutting.frames) == count
     adopt = Request("adopt", token_valid=True)
     assert cutting.sync(adopt).refused == (Alarm("RecordVoid", "X"),)
-    assert cutting.sync(Request("compared", True, compared={"X": RECORD})).refused == ()
+    assert cutting.sync(Request("compared", True, compared={"X": RECORD}, touched={"X": 1})).refused == ()
     assert cutting.sync(adopt).refused == ()
     cutting.until(Mode.OFF)
     assert [drive.offset for drive in cutting.drives] == [0, 0]

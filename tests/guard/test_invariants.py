@@ -85,7 +85,8 @@ class Faults(RuleBasedStateMachine):
             drive.remapped = False
         self.machine.main_alive = True
         self.machine.rest, self.machine.playing, self.machine.row = None, False, 0
-        self.cycle(Request("compared", True, compared={"X": RECORD, "Y": RECORD}))
+        self.cycle()
+        self.cycle(self.comparison(True, RECORD))
         self.machine.hear(0x701, b"\x05")
         self.machine.hear(0x702, b"\x05")
         for _ in range(40):
@@ -214,7 +215,12 @@ class Faults(RuleBasedStateMachine):
 
     @rule(digest=st.sampled_from((RECORD, "")), valid=st.booleans())
     def compared(self, digest: str, valid: bool) -> None:
-        self.cycle(Request("compared", valid, compared={"X": digest, "Y": RECORD}))
+        self.cycle(self.comparison(valid, digest))
+
+    def comparison(self, valid: bool, digest: str) -> Request:
+        """The drives were compared now, X with this finding."""
+        touched = {name: axis.touched for name, axis in zip("XY", self.machine.state.axes, strict=True)}
+        return Request("compared", valid, compared={"X": digest, "Y": RECORD}, touched=touched)
 
     @rule(cob_id=st.sampled_from((0x181, 0x281, 0x381, 0x481, 0x201)), data=st.binary(max_size=8))
     def garbage(self, cob_id: int, data: bytes) -> None:

@@ -30,6 +30,11 @@ def test_an_id_is_given_back_only_where_it_is_short(mark: object, kept: bool) ->
     assert document == {"request": "status", **({"id": mark} if kept else {})}
 
 
+def test_how_often_a_drive_was_touched_is_a_number_or_unknown() -> None:
+    for said, touched in (({"X": 2, "Y": 0}, {"X": 2, "Y": 0}), ({"X": True, "Y": "0", "Z": 1}, {}), ([1], {})):
+        assert parse_request("compared", {"touched": said}, settings()).touched == touched
+
+
 @given(st.binary(max_size=200) | st.from_type(dict).map(lambda found: json.dumps(found, default=str).encode()))
 def test_any_bytes_become_a_request_or_none(line: bytes) -> None:
     document = parse_line(line)

@@ -22,7 +22,7 @@ from fdhil.guard.landing import land
 from fdhil.guard.peers import Access, Peer
 from tests.guard import shop as shop_module
 from tests.guard.fed import FACTS, LAW, fed_settings
-from tests.guard.machine import DIGEST, FACTS_GIVEN, LIMITS
+from tests.guard.machine import DIGEST, FACTS_GIVEN, LIMITS, RECORD
 from tests.guard.shop import OWNER, TOKEN, Shop
 
 Make = Callable[..., Shop]
@@ -269,9 +269,9 @@ def test_an_axis_whose_frame_left_goes_on_from_it_when_that_of_the_other_did_not
     while shop.offsets()[-1] < 250:
         shop.cycle()
     stood = len(shop.offsets(node)) - 1
-    shop.wire.stuck = (0x300 + node,)
+    shop.wire.kept_back = (0x300 + node,)
     shop.cycle()
-    shop.wire.stuck = ()
+    shop.wire.kept_back = ()
     client.send(json.dumps({"request": then}).encode() + b"\n")
     shop.run(100)
     inside(shop.offsets(3 - node))
@@ -304,9 +304,9 @@ def test_an_offset_that_left_before_the_bus_went_down_stands(make: Make, ends_at
 def test_a_fault_of_the_program_ramps_from_what_left(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     shop = make()
     shop.into_the_cut()
-    shop.wire.stuck = (0x301,)
+    shop.wire.kept_back = (0x301,)
     shop.cycle()
-    shop.wire.stuck = ()
+    shop.wire.kept_back = ()
     unsent: list[object] = []
 
     def landed(_state: object, missed: object, *_: object) -> tuple[int, ...]:

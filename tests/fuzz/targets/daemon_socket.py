@@ -67,9 +67,8 @@ class _Client:
 
 
 async def _answered(data: bytes) -> None:
-    reader = asyncio.StreamReader(loop=_LOOP)
     peer, client = PEERS[data[0] % len(PEERS)], _Client()
-    answer = await _SERVER._attended(data[1:], peer, reader, client)  # type: ignore[arg-type] # stands for it
+    answer = await _SERVER._attended(data[1:], peer, client)  # type: ignore[arg-type] # stands for it
     line = json.dumps(answer)
     assert type(answer["ok"]) is bool
     assert answer.get("armed") is None

@@ -15,7 +15,7 @@ LAW = {"speed": [1, -2], "torque": [3], "pace": [1], "dry": 0}
 SAID = [
     {"request": "arm", "id": 1, "token": "t", "program_digest": "p", "facts": {"model_fresh": True}},
     {"request": "feedforward", "laws": {"X": LAW, "Y": LAW}},
-    {"request": "compared", "axes": {"X": "as commissioned"}},
+    {"request": "compared", "axes": {"X": "as commissioned"}, "touched": {"X": 1}},
     {"request": "status", "id": "a"},
     {"request": "table", "renew": True},
 ]

@@ -1,0 +1,23 @@
+"""Calls what blocks in a thread of its own.
+
+Those of asyncio's pool may all wait for a disk, and a disarm must not wait behind them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import ParamSpec, TypeVar
+
+Given = ParamSpec("Given")
+Said = TypeVar("Said")
+
+
+async def in_own_thread(call: Callable[Given, Said], *given: Given.args, **named: Given.kwargs) -> Said:
+    """Return what a call returns; it goes on where this is cancelled."""
+    thread = ThreadPoolExecutor(1, "call")
+    try:
+        return await asyncio.wrap_future(thread.submit(call, *given, **named))
+    finally:
+        thread.shutdown(wait=False)
