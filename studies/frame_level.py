@@ -184,7 +184,7 @@ class EverySync:
 def _land(cut: Cut) -> None:
     """What the guard's supervisor does when the loop itself has failed."""
     bus = EverySync()
-    land(cut.state, cut.settings, cast(CanSocket, bus))
+    land(cut.state, (), cut.settings, cast(CanSocket, bus))
     bus.close()
     values = [int.from_bytes(data, "little", signed=True) for _, data in bus.sent]
     for offsets in batched(values, len(cut.wires)):
