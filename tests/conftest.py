@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 import threading
 import time
 from collections.abc import Iterator
 
 import pytest
 from hypothesis import Phase, settings
+
+from fdhil.guard.signals import KEPT
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported; as the command line does
 gc.disable()  # until all tests are collected
@@ -38,6 +41,28 @@ def no_thread_left() -> Iterator[None]:
     while (left := _ours(set(threading.enumerate()) - before)) and time.monotonic() < deadline:
         time.sleep(0.01)
     assert not left, f"threads left behind: {[thread.name for thread in left]}"
+
+
+@pytest.fixture(autouse=True)
+def no_signal_caught() -> Iterator[None]:
+    """Fail a test that leaves a descriptor behind to which signals are told: a later one would break a pipe."""
+    yield
+    assert signal.set_wakeup_fd(-1) == -1, "signals are still told to a descriptor"
+
+
+@pytest.fixture
+def handlers() -> Iterator[None]:
+    """Give back what a guard that is started in this process takes: all signals, and the garbage collector."""
+    before = {number: signal.getsignal(number) for number in signal.valid_signals()}
+    yield
+    descriptor = signal.set_wakeup_fd(-1)
+    if descriptor >= 0:
+        os.close(descriptor)
+    for number, handler in before.items():
+        if number not in KEPT and handler is not None:
+            signal.signal(number, handler)
+    gc.unfreeze()
+    gc.enable()
 
 
 def _ours(threads: set[threading.Thread]) -> list[threading.Thread]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import gc
 import os
 import runpy
 import signal
@@ -125,20 +124,6 @@ def test_what_is_no_request_is_none(line: bytes) -> None:
 )
 def test_a_mark_that_cannot_be_given_back_is_left_out(mark: str) -> None:
     assert "id" not in (parse_line(f'{{"id": {mark}}}'.encode()) or {})
-
-
-@pytest.fixture
-def handlers() -> Iterator[None]:
-    before = {number: signal.getsignal(number) for number in signal.valid_signals()}
-    yield
-    descriptor = signal.set_wakeup_fd(-1)
-    if descriptor >= 0:
-        os.close(descriptor)
-    for number, handler in before.items():
-        if number not in signals.KEPT and handler is not None:
-            signal.signal(number, handler)
-    gc.unfreeze()
-    gc.enable()
 
 
 def start(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:

@@ -98,6 +98,7 @@ def run_main(monkeypatch: pytest.MonkeyPatch, settings: Path, descriptor: int) -
     return guard_main.main()
 
 
+@pytest.mark.usefixtures("handlers")
 def test_settings_that_cannot_be_read_are_one_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -108,6 +109,7 @@ def test_settings_that_cannot_be_read_are_one_sentence(
     assert capsys.readouterr().err.startswith("fdhil-guard: ")
 
 
+@pytest.mark.usefixtures("handlers")
 def test_a_descriptor_that_is_no_socket_is_one_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
