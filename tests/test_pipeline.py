@@ -23,7 +23,6 @@ from fdhil.records import (
     AxisSamples,
     MoveEvent,
     MoveKind,
-    NcMove,
     Notice,
     Outcome,
     ParameterSet,
@@ -349,12 +348,3 @@ def test_rapids_whose_samples_never_come_are_bounded(config: MachineConfig) -> N
     assert len(pipeline._rapids) == WAITING_RAPIDS
     after = 4000 * WAITING_RAPIDS
     assert len(windows_of(fed(pipeline, rapids(config, "X", 1, first_tick=after)))) == 1
-
-
-def test_a_program_whose_name_is_no_unicode_is_told_escaped(config: MachineConfig) -> None:
-    records = [
-        replace(record, nc=NcMove(7, "/nc/b\udcf6hlen.ngc")) if isinstance(record, MoveEvent) else record
-        for record in rapids(config, "X", 1)
-    ]
-    (cut,) = windows_of(fed(AxisPipeline("X", config), records))
-    assert cut.nc == NcMove(7, "/nc/b\\udcf6hlen.ngc")

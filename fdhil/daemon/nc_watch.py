@@ -32,8 +32,7 @@ class NcWatch:
 
     def note(self, state: NcState, now_s: float) -> list[Notice]:
         """Take a state; return what begins to be unusual, and what no longer is."""
-        program = None if state.program is None else printable(state.program)
-        self._state, self._heard_s = replace(state, program=program), now_s
+        self._state, self._heard_s = state, now_s
         if state.motion is MoveKind.UNKNOWN:
             return []
         found = dict(_unusual(state))
@@ -44,13 +43,16 @@ class NcWatch:
 
     def placed(self, notice: Notice, now_s: float) -> Notice:
         """Return a notice as it is told: printable, and unless it is mere news with the line that the NC works at."""
-        state, notice = self._state, replace(notice, text=printable(notice.text))
+        return replace(notice, text=printable(notice.text + self._place(notice, now_s)))
+
+    def _place(self, notice: Notice, now_s: float) -> str:
+        state = self._state
         if state is None or notice.severity == "info" or state.line is None or state.motion not in WORKING:
-            return notice
+            return ""
         if now_s - self._heard_s > FRESH_S:
-            return notice
+            return ""
         program = "" if state.program is None else f" of {state.program.rpartition('/')[2]}"
-        return replace(notice, text=f"{notice.text} (the NC is at line {state.line}{program})")
+        return f" (the NC is at line {state.line}{program})"
 
     def status(self, now_s: float) -> dict[str, Any] | None:
         """Return what the NC said last, with its age; None when it never said anything."""

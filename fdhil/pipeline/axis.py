@@ -168,7 +168,7 @@ class AxisPipeline:
         if self._rapids and self._rapids[-1].end is None:
             self._rapids[-1] = replace(self._rapids[-1], end=event.tick)
         if event.kind is MoveKind.RAPID:
-            self._rapids.append(_Rapid(event.tick, None, event.source, _in_unicode(event.nc)))
+            self._rapids.append(_Rapid(event.tick, None, event.source, event.nc))
 
     def _cut_what_is_over(self) -> list[Outcome]:
         outcomes: list[Outcome] = []
@@ -299,13 +299,6 @@ class AxisPipeline:
             )
         except ValueError:  # too few whole rows to compare
             return None
-
-
-def _in_unicode(nc: NcMove | None) -> NcMove | None:
-    """Return what the NC said so that JSON and UTF-8 take it: what is no Unicode in its program's name is escaped."""
-    if nc is None or nc.program is None:
-        return nc
-    return replace(nc, program=nc.program.encode("utf-8", "backslashreplace").decode())
 
 
 def _since_jump(known: Known) -> Sequence[Member]:

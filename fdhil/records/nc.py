@@ -34,6 +34,11 @@ class NcState:
     nc_tick: int | None = None
     nc_period_s: float | None = None
 
+    def __post_init__(self) -> None:
+        """Escape what is no Unicode in the program's name, as of a Latin-1 file: nothing that tells or keeps it can."""
+        if self.program is not None:
+            object.__setattr__(self, "program", self.program.encode("utf-8", "backslashreplace").decode())
+
     @property
     def held(self) -> bool:
         """Whether a feed hold is known to keep the NC still."""
