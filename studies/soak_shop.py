@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import shutil
 import signal
 import socket
@@ -34,10 +35,11 @@ STORE_MB = 512
 
 
 def free_port() -> int:
-    """Return a TCP port of this computer that nobody has."""
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return int(listener.getsockname()[1])
+    """Return a TCP port of this computer that nobody has, and that is given to nobody who asks for any."""
+    while True:
+        port = random.randrange(10_000, 30_000)
+        with suppress(OSError), socket.create_server(("127.0.0.1", port)):
+            return port
 
 
 def document_of(folder: Path, period_s: float, lockstep: bool) -> dict[str, Any]:

@@ -32,8 +32,8 @@ class Member(Protocol):
     target: int | None
 
     @property
-    def behind(self) -> int:
-        """How many SYNCs it has not answered."""
+    def awaited(self) -> bool:
+        """Whether a simulated drive has yet to answer."""
 
     @property
     def position(self) -> int | None:
@@ -149,12 +149,13 @@ class Cycle:
         """Whether a simulated drive has yet to answer the last SYNC, or a guard to send its offset, as it did before.
 
         Their processes may sleep, and time is the SYNC count. One that has not answered in ``LOCKSTEP_WAIT_S``, or
-        ``GUARD_WAIT_S``, is not waited for until it answers again.
+        ``GUARD_WAIT_S``, is not waited for until it answers again, and then until it has answered all that it slept
+        through: else there would be one SYNC on the way more than is answered, for good.
         """
         now = time.monotonic()
         if not self.lockstep or now >= self._sent_s + LOCKSTEP_WAIT_S:
             return False
-        if any(0 < member.behind <= 1 for member in self.members):
+        if any(member.awaited for member in self.members):
             return True
         return bool(self._offsets_before - self.offsets_heard) and now < self._sent_s + GUARD_WAIT_S
 

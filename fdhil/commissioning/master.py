@@ -41,7 +41,9 @@ class Heard:
     errors: int = 0
 
 
+FIRST_VALUE_S = 0.5  # an object of a TPDO that every tenth SYNC or so brings comes in this time
 LOCKSTEP_PATIENCE = 20.0  # times as long as on a real machine: a simulated one shares its computer
+CATCH_UP_S = 0.25  # a simulated drive that was not waited for has no SYNC left to answer when it is silent for so long
 
 
 class AxisSdo(SdoLink):
@@ -91,10 +93,13 @@ class Master:
             self._guarded.update(self._offset_ids())
         self._tpdos = {spec.cob_base + self.node_id: spec for spec in self.profile.tpdos}
         # SYNC is answered by the last of them: one before it would let two SYNCs go for one
-        every = [can_id for can_id, spec in self._tpdos.items() if spec.valid and spec.every_sync == 1]
-        self._last_answer = max(every, default=None)
+        answers = {can_id: spec.every_sync for can_id, spec in self._tpdos.items() if spec.valid}
+        self._last_answer = max((can_id for can_id, every in answers.items() if every == 1), default=0)
+        self._seldom = {can_id: every for can_id, every in answers.items() if every > 1 and can_id > self._last_answer}
+        self._due: dict[int, int] = {}
         self._plan: deque[int] = deque()
         self._answered = 0
+        self._caught_up_s = 0.0
         self._lock = threading.Lock()
         self.loop.members.append(self)
         if self._own_loop:
@@ -106,6 +111,12 @@ class Master:
     def behind(self) -> int:
         """How many SYNCs the drive has not answered."""
         return self.cycle - self._answered
+
+    @property
+    def awaited(self) -> bool:
+        """Whether a TPDO of the last SYNC is yet to come, or of those before at which it was not waited for."""
+        behind = self.behind
+        return behind == 1 or (not behind and self.cycle in self._due.values()) or self._catching_up
 
     @property
     def position(self) -> int | None:
@@ -129,6 +140,16 @@ class Master:
             if spec.valid and cob_id not in self._guarded and all((e.index, e.sub) in values for e in spec.entries):
                 self.bus.send(cob_id, cia402.pack(spec.entries, [values[e.index, e.sub] for e in spec.entries]))
 
+    def _take_answer(self) -> None:
+        """Take the last TPDO that comes with every SYNC: it may answer one that was sent long before the newest."""
+        if self.loop.lockstep and (self.behind > 1 or self._catching_up):
+            self._caught_up_s = time.monotonic() + CATCH_UP_S
+        self._answered = self.cycle
+
+    @property
+    def _catching_up(self) -> bool:
+        return time.monotonic() < self._caught_up_s
+
     def _offset_ids(self) -> Iterator[int]:
         """COB-IDs of the RPDOs that carry no target, but what a guard sends."""
         profile = self.profile
@@ -144,7 +165,9 @@ class Master:
         heard.errors, heard.frames = heard.errors + error, heard.frames + (not error)
         if spec is not None and len(data) >= spec.length:
             if can_id == self._last_answer:
-                self._answered = self.cycle
+                self._take_answer()
+            elif can_id in self._seldom:  # it follows the last answer to its SYNC
+                self._due[can_id] = self._answered + self._seldom[can_id]
             for entry, value in zip(spec.entries, cia402.unpack(spec.entries, data), strict=True):
                 heard.objects[entry.index, entry.sub] = value
                 heard.cycle[entry.index, entry.sub] = self.cycle
@@ -238,17 +261,18 @@ class Master:
 
     def average(self, key: tuple[int, int], cycles: int) -> float:
         """Return the mean of a mapped object over so many cycles; a computer that sleeps sees fewer of them."""
-        values, seen, end = [], self.heard.cycle.get(key, 0), self.cycle + cycles
+        before = self.heard.cycle.get(key, 0)
+        gone = f"0x{key[0]:04X} does not come any more; check its TPDO"
+        self.wait(lambda: self.heard.cycle.get(key, 0) > before, FIRST_VALUE_S, gone)
+        values, seen, end = [self.heard.objects[key]], self.heard.cycle[key], self.cycle + cycles
         over = False
         while not over:
             over = self.cycle >= end  # asked before the look, which sees what came in the last of them
-            if self.heard.cycle.get(key, 0) > seen:
+            if self.heard.cycle[key] > seen:
                 seen = self.heard.cycle[key]
                 values.append(self.heard.objects[key])
             self.check()
             time.sleep(self.period_s / 2)
-        if not values:
-            raise DeviceTimeout(self.device, f"0x{key[0]:04X} does not come any more; check its TPDO")
         return sum(values) / len(values)
 
     def state(self) -> cia402.State:

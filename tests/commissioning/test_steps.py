@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import signal
+import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
@@ -28,7 +30,7 @@ from fdhil.commissioning.steps import (
 )
 from fdhil.commissioning.watchdog import FEEDING_TRIES, watchdog_test
 from fdhil.config import CorrectionLimits, MachineConfig
-from fdhil.errors import ConnectError, DeviceError, DriveFault, ProtocolError
+from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, DriveFault, ProtocolError
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
 
@@ -87,6 +89,57 @@ def test_a_simulated_drive_may_sleep() -> None:
         prepare(master)
         enable(master)
         assert sign_test(master) == pytest.approx(10.0, abs=3.0)
+
+
+class SlowPeer(DrivePeer):
+    """A simulated drive whose frames leave one by one, and which sleeps through many SYNCs once it is told to."""
+
+    sleeping_s = 0.0
+
+    def take(self, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
+        """Sleep before the next SYNC."""
+        if can_id == 0x080 and self.sleeping_s:
+            time.sleep(self.sleeping_s)
+            self.sleeping_s = 0.0
+        return super().take(can_id, data)
+
+    def _send(self, frames: list[tuple[int, bytes]]) -> None:
+        for frame in frames:
+            time.sleep(0.002)
+            super()._send([frame])
+
+
+def test_a_simulated_drive_that_slept_answers_one_sync_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The TPDOs of every tenth SYNC are waited for as well: a guard counts in which SYNC they come."""
+    settings = config()
+    place = next(iter(settings.bus.values())).channel
+    with SlowPeer(settings) as peer, Master(settings, "X") as master, can.Bus(place, "virtual") as listener:
+        prepare(master)
+        with monkeypatch.context() as impatient:
+            impatient.setattr("fdhil.commissioning.cycle.LOCKSTEP_WAIT_S", 0.05)
+            peer.sleeping_s = 0.2
+            master.wait_cycles(50)  # most of them while it slept
+        master.wait(lambda: not master.behind, 10.0, "it sleeps on")
+        master.wait_cycles(10)  # one before it has caught up
+        while listener.recv(0) is not None:
+            pass
+        master.wait_cycles(40)
+        heard = []
+        while (message := listener.recv(0)) is not None:
+            if message.arbitration_id in (0x080, 0x181, 0x281, 0x381, 0x481):
+                heard.append(message.arbitration_id)
+    syncs = [k for k, can_id in enumerate(heard) if can_id == 0x080]
+    answers = [tuple(heard[a + 1 : b]) for a, b in itertools.pairwise(syncs)]
+    assert len(answers) > 30
+    assert set(answers) == {(0x181, 0x281), (0x181, 0x281, 0x381, 0x481)}
+    seldom = [k for k, each in enumerate(answers) if len(each) == 4]
+    assert set(np.diff(seldom)) == {10}
+
+
+def test_an_object_that_no_tpdo_brings_is_told() -> None:
+    settings = config(guard={})
+    with Master(settings, "X") as master, pytest.raises(DeviceTimeout, match="0x6064 does not come any more; check"):
+        master.average(master.profile.position, 10)
 
 
 def test_software_limits_are_kept_where_the_drive_has_them(peer: tuple[DrivePeer, MachineConfig]) -> None:
@@ -363,10 +416,11 @@ def test_a_mean_over_cycles_that_this_computer_slept_through_is_of_what_came(
         master.wait(lambda: position in master.heard.objects, 5.0, "no position comes")
 
         def slept(asked: Master) -> int:
-            """Return the cycle, and let twenty go by with the first that is asked for."""
-            monkeypatch.undo()
-            now = asked.cycle
-            asked.wait_cycles(20)
+            """Return the cycle, and let twenty go by with the first that this thread asks for."""
+            now = asked.loop.count
+            if threading.current_thread() is threading.main_thread():
+                monkeypatch.undo()
+                asked.wait_cycles(20)
             return now
 
         monkeypatch.setattr(Master, "cycle", property(slept))
