@@ -28,8 +28,9 @@ from fdhil.cli.demo.processes import Process
 from fdhil.cli.demo.toml import to_toml
 from fdhil.daemon.control import SOCKET_NAME
 from fdhil.program import load_trajectory
-from tests.linuxcnc.beside import PART, SHUTTLE, TRIES, contour_of_each_cut, free_port, record, repeated, until
+from tests.linuxcnc.beside import PART, SHUTTLE, TRIES, contour_of_each_cut, record, repeated, until
 from tests.linuxcnc.machine import LinuxCnc, write_machine
+from tests.ports import free_port
 from tests.sim.twin_process import TwinProcess
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import shutil
 import signal
 import socket
@@ -25,6 +24,7 @@ from fdhil.commissioning.steps import commission
 from fdhil.config import MachineConfig
 from fdhil.daemon.control import SOCKET_NAME, ask
 from fdhil.errors import ConnectError, FdhilError
+from tests.ports import free_port
 
 PATIENCE_S = 600.0
 LOOK_S = 0.1
@@ -32,14 +32,6 @@ TRIES = 50
 CANNOT = "cannot be played"
 KEPT_WINDOWS = 400
 STORE_MB = 512
-
-
-def free_port() -> int:
-    """Return a TCP port of this computer that nobody has, and that is given to nobody who asks for any."""
-    while True:
-        port = random.randrange(10_000, 30_000)
-        with suppress(OSError), socket.create_server(("127.0.0.1", port)):
-            return port
 
 
 def document_of(folder: Path, period_s: float, lockstep: bool) -> dict[str, Any]:

@@ -18,16 +18,11 @@ from typing import Any
 
 import psycopg
 
+from tests.ports import free_port
+
 NATS = shutil.which("nats-server") or "/usr/sbin/nats-server"
 POSTGRES = next(iter(sorted(Path("/usr/lib/postgresql").glob("*/bin"))), Path("/usr/lib/postgresql/15/bin"))
 PATIENCE_S = 180.0
-
-
-def free_port() -> int:
-    """Return a port that nobody listens at."""
-    with socket.socket() as chosen:
-        chosen.bind(("127.0.0.1", 0))
-        return int(chosen.getsockname()[1])
 
 
 def until(holds: Callable[[], bool], what: str) -> None:

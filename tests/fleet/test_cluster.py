@@ -10,8 +10,9 @@ import pytest
 from nats.aio.client import Client
 
 from tests.fleet.machine import Machine, written
-from tests.fleet.servers import NatsServer, Postgres, free_port, until
+from tests.fleet.servers import NatsServer, Postgres, until
 from tests.fleet.test_whole import counted, running
+from tests.ports import free_port
 
 pytestmark = pytest.mark.debian
 

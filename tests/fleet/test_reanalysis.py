@@ -27,9 +27,10 @@ from fdhil.pipeline import analyse
 from fdhil.records import Reason, WindowOutcome
 from tests.daemon.shop import fdhil
 from tests.fleet.machine import Machine, written
-from tests.fleet.servers import Postgres, children, free_port, listens, until
+from tests.fleet.servers import Postgres, children, listens, until
 from tests.fleet.works import fleet_of, gather, told_by
 from tests.identification.recorded import windows
+from tests.ports import free_port
 
 pytestmark = pytest.mark.debian
 BEFORE = Identification(method="least_squares")

@@ -10,7 +10,7 @@ import pytest
 from fdhil.config.uplink import NatsServer
 from fdhil.fleet import transport
 from fdhil.fleet.transport import connected
-from tests.fleet.servers import free_port
+from tests.ports import free_port
 
 
 async def test_a_server_that_is_not_there_is_not_tried_for_long(monkeypatch: pytest.MonkeyPatch) -> None:

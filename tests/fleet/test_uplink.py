@@ -18,7 +18,7 @@ from fdhil.fleet.transport import connected
 from fdhil.fleet.uplink import Sender
 from fdhil.store.outbox import read_position
 from tests.fleet.machine import Machine, written
-from tests.fleet.servers import free_port
+from tests.ports import free_port
 
 
 class Stream:

@@ -19,7 +19,8 @@ from fdhil.errors import FdhilError
 from fdhil.fleet.window_work import Again, Method, Stored, analyse_again
 from fdhil.fleet.workers import Cluster, WindowCrew, workers
 from tests.fleet import rapids
-from tests.fleet.servers import children, free_port, listening
+from tests.fleet.servers import children, listening
+from tests.ports import free_port
 
 Work = Callable[[Sequence[Stored]], list[Again]]
 

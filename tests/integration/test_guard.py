@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -51,9 +51,8 @@ def guarded(bench: Bench, tmp_path: Path) -> Iterator[GuardClient]:
     sign_off(bench.config)
     with Process("guard", ["fdhil.cli.guard", str(path)], tmp_path / "guard.log") as guard:
         guard.event("ready", PATIENCE_S)
-        guard_client = GuardClient(run)
-        yield guard_client
-        guard_client.close()
+        with closing(GuardClient(run)) as guard_client:
+            yield guard_client
         assert guard.stop() == 0
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import subprocess
 import sys
 import time
@@ -42,12 +41,6 @@ def fdhil(*arguments: object, code: int = 0) -> dict[str, Any]:
     )
     assert done.returncode == code, (arguments, done.returncode, done.stdout, done.stderr)
     return dict(json.loads(done.stdout))
-
-
-def free_port() -> int:
-    """Return a TCP port that nobody has."""
-    with socket.create_server(("127.0.0.1", 0)) as door:
-        return int(door.getsockname()[1])
 
 
 def until(ready: Callable[[], bool]) -> None:

@@ -19,8 +19,8 @@ from fdhil.config import MachineConfig
 from fdhil.drivers import Record, open_machine
 from fdhil.pipeline import AxisPipeline
 from fdhil.records import AxisSamples, Float, Int, MoveEvent, MoveKind, NcState, Notice, WindowOutcome
-from tests.linuxcnc.beside import free_port
 from tests.linuxcnc.machine import LinuxCnc
+from tests.ports import free_port
 from tests.sim.twin_process import TwinProcess, write_config
 
 pytestmark = pytest.mark.debian

@@ -18,7 +18,8 @@ from fdhil import config as machine_config
 from tests.daemon.machine import Machine, rapids
 from tests.daemon.shop import BENCH
 from tests.daemon.test_service import serving, status_when
-from tests.shopfloor.mosquitto import broker, certify, free_port, guarded, open_to_all
+from tests.ports import free_port
+from tests.shopfloor.mosquitto import broker, certify, guarded, open_to_all
 from tests.shopfloor.sparkplug_host import Host, command
 
 pytestmark = pytest.mark.debian

@@ -7,7 +7,6 @@ import contextlib
 import json
 import re
 import shutil
-import socket
 import ssl
 import subprocess
 import time
@@ -25,6 +24,7 @@ from fdhil.shopfloor.news import Listener, News
 from fdhil.shopfloor.prometheus import MOST_CONNECTIONS, Page, publish
 from tests.daemon.machine import Machine, config_of, rapids
 from tests.daemon.test_service import serving, status_when
+from tests.ports import free_port
 from tests.shopfloor.made import NOW_MS, notice, publishing, said, status, trouble
 from tests.shopfloor.mosquitto import certify
 
@@ -315,8 +315,3 @@ async def alerts_of(address: str, prometheus: asyncio.subprocess.Process) -> set
                 return firing
             await asyncio.sleep(0.2)
     raise TimeoutError("no alert fired")
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        return int(taken.getsockname()[1])
