@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from fdhil.cli.commission_steps import NOTHING
+from fdhil.cli.consent import agreed
 from fdhil.errors import DriveFault
 
 if TYPE_CHECKING:
@@ -77,13 +78,3 @@ def confirm(axis: str, question: str, advice: str) -> None:
     """DriveFault unless the operator says yes; ``advice`` says how things stand then, and what to do."""
     if not agreed(question):
         raise DriveFault(f"drive {axis}", f"nobody said yes; {advice}")
-
-
-def agreed(question: str) -> bool:
-    """Whether the operator says yes; where nobody is there to be asked, nobody does."""
-    try:
-        return click.confirm(question, err=True)
-    except click.Abort:
-        if sys.stdin.isatty():
-            raise  # Ctrl-C
-        return False

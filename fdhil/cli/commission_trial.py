@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fdhil.cli.commission_guide import Asked, Guide, agreed, confirm, room_of
+from fdhil.cli.commission_guide import Asked, Guide, confirm, room_of
 from fdhil.cli.commission_steps import NOTHING, TRIAL, trial_moves
+from fdhil.cli.consent import agreed
 from fdhil.errors import DriveFault
 
 if TYPE_CHECKING:

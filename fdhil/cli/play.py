@@ -16,6 +16,7 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cli.audited import audited
+from fdhil.cli.consent import agreed
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import FILE
 from fdhil.errors import DeviceError, DriveFault
@@ -209,13 +210,7 @@ def _ask(bench: Bench, program: Path, here: list[int]) -> None:
         f"The drives are as they were commissioned. {first}Then {program.name} is played. "
         "Is everybody out of reach, is the emergency stop within it, and may the axes move?"
     )
-    try:
-        agreed = click.confirm(question, err=True)
-    except click.Abort:
-        if sys.stdin.isatty():
-            raise  # Ctrl-C
-        agreed = False
-    if not agreed:
+    if not agreed(question):
         raise DriveFault("the bench", "nobody said yes, and nothing moved; start again, with --yes where nobody is")
 
 

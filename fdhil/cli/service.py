@@ -14,15 +14,17 @@ import click
 from fdhil import config as machine_config
 from fdhil import tables
 from fdhil.cli.audited import write_after, write_before
+from fdhil.cli.consent import agreed
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import FILE
-from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
+from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, DriveFault
 
 if TYPE_CHECKING:
     from fdhil.arming.guard_client import GuardClient
 
 CONFIG = click.argument("config", type=FILE)
 DISARM_S = 15.0  # the daemon waits for the guard's answer and for the ramp
+UNASKED = "hold the feed and run it again, with --yes where nobody can be asked"
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
 
 
@@ -204,7 +206,7 @@ def adopt(config: Path, yes: bool, as_json: bool) -> None:
 
     Says what may still be applied, asks, and has the guard take it over and ramp it to zero. The guard is asked itself:
     no daemon is needed. Hold the feed first. Exit 0 only when zero was read back, 1 when the guard refuses or zero is
-    not reached, 3 without a guard.
+    not reached, 3 without a guard or when nobody says yes.
     """
     if as_json and not yes:
         raise click.UsageError("--json cannot ask: give --yes too")
@@ -246,8 +248,8 @@ def _adopted(guard: GuardClient, token: Callable[[], str], yes: bool, quiet: boo
         return verdict(status) | {"text": f"guard: OFF, {stands}: there is nothing to adopt"}
     if not quiet:
         click.echo(f"the guard is {state}: {stands}", err=True)
-    if not yes:
-        click.confirm("Is the feed held? Ramp it to zero now?", abort=True, err=True)
+    if not yes and not agreed("Is the feed held? Ramp it to zero now?"):
+        raise DriveFault("adoption", f"nobody said yes, and nothing was sent; {stands}; {UNASKED}")
     try:
         answer = guard.adopt(token())
         return verdict(landed(guard.status)) if answer["ok"] else {**answer, "may_stand_um": dict(stands.offset_um)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import socket
@@ -331,15 +332,18 @@ def test_adopt_says_what_stands_asks_and_ends_at_zero(
 ) -> None:
     now = [FROZEN, {**FROZEN, "state": "ADOPT"}, {**FROZEN, "state": "ADOPT"}, OFF]
     guard.says = lambda kind: {"ok": True} if kind == "adopt" else now.pop(0) if len(now) > 1 else now[0]
-    monkeypatch.setattr("click.termui.visible_prompt_func", lambda _text: "n")
-    code, _, err = fdhil("adopt", machine, capsys=capsys)
-    assert (code, guard.heard) == (130, ["status"])
-    assert f"the guard is FROZEN: {STANDS}" in err
-    now.insert(0, FROZEN)
+    for said in ("n\n", ""):  # no, and nobody who could say it
+        monkeypatch.setattr("sys.stdin", io.StringIO(said))
+        code, _, err = fdhil("adopt", machine, capsys=capsys)
+        assert (code, guard.heard) == (3, ["status"])
+        assert f"the guard is FROZEN: {STANDS}" in err
+        assert f"nobody said yes, and nothing was sent; {STANDS}; hold the feed and run it again" in err
+        guard.heard.clear()
+        now.insert(0, FROZEN)
     monkeypatch.setattr("click.termui.visible_prompt_func", lambda _text: "y")
     code, out, _ = fdhil("adopt", machine, capsys=capsys)
     assert (code, out) == (0, "guard: OFF, offset 0\n")
-    assert guard.heard[2] == "adopt"
+    assert guard.heard[1] == "adopt"
     assert in_the_audit(machine) == [("adopt", None), ("adopt", "done")]
     code, out, _ = fdhil("adopt", machine, "--yes", capsys=capsys)
     assert (code, out) == (0, "guard: OFF, offset 0: there is nothing to adopt\n")
