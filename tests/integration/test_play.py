@@ -64,9 +64,13 @@ def test_a_correction_works_beside_it(bench: Bench, tmp_path: Path) -> None:
             text=True,
         ) as play:
             assert play.stderr is not None
+            told = []
             for line in play.stderr:
+                told.append(line)
                 if "press Enter" in line:
                     break
+            else:
+                pytest.fail("".join(told))
             loaded = guard.load(("X", "Y"), {"X": increments, "Y": increments}, {"X": bump, "Y": bump}, DIGEST)
             assert loaded["ok"], loaded
             run = bench.config.store.run_directory
