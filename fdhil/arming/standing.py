@@ -85,12 +85,11 @@ def _number(value: Any) -> float | None:
 
 
 def _fed(told: Any) -> tuple[str, ...]:
-    """Return the axes whose speed or torque offset is on, or was never read back as zero."""
+    """Return the axes whose speed or torque offset is on, or never went to zero for certain."""
     if not isinstance(told, Mapping):
         return ()
     applied = told.get("applied") or {}
-    unconfirmed = (told.get("cause") or {}).get("code") == "EchoMismatch"
-    on = told.get("state", "OFF") != "OFF" or unconfirmed
+    on = told.get("state", "OFF") != "OFF" or told.get("confirmed") is False
     return tuple(axis for axis, pair in applied.items() if on or any(pair))
 
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from fdhil.commissioning.void import Mark
     from fdhil.config import MachineConfig
 
-TellGuard = Callable[[Mapping[str, str]], Sequence[Mapping[str, str]]]
+TellGuard = Callable[[Mapping[str, str]], Sequence[Mapping[str, str]] | None]
 CONFIG = click.argument("config", type=FILE)
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
 SCAN_HEAD = ("node\naxis", "NMT state\nheartbeat", "device\nprofile", "vendor\nproduct", "revision\nserial", "EDS")
@@ -159,10 +159,15 @@ def _tell_compared(
             seen[axis] = finding.found if finding.ok else ""
             if not finding.ok:
                 void_record(directory, axis, finding.cause)
-    refused = [each for each in tell(seen) if seen.get(each["axis"]) != ""] if seen else []
+    answer = tell(seen) if seen else []
+    if answer is None:
+        return
+    refused = [each for each in answer if seen.get(each["axis"]) != ""]
     for each in refused:
         advice = "run fdhil check again; where it is refused again, stop fdhil-guard and start it again"
         click.echo(f"{each['code']}: {each['text']}; {advice}", err=True)
+    if not all(each["axis"] for each in refused):  # the guard has taken nothing of it
+        return
     for axis in {axis for axis, digest in seen.items() if digest} - {each["axis"] for each in refused}:
         confirm_record(directory, axis, marks[axis])
         if is_void(directory, axis):
@@ -174,18 +179,18 @@ def _tell_compared(
 def _guard(machine: MachineConfig) -> Iterator[TellGuard]:
     """Ask a running guard how often each drive was touched, and give what tells it which drives were compared since.
 
-    That returns what the guard refuses. The connection is held meanwhile: a guard that is started anew has not heard
-    what this one did.
+    That returns what the guard refuses, None when it went before it could answer. The connection is held meanwhile: a
+    guard that is started anew has not heard what this one did.
     """
     from fdhil.arming.guard_client import GuardClient
     from fdhil.arming.token import operator_token
 
-    def tell(seen: Mapping[str, str]) -> Sequence[Mapping[str, str]]:
+    def tell(seen: Mapping[str, str]) -> Sequence[Mapping[str, str]] | None:
         try:
             return guard.compared(token, seen, touched).get("refused", []) if touched is not None else []
         except DeviceError as error:
-            click.echo(f"the guard was not told: {error}", err=True)
-            return []
+            click.echo(f"the guard was not told, and records that are void stay so: {error}", err=True)
+            return None
 
     directory, touched = machine.guard_directory, None
     with ExitStack() as held:

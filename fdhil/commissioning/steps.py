@@ -41,6 +41,7 @@ from fdhil.errors import DeviceError, DriveFault, ProtocolError
 SIGN_TEST_UM = 10.0
 ENABLE_TIMEOUT_S = 5.0
 SETTLE_CYCLES = 400
+BOOTED = "it has booted since it was compared, and may not be set up as it was; commission it again"
 AVERAGE_CYCLES = 200
 RAMPS = 8
 MOST_RAMPS = 24
@@ -306,8 +307,11 @@ def commission(
         listen(master)
         with feedforward_open(master) as feeding:
             report("compare")
+            boots = master.heard.boots
             found = check_axis(master)
             proven = _proven(master, found, report, progress)
+            if master.heard.boots != boots:
+                raise DriveFault(master.device, BOOTED)
     return CommissioningRecord(
         axis=axis,
         **asdict(found.identity),

@@ -84,8 +84,8 @@ def _may_stand(state: State, axis: AxisState) -> int | None:
 
 
 def is_zero(axis: AxisState) -> bool:
-    """Whether nothing but zeros was sent, and the drive has shown one since."""
-    return not any(axis.sent) and (axis.zero_shown or known(axis) == 0)
+    """Whether nothing but zeros was sent, and the drive has shown one since, and nothing else last."""
+    return not any(axis.sent) and not axis.read_back and (axis.zero_shown or known(axis) == 0)
 
 
 def adopt_refusals(state: State, request: Request, alarms: Alarms, views: Views) -> Alarms:
@@ -101,7 +101,12 @@ def adopt_refusals(state: State, request: Request, alarms: Alarms, views: Views)
 
 def _nothing_held(state: State) -> bool:
     """Whether all drives are known to hold nothing: then there is nothing to send either."""
-    return not is_fed(state) and all(known(axis) == 0 for axis in state.axes)
+    return not _fed(state) and all(known(axis) == 0 for axis in state.axes)
+
+
+def _fed(state: State) -> bool:
+    """Whether a drive holds, or may hold, a speed or torque offset."""
+    return is_fed(state) or state.feed.unconfirmed
 
 
 def adopting(state: State, settings: Settings) -> State:
@@ -109,7 +114,7 @@ def adopting(state: State, settings: Settings) -> State:
     cause = Alarm("StaleOffset")
     if _nothing_held(state):
         return state.after(Event.NOTHING_HELD, axes=tuple(map(at_zero, state.axes)), cause=None)
-    feed = feedforward.zeroing(len(state.axes), cause) if is_fed(state) and settings.feeds else state.feed
+    feed = feedforward.zeroing(len(state.axes), cause) if _fed(state) and settings.feeds else state.feed
     state = state.after(Event.ADOPT, zeros_sent=0, cause=cause, feed=feed)
     return _from_measured(state)
 

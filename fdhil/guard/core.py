@@ -39,7 +39,7 @@ FAILED_SENDS = 3
 
 def step(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Output]:
     """Decide what leaves the guard now. ``inputs.sync`` False is the local timer's step, taken when SYNC is silent."""
-    before = state.mode
+    before, fed_before = state.mode, state.feed.mode
     state = observe(state, inputs, settings)
     views = views_of(settings, inputs, state)
     alarms = _alarms(state, inputs, views)
@@ -53,7 +53,8 @@ def step(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outpu
     state, output = _move(state, inputs, settings)
     state, output = go_on(state, inputs, alarms, settings, output)
     moved = None if state.mode is before else (before, state.mode, state.cause)
-    return state, output._replace(refused=refused, transition=moved)
+    fed = None if state.feed.mode is fed_before else (fed_before, state.feed.mode)
+    return state, output._replace(refused=refused, transition=moved, feed_transition=fed)
 
 
 # --- what the drives and the bus say ---
@@ -109,6 +110,8 @@ def _refusals(
     refused: list[Alarm] = []
     if state.mode is not Mode.OFF or state.feed.mode is not FeedMode.OFF:
         refused.append(Alarm("NotOff", detail=state.mode.value))
+    if state.feed.unconfirmed:
+        refused.append(Alarm("StaleOffset", detail="of speed or torque"))
     if request.token_valid is not True:
         refused.append(Alarm("AuthRequired"))
     if inputs.main_alive is not True:

@@ -70,7 +70,8 @@ class Feed(NamedTuple):
     """The feed-forward's memory: ``share`` of ``FADE_S`` faded in (cycles), the last targets per axis, newest first.
 
     ``sent`` are the last offsets of all axes, newest first; ``held`` counts cycles in which something was not as it
-    should be, ``limited`` those in which a limit took something away.
+    should be, ``limited`` those in which a limit took something away, ``unsent`` those in a row whose frames did not
+    leave. ``unconfirmed``: it went OFF with no zero shown, or none sent: something may still be applied.
     """
 
     mode: FeedMode = FeedMode.OFF
@@ -81,7 +82,14 @@ class Feed(NamedTuple):
     held: int = 0
     limited: int = 0
     zeros: int = 0
+    unsent: int = 0
+    unconfirmed: bool = False
     cause: Alarm | None = None
+
+    @property
+    def may_stand(self) -> bool:
+        """Whether speed or torque offsets may be applied."""
+        return self.mode is not FeedMode.OFF or self.unconfirmed
 
     @property
     def applied(self) -> tuple[Pair, ...]:
@@ -90,19 +98,20 @@ class Feed(NamedTuple):
 
     def after(self, event: Event, cause: Alarm | None) -> Feed:
         """Return the state that ``event`` leads to; KeyError where the table has no such way."""
-        return self._replace(mode=NEXT_FEED[self.mode, event], cause=cause)
+        unconfirmed = event is Event.ZERO_NOT_SHOWN
+        return self._replace(mode=NEXT_FEED[self.mode, event], cause=cause, unconfirmed=unconfirmed)
 
     def send(self, pairs: tuple[Pair, ...]) -> Feed:
         """Note what is sent now."""
         return self._replace(sent=(pairs, *self.sent)[:KEPT])
 
     def not_sent(self, axes: Sequence[int]) -> Feed:
-        """The last frames of some axes did not leave: the offsets before them are still in force."""
-        if not axes or len(self.sent) == 1:
-            return self
-        newest, before = self.sent[:2]
+        """The last frames of some axes did not leave: the offsets before them are still in force, no zero counts."""
+        if not axes:
+            return self._replace(unsent=0)
+        newest, before = (*self.sent, *self.sent)[:2]
         held = [before[k] if k in axes else pair for k, pair in enumerate(newest)]
-        return self._replace(sent=(tuple(held), *self.sent[1:]))
+        return self._replace(sent=(tuple(held), *self.sent[1:]), zeros=0, unsent=self.unsent + 1)
 
 
 def armed(laws: tuple[Law, ...]) -> Feed:
@@ -172,10 +181,10 @@ def zeroed(feed: Feed, confirmed: bool = True) -> Feed:
 
 
 def _landed(feed: Feed, confirmed: bool) -> Feed:
-    """OFF after enough zeros that the drives show, or far more of them that a drive does not show."""
-    if confirmed:
-        return feed.after(Event.ZERO_SHOWN, feed.cause) if feed.zeros > ZEROS else feed
-    if feed.zeros <= ZEROS_UNCONFIRMED:
+    """OFF after enough zeros that the drives show; or after far more that one does not show, or that do not leave."""
+    if confirmed and feed.zeros > ZEROS:
+        return feed.after(Event.ZERO_SHOWN, feed.cause)
+    if feed.mode is FeedMode.ON or max(feed.zeros, feed.unsent) <= ZEROS_UNCONFIRMED:
         return feed
     return feed.after(Event.ZERO_NOT_SHOWN, Alarm("EchoMismatch", detail="no zero was read back"))
 

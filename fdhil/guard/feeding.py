@@ -33,6 +33,4 @@ def go_on(state: State, inputs: Inputs, alarms: Alarms, settings: Settings, outp
         cause = Alarm("InternalError", detail=f"feed-forward {before.applied} -> {moved.applied}")
         moved = feedforward.zeroed(feedforward.react(before, (cause,)))
     heartbeat = output.heartbeat or state.tick % settings.heartbeat_cycles == 0
-    changed = None if moved.mode is before.mode else (before.mode, moved.mode)
-    state = state._replace(feed=moved)
-    return state, output._replace(feed=moved.applied, heartbeat=heartbeat, feed_transition=changed)
+    return state._replace(feed=moved), output._replace(feed=moved.applied, heartbeat=heartbeat)

@@ -88,7 +88,7 @@ class Guard:
             return 3
         standing_um = status.may_stand_um(self.state, self.settings)
         self._stopped(standing_um, status.offset_um(self.state, self.settings))
-        return 3 if any(um != 0 for um in standing_um.values()) else 0
+        return 3 if self.state.feed.may_stand or any(um != 0 for um in standing_um.values()) else 0
 
     def _failed(self, error: Exception) -> None:
         """Ramp to zero from what was sent last, without serving anybody any more, and say what was the matter."""
@@ -104,7 +104,7 @@ class Guard:
         self._stopped(standing_um, status.in_um(sent, self.settings))
 
     def _stopped(self, standing_um: Mapping[str, float | None], sent_um: Mapping[str, float | None]) -> None:
-        left = status.sentence(standing_um)
+        left = status.sentence(standing_um, self.state.feed)
         told = {"text": f"the guard has stopped; {left}; hold the feed, start it again and adopt"} if left else {}
         state = self.state.mode.value
         self._journal.write("stopped", state=state, offset_um=sent_um, may_stand_um=standing_um, **told)
@@ -147,6 +147,11 @@ class Guard:
         if not self._stopping:
             self._stopping = True
             self._notifier.tell("STOPPING=1")
+            for waits in list(self._requests):
+                owner, asked, other = waits
+                if owner is not None and other.kind != "disarm":
+                    self._requests.remove(waits)
+                    self._answer(owner, asked, (Alarm("Stopped"),))
             self._requests.append((None, {}, Request("stop")))
 
     # --- the bus ---
@@ -293,8 +298,10 @@ class Guard:
         self._notifier.tell(f"STATUS={mode.value}" + (f": {cause.cause}" if cause else ""))
 
     def _tell_feed(self, before: FeedMode, mode: FeedMode, by: Mapping[str, int]) -> None:
-        cause = self.state.feed.cause
+        feed, cause = self.state.feed, self.state.feed.cause
         told = {"code": cause.code, "axis": cause.axis, "text": cause.sentence(mode is FeedMode.OFF)} if cause else {}
+        if feed.unconfirmed:
+            told["text"] = f"{status.FED}; hold the feed, then run fdhil adopt"
         self._journal.write("feedforward", before=before.value, state=mode.value, tick=self.state.tick, **told, **by)
         self._notifier.tell(f"STATUS=feed-forward {mode.value}" + (f": {cause.cause}" if cause else ""))
 

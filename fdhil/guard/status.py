@@ -6,11 +6,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fdhil.guard.adoption import may_stand
+from fdhil.guard.feedforward import Feed
 from fdhil.guard.interlocks import Alarm
 from fdhil.guard.path import CorrectedPath
 from fdhil.guard.protocol import FEEDFORWARD, FeedMode
 from fdhil.guard.settings import Settings
 from fdhil.guard.state import State
+
+FED = "speed and torque offsets may still be applied"
 
 
 def told(alarm: Alarm) -> dict[str, str]:
@@ -34,11 +37,13 @@ def may_stand_um(state: State, settings: Settings) -> dict[str, float | None]:
     return in_um(may_stand(state), settings)
 
 
-def sentence(standing_um: Mapping[str, float | None]) -> str:
+def sentence(standing_um: Mapping[str, float | None], feed: Feed | None = None) -> str:
     """Say what may still be applied; empty when it is known that nothing is."""
     left = [
         f"{'an unknown offset' if um is None else f'{um:.1f} um'} on {x}" for x, um in standing_um.items() if um != 0
     ]
+    if not left and feed is not None and feed.may_stand:
+        return FED
     return f"{' and '.join(left)} may still be applied" if left else ""
 
 
@@ -51,6 +56,7 @@ def document(state: State, settings: Settings, path: CorrectedPath | None, not_g
         "feedforward": {
             "state": feed.mode.value,
             "cause": told(feed.cause) if feed.cause else None,
+            "confirmed": not feed.unconfirmed,
             "limited_cycles": feed.limited,
             "applied": {s.name: list(p) for s, p in zip(settings.axes, feed.applied, strict=False)},
         },

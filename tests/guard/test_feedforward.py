@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import socket
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from fdhil.guard import table
+from fdhil.guard import status, table
 from fdhil.guard.control import Client, Closer
 from fdhil.guard.feedforward import Pair, armed, violates
 from fdhil.guard.feeding import go_on
@@ -24,8 +25,8 @@ from fdhil.guard.settings import Pdo, from_json, to_json
 from fdhil.guard.state import AxisInput, BusView, Inputs, Output, Request, initial
 from tests.guard import machine
 from tests.guard.fed import FACTS, LAW, LIMITS, fed_bench, fed_settings, request, switched_on
-from tests.guard.machine import Bench, arm_request
-from tests.guard.shop import OWNER
+from tests.guard.machine import Bench, arm_request, commissioned
+from tests.guard.shop import OWNER, TOKEN, Shop
 
 
 def test_it_is_mute_until_it_is_asked_for() -> None:
@@ -213,6 +214,77 @@ def test_a_drive_that_keeps_its_torque_is_told() -> None:
     assert (bench.mode, bench.state.feed.mode) == (Mode.OFF, FeedMode.OFF)
 
 
+def test_zeros_that_do_not_leave_are_none() -> None:
+    """Where a queue stays full the guard gives up, says what may stand, and arms nothing until it was adopted."""
+    bench = switched_on()
+    bench.sync(Request("disarm"))
+    before = bench.state.feed.applied
+    assert before[0] != (0, 0)
+    for _ in range(100):
+        bench.sync(unsent=(0, 1))
+    assert mode_of(bench) is FeedMode.OFF
+    told = status.document(bench.state, bench.settings, None, ())["feedforward"]
+    assert told["confirmed"] is False
+    assert told["cause"]["text"].endswith("(no zero was read back)")
+    assert bench.state.feed.applied[0][0] > before[0][0] // 2
+    bench.run(150)
+    for wanted in (request(), arm_request()):
+        refused = bench.sync(wanted).refused
+        assert refused is not None
+        assert Alarm("StaleOffset", detail="of speed or torque") in refused
+    assert bench.sync(Request("adopt", True)).refused == ()
+    assert mode_of(bench) is FeedMode.ZEROING
+    bench.run(20)
+    assert mode_of(bench) is FeedMode.OFF
+    assert not bench.state.feed.may_stand
+    assert status.document(bench.state, bench.settings, None, ())["feedforward"]["confirmed"] is True
+
+
+def test_an_axis_whose_zeros_stay_behind_is_waited_for() -> None:
+    bench = switched_on()
+    bench.main_alive = False
+    bench.silence()
+    for _ in range(10):
+        bench.sync(unsent=(1,))
+    assert mode_of(bench) is FeedMode.ZEROING
+    bench.run(10)
+    assert mode_of(bench) is FeedMode.OFF
+    assert not bench.state.feed.may_stand
+
+
+def test_a_mismatch_that_ended_at_zero_is_over() -> None:
+    """What was told against a drive is why it went off; what it shows since then is that nothing stands."""
+    bench = switched_on(shown=True)
+    bench.drives[1].takes_fed = lambda pair: (pair[0], -pair[1])
+    bench.run(200)
+    assert (mode_of(bench), code_of(bench)) == (FeedMode.OFF, "EchoMismatch")
+    assert not bench.state.feed.may_stand
+
+
+def test_a_guard_that_ends_over_a_torque_says_so(tmp_path: Path) -> None:
+    """The bus is gone while it acts: exit code, the last line and the journal say what may still be applied."""
+    with closing(Shop(tmp_path, commissioned(fed_settings()))) as shop:
+        client = shop.connect()
+        shop.run(150)
+        laws = dict.fromkeys("XY", LAW._asdict())
+        assert shop.ask(client, {"request": "feedforward", "token": TOKEN, "laws": laws, "facts": FACTS})["ok"]
+        shop.playing = True
+        shop.run(150)
+        shop.wire.down = True
+        shop.wire.feed([])
+        shop.turn()
+        for _ in range(100):
+            shop.guard._last_sync_s -= 20
+            shop.guard._stepped_s -= 1
+            shop.turn()
+        assert shop.guard.status()["feedforward"]["confirmed"] is False
+        shop.stop.send(b"x")
+        assert shop.guard.run() == 3
+        told = [event for event in shop.events() if event["event"] in ("feedforward", "stopped")][-2:]
+        assert told[0]["text"].startswith("speed and torque offsets may still be applied; hold the feed")
+        assert told[1]["text"].startswith("the guard has stopped; speed and torque offsets may still be applied; hold")
+
+
 def test_a_drive_that_holds_a_torque_at_start_gets_zeros() -> None:
     """A guard that comes back finds what another left behind; nothing else is sent."""
     bench = fed_bench(shown=True)
@@ -301,7 +373,7 @@ def test_a_change_is_told_in_the_cycle_in_which_it_happens() -> None:
     bench.sync(Request("disarm"))
     bench.run(120)
     told = [output.feed_transition for output in bench.outputs if output.feed_transition is not None]
-    assert told == [(FeedMode.ENDING, FeedMode.OFF)]
+    assert told == [(FeedMode.OFF, FeedMode.ON), (FeedMode.ON, FeedMode.ENDING), (FeedMode.ENDING, FeedMode.OFF)]
     bench = switched_on()
     bench.silence()
     assert bench.outputs[-1].feed_transition == (FeedMode.ON, FeedMode.ZEROING)
