@@ -543,6 +543,22 @@ def test_a_guard_that_was_told_to_stop_arms_nothing_more(make: Make) -> None:
     assert (shop.state, shop.guard.run()) == ("OFF", 0)
 
 
+def test_an_arming_that_waits_when_it_is_told_to_stop_is_refused(make: Make) -> None:
+    shop = make()
+    arming, disarming = shop.connect(), shop.connect()
+    shop.load(arming)
+    shop.run(150)
+    disarming.send(b'{"request": "disarm"}\n')
+    shop.serve()
+    arming.send(arm_line() + b"\n")
+    shop.serve()
+    shop.stop.send(b"x")
+    assert shop.answer(arming, syncing=False)["code"] == "Stopped"
+    assert shop.answer(disarming)["ok"]
+    assert (shop.state, shop.guard.run()) == ("OFF", 0)
+    assert "ARMED" not in {event.get("state") for event in shop.events()}
+
+
 def test_the_journal_says_whose_disarm_it_was(make: Make) -> None:
     shop = make()
     client = shop.into_the_cut()
