@@ -88,7 +88,7 @@ def config(tmp_path: Path) -> MachineConfig:
             "speed and torque offsets on axis X",
         ),
         (
-            {**OFF, "feedforward": {"state": "OFF", "applied": {"X": [0, 0]}, "cause": {"code": "EchoMismatch"}}},
+            {**OFF, "feedforward": {"state": "OFF", "applied": {"X": [0, 0]}, "confirmed": False}},
             False,
             "speed and torque offsets on axis X may still be applied",
         ),

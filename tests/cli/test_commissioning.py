@@ -233,6 +233,32 @@ def test_a_sensor_is_read_and_a_silent_one_is_told(fdhil: Said, bench: Bench) ->
     assert "axis X: the Modbus device 127.0.0.1:1 cannot be reached; check its supply, host and port" in out
 
 
+@pytest.mark.parametrize("answer", [{"code": "NotOff", "axis": "", "text": "a correction is on"}, None])
+def test_where_the_guard_took_nothing_of_a_comparison_void_records_stay_so(
+    fdhil: Said, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: dict[str, str] | None
+) -> None:
+    """It refuses all of it, or hangs up before it has answered."""
+    path = write_config(tmp_path, bus='interface = "virtual"')
+    config = load(path)
+    config.guard_directory.mkdir(parents=True, exist_ok=True)
+    guard = Guard(config.guard_directory)
+    guard.says = lambda _kind: {"ok": True, "state": "OFF", "touched": {"X": 0, "Y": 0}}
+
+    def compare(*_: object) -> list[tuple[str, Finding]]:
+        if answer is None:
+            guard.close()
+        guard.says = lambda _kind: {"ok": False, "refused": [answer]}
+        return [("axis X", Finding(POINT, "f", "f"))]
+
+    monkeypatch.setattr("fdhil.commissioning.config_check.check_machine", compare)
+    void_record(config.store.directory, "X", "booted")
+    code, _, err = fdhil("check", path, "--json")
+    assert code == 0
+    assert ("NotOff: a correction is on; run fdhil check again" if answer else "records that are void stay so") in err
+    assert is_void(config.store.directory, "X")
+    guard.close()
+
+
 def test_what_is_seen_while_drives_are_compared_speaks_against_them(
     fdhil: Said, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -72,6 +72,18 @@ def test_a_good_drive_is_signed_off_and_left_as_it_was(peer: tuple[DrivePeer, Ma
     assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == consumers
 
 
+def test_a_drive_that_boots_while_it_is_commissioned_is_not_signed_off(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    _, settings = peer
+
+    def boot(step: str) -> None:
+        if step == "restore":
+            with can.Bus(next(iter(settings.bus.values())).channel, "virtual") as drive:
+                drive.send(can.Message(arbitration_id=0x701, data=[0], is_extended_id=False))
+
+    with pytest.raises(DriveFault, match="it has booted since it was compared"):
+        commission(settings, "X", boot)
+
+
 class SleepyPeer(DrivePeer):
     """A simulated drive whose process sleeps now and then, as on a busy computer, until its watchdog is tried."""
 
