@@ -11,6 +11,7 @@ import os
 import queue
 import select
 import socket
+import struct
 import threading
 from array import array
 from collections.abc import Callable, Mapping
@@ -28,9 +29,11 @@ MAX_LINE_BYTES = 1 << 15
 MOST_DESCRIPTORS = 253  # the kernel's limit: what does not fit the buffer would be closed in this thread
 ANCILLARY_BYTES = socket.CMSG_SPACE(MOST_DESCRIPTORS * 4)
 
+AT_ONCE = struct.pack("ii", 1, 0)
+
 
 class Closer:
-    """Closes what clients sent or left, in a thread: closing a socket that lingers or a hung server's file may wait."""
+    """Closes what clients sent or left, in a thread: closing a hung server's file may wait. No socket lingers."""
 
     def __init__(self) -> None:
         self._left: queue.SimpleQueue[int | None] = queue.SimpleQueue()
@@ -43,6 +46,12 @@ class Closer:
 
     def _run(self) -> None:
         while (descriptor := self._left.get()) is not None:
+            with contextlib.suppress(OSError):  # it is no socket
+                sent = socket.socket(fileno=descriptor)
+                try:
+                    sent.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, AT_ONCE)
+                finally:
+                    sent.detach()
             with contextlib.suppress(OSError):
                 os.close(descriptor)
 

@@ -6,7 +6,9 @@ import contextlib
 import itertools
 import json
 import os
+import select
 import socket
+import struct
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -736,6 +738,23 @@ def test_an_answer_to_who_has_gone_is_dropped() -> None:
     assert client.gone
     closer.take(1 << 20)
     closer.end()
+
+
+def test_a_socket_that_would_linger_is_closed_at_once() -> None:
+    """A peer that passes it holds up none of what others left."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        near = socket.create_connection(server.getsockname())
+        near.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 30_000))
+        near.setblocking(False)
+        while select.select((), [near], (), 0.0)[1]:
+            near.send(bytes(1 << 16))
+        here, there = os.pipe()
+        closer = Closer()
+        closer.take(near.detach())
+        closer.take(there)
+        assert os.read(here, 1) == b""  # the pipe's other end is closed
+        closer.end()
+        os.close(here)
 
 
 # --- journal and systemd ---
