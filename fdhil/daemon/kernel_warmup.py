@@ -9,6 +9,7 @@ import numpy as np
 from fdhil import correction
 from fdhil.config import Axis, MachineConfig
 from fdhil.correction.kernels import project
+from fdhil.identification.covariance import robust
 from fdhil.identification.kalman import departure
 from fdhil.model import closed_loop
 from fdhil.pipeline import AxisPipeline
@@ -37,10 +38,15 @@ def warm(config: MachineConfig, method: str | None = None) -> None:
 
 
 def _warm_what_is_rare() -> None:
-    """Call the kernels that a sound drive seldom needs: offsets at their limits, a sensor told by the others."""
+    """Call what a sound drive seldom needs: offsets at their limits, a sensor told by the others, coloured innovations.
+
+    The last compiles nothing: it has a library's code and buffers, of over a megabyte, in memory from the beginning.
+    """
     project(np.linspace(0.0, 2.0, 8), np.ones(3), np.zeros(2))
     theta, rows = np.array([0.5, 0.005, 0.8, 0.075, 0.05, 5.0, 0.0]), np.ones((4, 3))
     departure(theta, 0.001, np.ones(4, dtype=np.int8), np.ones(4), rows, rows, rows, 0)
+    slopes = np.random.default_rng(1).normal(size=(256, 2, theta.size))
+    robust(np.eye(theta.size), [slopes[:, 0]], [(slopes, slopes[:, :, 0])])
 
 
 def nominal_rapid(name: str, axis: Axis, dt_s: float, direction: int = 1, seed: int = 1) -> Window:
