@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from fdhil.config import MachineConfig
 from fdhil.config.web import Web, is_loopback
+from fdhil.daemon import heap
 from fdhil.errors import ConfigError, ConfigFault, ConnectError, FdhilError
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ LARGEST_MESSAGE = 64 * 1024
 BACKLOG = 64
 KEEP_ALIVE_S = 15
 STOP_S = 3
+GIVE_BACK_S = 60.0
 
 
 def require() -> None:
@@ -67,6 +69,7 @@ def serve(web: Web, make: Callable[[], FastAPI], ready: Callable[[str], None]) -
     require()
     check_reach(web)
     certificate = _tls(web)
+    heap.keep_small()
     with _listening(web) as listener:
         asyncio.run(_serve(web, make, listener, certificate, ready))
 
@@ -116,7 +119,18 @@ async def _serve(
     server = server_of(make(), certificate, lambda: ready(url_of(web, listener)))
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, setattr, server, "should_exit", True)
-    await server.serve([listener])
+    giving_back = asyncio.create_task(_give_back(), name="free memory")
+    try:
+        await server.serve([listener])
+    finally:
+        giving_back.cancel()
+
+
+async def _give_back() -> None:
+    """Give free memory back now and then: a page of a long history takes 100 MB while it is made."""
+    while True:
+        await asyncio.sleep(GIVE_BACK_S)
+        await asyncio.to_thread(heap.give_back)
 
 
 def server_of(app: FastAPI, certificate: ssl.SSLContext | None, ready: Callable[[], None]) -> uvicorn.Server:
