@@ -56,11 +56,22 @@ class CorrectedPath:
 
     def standing_rows(self) -> int:
         """Return the number of the last row that still stands at the first row's demand."""
-        row = self.first
-        start = [values[0] for values in self.demand]
-        while self.mismatch(row + 1, start) == 0:
-            row += 1
-        return row
+        return self.first + min(map(_alike, self.demand)) - 1
+
+
+def _alike(values: Sequence[int]) -> int:
+    """Return how many values at the begin are equal; runs are compared, not values: a dwell has ten thousands of rows.
+
+    A run of ``step`` equal values is doubled until the next run is another, then halved to where that begins to differ.
+    """
+    step = 1
+    while values[step : 2 * step] == values[:step]:
+        step *= 2
+    count = step
+    while step := step // 2:
+        if values[count : count + step] == values[:step]:
+            count += step
+    return count
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from array import array
+from collections.abc import Callable, Sequence
+from functools import partial
+
 import pytest
 
 from fdhil.guard.interlocks import Alarm
@@ -38,6 +42,15 @@ def test_the_rows_that_stand_at_the_begin_are_counted_one_by_one(standing: int) 
         *(False, *[True] * (standing - 1)),  # to the next row, not from the one before
         *(False, False, True, False),
     ]
+
+
+@pytest.mark.parametrize("kind", [list, partial(array, "i")])
+def test_a_dwell_of_any_length_is_counted_to_its_last_row(kind: Callable[[list[int]], Sequence[int]]) -> None:
+    for standing in (*range(1, 70), 14_000):
+        for after in ([], [9], [9, 7, 7, 7]):
+            x, y = kind([7] * standing + after), kind([0] * (standing + len(after)))
+            path = CorrectedPath(FIRST, (y, x), (y, y), True, "p")
+            assert path.standing_rows() == FIRST + standing - 1
 
 
 @pytest.mark.parametrize(("dx", "dy"), [(EPS, 0), (-EPS, 0), (0, EPS), (EPS, -EPS)])
