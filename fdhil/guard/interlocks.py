@@ -140,7 +140,7 @@ CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
     "NotOff": (_N, "what was armed before has not ended", "disarm it first"),
     "NotSettled": (_N, "the interlocks were not all good for 100 SYNC", "wait a moment and arm again"),
     "GuardBusy": (_N, "a request of this connection still waits", "wait for its answer, then ask again"),
-    "DisarmedSince": (_N, "it was disarmed after this arming had begun", "arm when it is wanted again"),
+    "DisarmedSince": (_N, "it was disarmed after this was asked for", "ask again when it is wanted"),
     "MainLost": (_R, "the daemon is gone or does not answer", "restart the daemon, then arm again"),
     "Disarmed": (_R, "disarmed", "arm when it is wanted again"),
     "Stopped": (_R, "the guard was told to stop", "start it again when it is wanted"),
