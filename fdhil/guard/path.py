@@ -60,9 +60,9 @@ class CorrectedPath:
 
 
 def _alike(values: Sequence[int]) -> int:
-    """Return how many values at the begin are equal; runs are compared, not values: a dwell has ten thousands of rows.
+    """Return how many values at the begin are equal; runs are compared, not values: a dwell has thousands of rows.
 
-    A run of ``step`` equal values is doubled until the next run is another, then halved to where that begins to differ.
+    A run of equal values is doubled until the next one differs, then halved to where it begins to.
     """
     step = 1
     while values[step : 2 * step] == values[:step]:

@@ -35,11 +35,10 @@ def test_rows_have_their_number_to_the_last() -> None:
 
 
 @pytest.mark.parametrize("standing", [1, 2, 3, 4])
-def test_the_rows_that_stand_at_the_begin_are_counted_one_by_one(standing: int) -> None:
+def test_a_row_stands_to_the_next_one_and_not_from_the_one_before(standing: int) -> None:
     path = CorrectedPath(FIRST, ([7] * standing + [9, 7, 7],), ([0] * (standing + 3),), True, "p")
-    assert path.standing_rows() == FIRST + standing - 1
     assert [path.stands(FIRST + k) for k in range(-1, standing + 3)] == [
-        *(False, *[True] * (standing - 1)),  # to the next row, not from the one before
+        *(False, *[True] * (standing - 1)),
         *(False, False, True, False),
     ]
 
