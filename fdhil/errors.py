@@ -6,6 +6,7 @@ Expected outcomes (a refused window, a correction that would not help) are value
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -56,6 +57,17 @@ class DeviceError(FdhilError):
 
 class ConnectError(DeviceError):
     """A bus, port or peer cannot be reached."""
+
+    @classmethod
+    def of_socket(cls, device: str, error: OSError, absent: str) -> ConnectError:
+        """Return why ``device`` was not heard at its UNIX socket; ``absent`` says it where nothing listens there."""
+        text, cause = absent, error.strerror or error
+        if error.errno in (errno.EACCES, errno.EPERM):
+            text = f"may not be asked by this user ({cause}), so that whether it runs is not known"
+            text += "; ask as a user of its group, or with sudo"
+        elif error.errno in (errno.EMFILE, errno.ENFILE):
+            text = f"was not asked ({cause}); close other connections or files, then try again"
+        return cls(device, text)
 
 
 class DeviceTimeout(DeviceError):

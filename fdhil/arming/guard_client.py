@@ -46,8 +46,8 @@ class GuardClient:
             self._socket.connect(str(path))
         except OSError as error:
             self._socket.close()
-            text = f"no guard answers ({error.strerror or error}); start fdhil-guard with this machine's config"
-            raise ConnectError(str(path), text) from None
+            absent = f"no guard answers ({error.strerror or error}); start fdhil-guard with this machine's config"
+            raise ConnectError.of_socket(str(path), error, absent) from None
 
     def status(self) -> dict[str, Any]:
         """Return the guard's status document."""

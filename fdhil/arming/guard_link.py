@@ -15,7 +15,7 @@ from fdhil.arming.guard_client import GuardClient
 from fdhil.arming.preparing import Armament, Feeding
 from fdhil.arming.standing import ABSENT, GONE, START_AND_ADOPT, Standing, landed, lost, standing
 from fdhil.arming.standing_mark import StandingMark
-from fdhil.errors import DeviceError
+from fdhil.errors import ConnectError, DeviceError
 from fdhil.guard.protocol import AT_REST, CHARGED
 from fdhil.records import Notice
 
@@ -43,6 +43,7 @@ class GuardLink:
         self._missed = self._mark.left is None
         self._heard_s: float | None = None
         self._untold: list[Notice] = []
+        self._ended = False
 
     @property
     def connected(self) -> bool:
@@ -95,6 +96,8 @@ class GuardLink:
         A guard that does not answer is let go: what it may have armed it ramps down, and so it ends as it is told.
         """
         with self._lock:
+            if self._ended:
+                raise ConnectError("guard", "is not asked any more, since the daemon ends; start it again")
             before = self._status
             try:
                 if self._client is None:
@@ -200,8 +203,9 @@ class GuardLink:
             return answer
 
     def close(self) -> None:
-        """End the connection, and know what was heard last; what still runs is ramped down by the guard."""
+        """End the connection for good, and know what was heard last; what still runs is ramped down by the guard."""
         with self._lock:
+            self._ended = True
             self._drop()
 
 

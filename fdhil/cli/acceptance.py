@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from fdhil.cli.compiling import forewarn
+from fdhil.cli.failing import verdict
 from fdhil.cli.options import FILE, OutputFile, Positive, Writing
 
 
@@ -17,8 +18,10 @@ from fdhil.cli.options import FILE, OutputFile, Positive, Writing
 @click.option("--pdf", type=OutputFile(".pdf"), help="Also print it as PDF (needs chromium).")
 @click.option("--by", default="", metavar="NAME", help="Who proved it; stands above the signature.")
 @click.option("--program", type=FILE, metavar="PROGRAM", help="An NC program or demand CSV: its contour error is told.")
-@click.option("--radius-mm", type=Positive(), default=50.0, show_default=True, help="Radius of the circular test.")
-@click.option("--feed", type=Positive(), default=2000.0, show_default=True, help="Its feed, mm/min.")
+@click.option(
+    "--radius-mm", type=Positive(0.1, 10_000.0), default=50.0, show_default=True, help="Radius of the circular test."
+)
+@click.option("--feed", type=Positive(1.0, 1e6), default=2000.0, show_default=True, help="Its feed, mm/min.")
 @click.option(
     "--measured-circle",
     type=FILE,
@@ -28,6 +31,7 @@ from fdhil.cli.options import FILE, OutputFile, Positive, Writing
 @click.option("--contour-um", type=Positive(), help="The largest contour error of PROGRAM that is accepted.")
 @click.option("--circle-um", type=Positive(), help="The largest bi-directional circular deviation that is accepted.")
 @click.option("--json", "as_json", is_flag=True, help="Print what the page says as one JSON document.")
+@verdict
 def acceptance(
     config: Path,
     out: Path,

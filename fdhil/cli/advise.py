@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from fdhil.cli.compiling import forewarn
+from fdhil.cli.failing import verdict
 from fdhil.cli.options import FILE, OutputFile, Positive, Writing
 from fdhil.cli.prediction import inputs
 
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from fdhil.prediction.advise import Advice
     from fdhil.prediction.feeds import Source
     from fdhil.records import Parameters, Trajectory
+
+UNHELD = "; {} of its lines leave the tolerance at every feed that was tried, without the correction"
 
 
 @click.command(cls=Writing)
@@ -36,6 +39,7 @@ if TYPE_CHECKING:
 )
 @click.option("--out", type=OutputFile(), help="Write PROGRAM with these feeds, those without the correction.")
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
+@verdict
 def advise(
     program: Path,
     config_path: Path,
@@ -52,8 +56,8 @@ def advise(
     these feeds together were predicted to keep the tolerance. --json lists every line; --out writes the program with
     its F words replaced and everything else kept.
 
-    Exit codes: 0 every line can be held by some feed, 1 some line cannot, 2 wrong option, model or configuration, 3 a
-    file cannot be read or written.
+    Exit codes: 0 every line can be held by some feed (with --out: also without the correction), 1 some line cannot, 2
+    wrong option, model or configuration, 3 a file cannot be read or written.
     """
     if out is not None and program.suffix.lower() == ".csv":
         raise click.UsageError("--out writes an NC program, and a demand has no F words; give the program")
@@ -79,8 +83,15 @@ def advise(
         written = None if out is None else str(out)
         click.echo(json.dumps(document | {"lines": lines, "written": written}, allow_nan=False))
     elif out is not None:
-        click.echo(f"written to {out}", err=True)
-    return 1 if any(a.plain.share is None and (a.corrected is None or a.corrected.share is None) for a in advice) else 0
+        left = sum(a.plain.share is None for a in advice)
+        click.echo(f"written to {out}{UNHELD.format(left) if left else ''}", err=True)
+    return int(any(not _held(a, corrected=out is None) for a in advice))
+
+
+def _held(advice: Advice, corrected: bool) -> bool:
+    """Whether some feed holds a stretch, without the correction or, where that counts too, with it."""
+    ways = (advice.plain, advice.corrected) if corrected else (advice.plain,)
+    return any(way is not None and way.share is not None for way in ways)
 
 
 def _write(program: Path, advice: Sequence[Advice], config: MachineConfig, out: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from fdhil import config as machine_config
+from fdhil.cli.failing import verdict
 from fdhil.cli.options import FILE
 
 
@@ -17,6 +18,7 @@ from fdhil.cli.options import FILE
 @click.argument("config", type=FILE)
 @click.option("--last", type=click.IntRange(min=1), default=20, show_default=True, help="How many entries to show.")
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
+@verdict
 def audit(config: Path, last: int, as_json: bool) -> int:
     """Show who asked the machine of CONFIG for what, what he was answered, and whether no line was changed since.
 

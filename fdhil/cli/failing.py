@@ -22,7 +22,9 @@ Given = ParamSpec("Given")
 Result = TypeVar("Result")
 STOPPED = 130
 STANDARD_ERROR = 2
+WRONG_CALL = 2
 TROUBLE = 3
+COMPLETION = "_FDHIL_COMPLETE"  # what a shell asks click by for its completion; fdhil runs no command then
 NO_CACHE = (
     "compiled code can be kept neither beside fdhil nor in the home of this user; nothing was started; "
     "set NUMBA_CACHE_DIR to a folder that this user may write"
@@ -31,6 +33,9 @@ NO_CACHE = (
 
 def run_safely(command: click.Command) -> int:
     """Run a click command and return the exit code; errors are told on stderr, with ``--json`` on stdout."""
+    if broken := next((each for each in sys.argv[1:] if not _is_text(each)), None):
+        text = f"{broken!a} is no text in this computer's encoding, {sys.getfilesystemencoding()}"
+        return tell("BadParameter", f"{text}; rename the file, or write the word anew", WRONG_CALL)
     try:
         result = command.main(standalone_mode=False)
         sys.stdout.flush()
@@ -45,9 +50,11 @@ def run_safely(command: click.Command) -> int:
         return _tell_config(error)
     except FdhilError as error:
         return tell(type(error).__name__, str(error), error.exit_code, _details(error))
-    except (SystemExit, BrokenPipeError):  # whoever read the answer has seen enough of it; click raises the former
+    except (SystemExit, BrokenPipeError) as error:
         _drop(sys.stdout)
-        return 0
+        if isinstance(error, SystemExit) and COMPLETION in os.environ:
+            return int(error.code or 0)
+        return 0  # whoever read the answer has seen enough of it; click and rich raise SystemExit then
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
         text = f"{place}{error.strerror or error}; nothing more was done, check the disk, the path and its rights"
@@ -63,6 +70,15 @@ def run_safely(command: click.Command) -> int:
     return int(result or 0)
 
 
+def _is_text(argument: str) -> bool:
+    """Whether an argument can be told, kept and shown: bytes that are no letters cannot."""
+    try:
+        argument.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def verdict(command: Callable[Given, Result]) -> Callable[Given, Result]:
     """Mark a command whose exit code 0 is a yes: where nobody took its answer, it is 3."""
 
@@ -71,7 +87,7 @@ def verdict(command: Callable[Given, Result]) -> Callable[Given, Result]:
         try:
             result = command(*given, **options)
             sys.stdout.flush()
-        except BrokenPipeError:
+        except (BrokenPipeError, SystemExit):  # rich raises the latter
             _drop(sys.stdout)
             click.get_current_context().exit(TROUBLE)
         return result

@@ -10,6 +10,7 @@ from typing import Any
 
 import click
 
+from fdhil.cli.failing import verdict
 from fdhil.cli.options import FILE
 from fdhil.errors import FdhilError
 
@@ -133,6 +134,7 @@ def status(fleet: Path, as_json: bool) -> None:
 @click.option("--axis", required=True, help="Its axis.")
 @click.option("--parameter", required=True, type=PARAMETER)
 @AS_JSON
+@verdict
 def trend(fleet: Path, machine: str, axis: str, parameter: str, as_json: bool) -> int:
     """Show how one parameter of one axis moved.
 
@@ -167,6 +169,7 @@ def compare(fleet: Path, parameter: str, by: str, axis: str | None, as_json: boo
 @BY
 @click.option("--axis", help="One axis letter only.")
 @AS_JSON
+@verdict
 def outliers(fleet: Path, by: str, axis: str | None, as_json: bool) -> int:
     """Name the axes that are unlike their sisters.
 

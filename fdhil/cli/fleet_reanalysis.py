@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from fdhil import tables
+from fdhil.cli.failing import verdict
 from fdhil.cli.fleet import AS_JSON, BY, with_extra
 from fdhil.cli.options import FILE
 
@@ -37,6 +38,7 @@ DAY = click.DateTime(["%Y-%m-%d", "%Y-%m-%dT%H:%M:%S"])
 )
 @BY
 @AS_JSON
+@verdict
 def reanalyse(
     fleet: Path,
     since: datetime | None,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fdhil.cli.failing import verdict
 from fdhil.cli.fleet import with_extra
 from fdhil.cli.options import FILE, OutputFile, Writing
 
@@ -84,6 +85,7 @@ def sign(change: Path, key_file: Path, by: str, machines: tuple[str, ...], out: 
 @click.option("--despite", default="", help="Why it goes on although not all machines before stand well.")
 @click.option("--withdraw", is_flag=True, help="Take CHANGE back from the machines that have not accepted it.")
 @AS_JSON
+@verdict
 def stage(
     fleet: Path,
     change: Path,

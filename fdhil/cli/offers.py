@@ -10,6 +10,7 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cli.audited import audited
+from fdhil.cli.failing import verdict
 from fdhil.cli.fleet import with_extra
 from fdhil.cli.options import FILE
 from fdhil.config import MachineConfig
@@ -37,6 +38,7 @@ def offers() -> None:
 @CONFIG
 @click.argument("files", nargs=-1, type=FILE)
 @AS_JSON
+@verdict
 def list_(config: Path, files: tuple[Path, ...], as_json: bool) -> int:
     """Show the offers for the machine of CONFIG.
 
@@ -61,6 +63,7 @@ def list_(config: Path, files: tuple[Path, ...], as_json: bool) -> int:
 @BY
 @click.option("--loosens", "may_loosen", is_flag=True, help="A limit may be loosened, where the offer does that.")
 @AS_JSON
+@verdict
 def accept(config: Path, offer: Path, by: str, may_loosen: bool, as_json: bool) -> None:
     """Write what OFFER changes into CONFIG.
 

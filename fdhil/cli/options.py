@@ -22,10 +22,10 @@ COLUMNS = click.option(
 
 
 class Positive(click.FloatRange):
-    """A finite number above 0: nan, which no range refuses, and infinity are wrong too."""
+    """A finite number above 0, or of a range above it: nan, which no range refuses, and infinity are wrong too."""
 
-    def __init__(self) -> None:
-        super().__init__(min=0.0, min_open=True)
+    def __init__(self, least: float | None = None, most: float | None = None) -> None:
+        super().__init__(min=least or 0.0, max=most, min_open=least is None)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Return the number; click.BadParameter where it is none."""

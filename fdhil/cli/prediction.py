@@ -13,6 +13,7 @@ import click
 
 from fdhil import tables
 from fdhil.cli.compiling import forewarn
+from fdhil.cli.failing import verdict
 from fdhil.cli.options import FILE, OutputFile, Positive, Writing
 from fdhil.records import INTERVAL_95
 from fdhil.report.parameter_view import MEANING
@@ -41,11 +42,11 @@ class Asked:
     as_json: bool
 
 
-def _shared(wanted: Callable[..., int]) -> Callable[..., int]:
+def _shared(wanted: Callable[..., int | None]) -> Callable[..., int | None]:
     """Add the argument and options that both commands have; ``wanted`` gets them as one ``Asked``."""
 
     @functools.wraps(wanted)
-    def command(**options: Any) -> int:
+    def command(**options: Any) -> int | None:
         own = {name: value for name, value in options.items() if name not in Asked.__dataclass_fields__}
         return wanted(Asked(**{name: options[name] for name in Asked.__dataclass_fields__}), **own)
 
@@ -80,7 +81,7 @@ def _shared(wanted: Callable[..., int]) -> Callable[..., int]:
 @click.option(
     "--since", type=int, metavar="REVISION", help="With --from-history: compare inertia and friction with REVISION."
 )
-def predict(asked: Asked, sensitivity: bool, tolerance_um: float | None, since: int | None) -> int:
+def predict(asked: Asked, sensitivity: bool, tolerance_um: float | None, since: int | None) -> None:
     """Predict the path error that the drives will leave of a PROGRAM (NC program or demand CSV).
 
     The parameters are the configuration's nominal ones unless --model or --from-history says otherwise. Exit codes: 0
@@ -114,13 +115,12 @@ def predict(asked: Asked, sensitivity: bool, tolerance_um: float | None, since: 
     _report(asked, config, predicted)
     if asked.as_json:
         click.echo(json.dumps(document, allow_nan=False))
-        return 0
+        return
     from fdhil.cli import forecast
 
     _show_prediction(predicted, document["zones"], tolerance_um)
     forecast.show_steps(steps)
     forecast.show_compared(document.get("compared"))
-    return 0
 
 
 def _with_history(
@@ -163,6 +163,7 @@ def _with_history(
 @click.command(cls=Writing)
 @_shared
 @click.option("--method", type=click.Choice(list(tables.CORRECTIONS)), help="Left out: the best there is.")
+@verdict
 def correct(asked: Asked, method: str | None) -> int:
     """Plan the offsets that correct the predicted path error of a PROGRAM (NC program or demand CSV).
 

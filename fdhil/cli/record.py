@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import config as machine_config
+from fdhil.cli.failing import verdict
 from fdhil.cli.options import FILE, OutputFile, Positive, Writing
 
 if TYPE_CHECKING:
@@ -16,11 +17,12 @@ if TYPE_CHECKING:
     from fdhil.drivers.demand_recorder import DemandRecorder, RecordedDemand
 
 _SHOWN_GAPS = 5
+NOTHING_MOVED = "nothing moved; start the program on the NC while the recording waits"
 
 
 @click.command(cls=Writing)
 @click.argument("config", type=FILE)
-@click.option("--out", required=True, type=OutputFile(), help="The demand CSV to write.")
+@click.option("--out", required=True, type=OutputFile(), help="The demand CSV to write; as *.csv it is read as one.")
 @click.option("--seconds", type=Positive(), help="Record no longer than this.")
 @click.option(
     "--rest",
@@ -31,6 +33,7 @@ _SHOWN_GAPS = 5
 )
 @click.option("--with-gaps", is_flag=True, help="Write a demand with lost rows too, each marked nan.")
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
+@verdict
 def record(config: Path, out: Path, seconds: float | None, rest: float, with_gaps: bool, as_json: bool) -> None:
     """Record the demand that the NC sends to CONFIG's machine during an air cut, as a demand CSV.
 
@@ -108,13 +111,13 @@ def _document(out: Path, recorded: RecordedDemand | None, written: bool) -> dict
         "duration_s": 0.0 if recorded is None else float(recorded.reference.time_s[-1]),
         "complete": recorded is not None and recorded.complete,
         "gaps": gaps,
-        "doubts": [] if recorded is None else list(recorded.doubts),
+        "doubts": [NOTHING_MOVED] if recorded is None else list(recorded.doubts),
     }
 
 
 def _tell(out: Path, recorded: RecordedDemand | None, written: bool) -> None:
     if recorded is None:
-        click.echo("nothing moved; start the program on the NC while the recording waits", err=True)
+        click.echo(NOTHING_MOVED, err=True)
         return
     rows = recorded.reference.time_s.size
     click.echo(f"{rows} rows, {recorded.reference.time_s[-1]:.3f} s" + (f", written to {out}" if written else ""))

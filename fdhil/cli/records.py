@@ -12,6 +12,7 @@ import click
 from fdhil import config as machine_config
 from fdhil import tables
 from fdhil.cli.compiling import forewarn
+from fdhil.cli.failing import verdict
 from fdhil.cli.options import COLUMNS, FILE, OutputFile, Writing
 from fdhil.errors import RecordingError
 from fdhil.store import suffixes
@@ -28,6 +29,7 @@ HEALTH = ("slopes", "trends", "limits", "changes", "windows")
 @click.option("--config", "config", type=FILE, help="The machine's config; left out: what the recordings say.")
 @click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Left out: the config's, else the best.")
 @AS_JSON
+@verdict
 def replay(recordings: tuple[Path, ...], config: Path | None, method: str | None, as_json: bool) -> None:
     """Analyse recorded windows (.parquet) or recordings (.csv) again, bit by bit as the daemon did.
 

@@ -258,7 +258,7 @@ def _adopted(guard: GuardClient, token: Callable[[], str], yes: bool, quiet: boo
 
 
 def _tell(answer: Mapping[str, Any], as_json: bool) -> None:
-    """Show an answer; exit 1 when it is no."""
+    """Show an answer; exit 1 when it is no, or as the answer says where something could not be read."""
     if as_json:
         click.echo(json.dumps(answer))
     elif answer["ok"]:
@@ -270,4 +270,4 @@ def _tell(answer: Mapping[str, Any], as_json: bool) -> None:
             told = more if isinstance(more, str) else f"{more['code']}: {more['text']}; {more['advice']}"
             click.echo(f"also: {told}", err=True)
     if not answer["ok"]:
-        click.get_current_context().exit(1)
+        click.get_current_context().exit(answer.get("exit_code", 1))

@@ -63,8 +63,14 @@ def _serve(path: Path, as_json: bool, script: Path | None, play: Path | None, tr
     entries = [] if script is None else fault_script.load(script, tuple(machine.axis))
     tell = _tell_json if as_json else _tell
     service = SimService(machine, tell, _load, panel_fd=_panel_descriptor(), faults=entries)
+
+    def stop(*_: object) -> None:
+        service.stop()
+        if not service.serving:
+            raise KeyboardInterrupt
+
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: service.stop())
+        signal.signal(number, stop)
     sys.setswitchinterval(0.0005)  # the SYNC must not wait 5 ms for the thread that serves the sensors
     gc.freeze()  # what is there now stays; the collector need not look at it between two SYNCs
     service.run(play, trace)

@@ -76,7 +76,9 @@ def read_users(path: Path) -> Mapping[str, User]:
     try:
         return Users.model_validate_json(raw).users
     except ValidationError:  # its message would show what stands in the file
-        raise _fault(path, "is no users file", "make it anew with fdhil web-user CONFIG NAME") from None
+        raise _fault(
+            path, "is no users file", "move it away, then make it anew with fdhil web-user CONFIG NAME"
+        ) from None
 
 
 def write_users(path: Path, users: Mapping[str, User]) -> None:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import errno
 import json
 import select
 import socket
@@ -170,7 +169,8 @@ class ControlServer:
         try:
             return await self._handle(request, peer)
         except FdhilError as error:
-            return refusal(type(error).__name__, str(error))
+            text, _, advice = str(error).partition("; ")
+            return refusal(type(error).__name__, text, advice) | {"exit_code": error.exit_code}
 
 
 def _hung_up(writer: asyncio.StreamWriter) -> bool:
@@ -216,10 +216,8 @@ def ask(
         text = f"did not answer within {timeout_s:.0f} s; see its log"
         raise DeviceTimeout("daemon", text) from None
     except OSError as error:
-        text = f"is not running ({path}: {error.strerror or error}); start it with `fdhil run CONFIG`"
-        if error.errno in (errno.EMFILE, errno.ENFILE):
-            text = f"was not asked ({error.strerror}); close other connections or files, then try again"
-        raise ConnectError("daemon", text) from None
+        absent = f"is not running ({path}: {error.strerror or error}); start it with `fdhil run CONFIG`"
+        raise ConnectError.of_socket("daemon", error, absent) from None
     if not line:
         raise ConnectError("daemon", "closed the connection without an answer; see its log")
     try:

@@ -240,14 +240,30 @@ def accept(place: Path, file: Path, by: str, may_loosen: bool) -> Judged:
 
 
 def reject(place: Path, file: Path, by: str, reason: str) -> Judged:
-    """Note who rejected an offer, and why; OfferRefused where it is none of a works that is trusted."""
+    """Note who rejected an offer, and why.
+
+    OfferRefused where it is none of a works that is trusted, or was accepted and is in force.
+    """
     with _alone(file):
         machine = present(file)
         judged = judge(place, machine)
         if judged.offer is None:
             raise OfferRefused(f"{place.name}: {judged.wrong}")
+        accepted = [each.by for each in judged.answers[-1:] if each.answer == "accepted"]
+        if accepted and _in_force(judged, judged.offer, machine):
+            way_back = f"put the values of before back first; they are in {kept_file(file, judged.offer)}"
+            text = f"{judged.offer} was accepted by {accepted[0]}, and what it changes is in force"
+            raise OfferRefused(f"{text}: it is not rejected; {way_back}")
         _note(judged, machine.config, "rejected", by, reason)
         return judged
+
+
+def _in_force(judged: Judged, offer: Offer, machine: Present) -> bool:
+    """Whether the configuration says already what an offer asks for, whether or not that is over by now."""
+    try:
+        return not _weighed(judged, offer, machine).changes
+    except OfferRefused:
+        return False
 
 
 def kept_file(file: Path, offer: Offer) -> Path:

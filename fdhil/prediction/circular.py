@@ -101,6 +101,6 @@ def circle_program(axes: tuple[str, str], radius_mm: float, feed_mm_min: float) 
     # seen along the normal axis, Z to X turns as G18 counts: there G2 and G3 change places
     turns = ("G3", "G2") if plane != "G18" else ("G2", "G3")
     towards = {"X": "I", "Y": "J", "Z": "K"}
-    centre = f"{towards[a]}{-radius_mm:g} {towards[b]}0"
-    arcs = [f"{turn} {a}{radius_mm:g} {b}0 {centre} P2 F{feed_mm_min:g}\nG4 P0.5" for turn in turns]
-    return "\n".join(["G21 G90 G94 G91.1", plane, f"G0 {a}{radius_mm:g} {b}0", "G4 P0.5", *arcs, "M2", ""])
+    centre = f"{towards[a]}{-radius_mm:.6f} {towards[b]}0"
+    arcs = [f"{turn} {a}{radius_mm:.6f} {b}0 {centre} P2 F{feed_mm_min:.6f}\nG4 P0.5" for turn in turns]
+    return "\n".join(["G21 G90 G94 G91.1", plane, f"G0 {a}{radius_mm:.6f} {b}0", "G4 P0.5", *arcs, "M2", ""])

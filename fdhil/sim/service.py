@@ -104,6 +104,7 @@ class SimService:
         self._line = b""
         self._stream: DemandStream | None = None
         self._streaming = False
+        self.serving = False  # until then what is to be played is read, which has no end where a pipe has none
         self._ending = False
         self._drive_time_s = 0.0
         self._wall_s = self._told_s = 0.0
@@ -236,6 +237,7 @@ class SimService:
                 self._stream = DemandStream(tuple(self.config.axis), self.config.machine.sync_period_s)
             demand = None if play is None or play == _STREAM else self._load(play, self.config)
             self._send(self.machine.power_on())
+            self.serving = True
             self._emit(self.ready_event())
             self._serve_panel()
             if trace is not None:

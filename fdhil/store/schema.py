@@ -143,6 +143,8 @@ def open_to_read(path: Path, checked: set[tuple[int, int]] | None = None) -> tup
     if not path.is_file():
         raise StoreError(f"{path} does not exist: nothing was recorded yet; run the daemon first", "NoHistory")
     place = path.stat()
+    if not place.st_size:
+        raise StoreError(f"{path} is empty: nothing was recorded yet; run the daemon first", "NoHistory")
     known = checked is not None and (place.st_dev, place.st_ino) in checked
     with told(path):
         # where no shared-memory file can be made only the latter opens; nowhere else, since it heeds no lock

@@ -44,9 +44,8 @@ class Daemon:
             text = f"did not answer within {timeout_s:.0f} s, what the machine does is unknown here; see its log"
             raise DeviceTimeout("daemon", text) from None
         except OSError as error:
-            reason = error.strerror or error
-            text = f"is not running or cannot be asked ({reason}); start it with fdhil run CONFIG"
-            raise ConnectError("daemon", text) from None
+            absent = f"is not running ({error.strerror or error}); start it with fdhil run CONFIG"
+            raise ConnectError.of_socket("daemon", error, absent) from None
 
     async def status(self) -> Mapping[str, Any]:
         """Return the status document, at most half a second old: many browsers ask the daemon no more than one does.

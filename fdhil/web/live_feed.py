@@ -151,5 +151,5 @@ def _cause(error: Exception) -> str:
     if isinstance(error, TimeoutError):
         return f"the daemon has said nothing for {SILENT_S:.0f} s; see its log"
     if isinstance(error, OSError):
-        return "the daemon is not running or may not be asked; start it with fdhil run CONFIG"
+        return str(ConnectError.of_socket("daemon", error, "is not running; start it with fdhil run CONFIG"))
     return "the daemon told what is not understood here; use one version of fdhil for both"

@@ -54,6 +54,17 @@ class Long:
     stream = SimpleNamespace(axes=("X",), program_digest="digest")
 
 
+def test_a_link_that_was_ended_makes_no_new_connection(guard: Guard, folder: Path) -> None:
+    """A look that was under way when the daemon ended would leave one that nobody closes."""
+    link = GuardLink(folder, folder)
+    link.refresh()
+    link.close()
+    assert link.refresh() == []
+    assert not link.connected
+    with pytest.raises(DeviceError, match="is not asked any more, since the daemon ends"):
+        link.disarm()
+
+
 def test_a_trip_that_another_request_saw_is_told_all_the_same(guard: Guard, folder: Path) -> None:
     link, long = GuardLink(folder, folder), Long()
     assert [notice.code for notice in link.refresh()] == ["GuardFound"]

@@ -34,6 +34,17 @@ def test_lists_the_lines_that_leave_the_tolerance(bench: Path, tolerance: float,
     assert ("line 3: F15000 -> F" in shown or "lines 2-3: F15000 -> F" in shown) == (lines > 0)
 
 
+def test_a_written_program_that_leaves_the_tolerance_is_no_yes(bench: Path) -> None:
+    """The correction would hold both lines; the file has the feeds without it, and none of them does."""
+    program, out = bench / "corner.ngc", bench / "slow.ngc"
+    program.write_text("G21 G90 G64\nG1 X0 Y30 F15000\nG1 X40\nM2\n")
+    arguments = ["advise", program, "--config", bench / "bench.toml", "--tolerance-um", 1]
+    assert invoke(*arguments).exit_code == 0
+    result = invoke(*arguments, "--out", out)
+    assert result.exit_code == 1
+    assert "2 of its lines leave the tolerance at every feed that was tried, without the correction" in result.stderr
+
+
 @pytest.fixture(scope="module")
 def wave(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a closed curve of 400 short lines."""

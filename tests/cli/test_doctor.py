@@ -6,6 +6,8 @@ import json
 import socket
 import sqlite3
 import stat
+import subprocess
+import sys
 import uuid
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,6 +25,7 @@ from fdhil.store.history import FILE_NAME, History
 from fdhil.store.rows import Stamp
 from tests.bench import bench_document
 from tests.drivers.peer import DrivePeer
+from tests.heeding_modes import HEEDING_MODES
 
 
 @pytest.fixture(autouse=True)
@@ -254,6 +257,30 @@ def test_what_could_be_better_comes_last_and_is_no_failure(pc: Pc, monkeypatch: 
     monkeypatch.setattr("os.getloadavg", lambda: (99.0, 99.0, 99.0))
     code, troubles = pc.examined("--offline")
     assert (code, [t["code"] for t in troubles]) == (0, ["BusyHost", "NotCommissioned"])
+
+
+def test_a_store_that_may_not_be_entered_is_told_and_the_rest_examined(pc: Pc) -> None:
+    pc.document["store"]["run_directory"] = str(pc.folder / "run")
+    History.open(pc.store).close()
+    command = [*HEEDING_MODES, sys.executable, "-m", "fdhil", "doctor", str(pc.write()), "--json", "--offline"]
+    pc.store.chmod(0)
+    try:
+        done = subprocess.run(command, capture_output=True, text=True)
+    finally:
+        pc.store.chmod(0o700)
+    assert (done.returncode, done.stderr) == (1, "")
+    troubles = json.loads(done.stdout)["troubles"]
+    assert {"StoreReadOnly", "NotSeen"} <= {trouble["code"] for trouble in troubles}
+    assert any(str(pc.store) in trouble["what"] and "sudo" in trouble["mend"] for trouble in troubles)
+
+
+def test_offline_leaves_the_hub_in_peace(pc: Pc) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as hub:
+        pc.bus = {"interface": "socketcand", "port": hub.getsockname()[1]}
+        pc.examined("--offline")
+        hub.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            hub.accept()
 
 
 def test_it_reads_well(pc: Pc) -> None:

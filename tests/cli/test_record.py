@@ -76,6 +76,7 @@ def test_without_a_motion_there_is_nothing_to_write(twin: tuple[TwinProcess, Pat
     recording.process.send_signal(signal.SIGINT)
     code, document = recording.end()
     assert (code, document["rows"], document["file"]) == (1, 0, None)
+    assert document["doubts"] == ["nothing moved; start the program on the NC while the recording waits"]
     assert not out.exists()
 
 

@@ -24,6 +24,7 @@ from fdhil.records import Notice
 from fdhil.report.parameter_view import cell, half_of
 from tests.daemon.machine import config_of
 from tests.daemon.shop import BENCH, fdhil
+from tests.heeding_modes import HEEDING_MODES
 from tests.held_port import held_port
 from tests.store.made import outcome, published
 
@@ -180,6 +181,27 @@ def test_without_a_daemon_it_is_3_and_how_to_start_one(command: str, machine: Pa
     code, out, err = fdhil(command, machine, capsys=capsys)
     assert (code, out) == (3, "")
     assert "fdhil run CONFIG" in err
+
+
+def test_a_daemon_that_may_not_be_asked_is_not_told_to_be_away(machine: Path) -> None:
+    """Who was told to start it would start another one."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as server:
+        place = machine.parent / "fdhil-data" / "run" / "daemon.sock"
+        server.bind(str(place))
+        server.listen()
+        place.chmod(0)
+        command = [*HEEDING_MODES, sys.executable, "-m", "fdhil", "status", str(machine)]
+        done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (3, "")
+    assert "daemon: may not be asked by this user (Permission denied), so that whether it runs is not" in done.stderr
+    assert "start it" not in done.stderr
+
+
+def test_a_program_that_the_daemon_cannot_read_is_3(machine: Path, tmp_path: Path, capsys: Any) -> None:
+    answer = {"ok": False, "code": "ProgramError", "text": "line 1: G77 is not known", "advice": "correct it"}
+    with answering(machine, {**answer, "exit_code": 3}):
+        code, out, err = fdhil("arm", machine, tmp_path / "p.ngc", capsys=capsys)
+    assert (code, out, err) == (3, "", "refused: ProgramError: line 1: G77 is not known; correct it\n")
 
 
 def test_a_wrong_method_or_config_is_2(machine: Path, tmp_path: Path, capsys: Any) -> None:

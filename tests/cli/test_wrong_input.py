@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import inspect
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from fdhil.cli.main import cli, leaves
 from fdhil.sim.wire.hub import Hub
 from tests.daemon.shop import fdhil
 from tests.sim.hub_thread import HubThread
@@ -47,6 +50,68 @@ def test_an_output_that_takes_nothing_is_no_traceback(sink: str, tmp_path: Path)
     assert "Exception ignored" not in done.stderr
     assert done.returncode == (3 if sink == "> /dev/full" else 0)
     assert done.stderr.count("\n") == (sink == "> /dev/full")
+
+
+def unread(*arguments: str | Path) -> int:
+    """Run fdhil with a standard output that nobody reads any more; return the exit code."""
+    read, write = os.pipe()
+    os.close(read)
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", "fdhil", *map(str, arguments)], stdout=write, stderr=subprocess.PIPE
+        )
+    finally:
+        os.close(write)
+    assert b"Traceback" not in done.stderr, done.stderr
+    return done.returncode
+
+
+@pytest.mark.parametrize("form", [(), ("--json",)], ids=["text", "json"])
+def test_an_answer_that_nobody_took_is_no_yes(form: tuple[str, ...], tmp_path: Path) -> None:
+    """Neither where fdhil writes itself, nor where a library draws the table, which tells it in another way."""
+    config, program, out = write_config(tmp_path), tmp_path / "part.ngc", tmp_path / "page.html"
+    program.write_text("G21 G90\nG1 X1 F1000\nM2\n")
+    for command in (
+        ("doctor", config, "--offline"),
+        ("audit", config),
+        ("correct", program, "--config", config),
+        ("advise", program, "--config", config, "--tolerance-um", "1"),
+        ("acceptance", config, "--by", "somebody", "--out", out),
+    ):
+        assert unread(*command, *form) == 3, command
+    assert unread("interpret", program, *form) == 0
+
+
+def test_every_command_that_answers_no_by_its_exit_code_is_marked_so() -> None:
+    """A command that returns a number, or ends with one, is a verdict: that its answer was not read is told by 3."""
+    for name, command in leaves(cli):
+        assert command.callback is not None
+        body = inspect.getsource(inspect.unwrap(command.callback))
+        marked = Path(command.callback.__code__.co_filename).name == "failing.py" or "@verdict" in body
+        answers = inspect.signature(command.callback).return_annotation == "int" or "exit(1)" in body
+        assert marked or not answers, name
+
+
+def test_a_shell_that_has_no_completion_is_no_success() -> None:
+    for shell, code in (("bash", 0), ("foo", 1)):
+        asked = os.environ | {"_FDHIL_COMPLETE": f"{shell}_source"}
+        assert (
+            subprocess.run([Path(sys.executable).with_name("fdhil")], env=asked, stdout=subprocess.DEVNULL).returncode
+            == code
+        )
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("acceptance", "machine.toml", "--by"), ("interpret",), ("history", "machine.toml", "--json", "--axis")],
+)
+def test_bytes_that_are_no_text_are_told(arguments: tuple[str, ...], tmp_path: Path) -> None:
+    write_config(tmp_path)
+    command = [sys.executable, "-m", "fdhil", *arguments, os.fsdecode(b"caf\xe9")]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    assert done.returncode == 2
+    assert "'caf\\udce9' is no text" in (json.loads(done.stdout)["error"]["text"] if done.stdout else done.stderr)
+    assert "Traceback" not in done.stderr
 
 
 def said_by_shell(command: str, redirected: str) -> tuple[int, str]:

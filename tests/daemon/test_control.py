@@ -25,7 +25,7 @@ from fdhil.daemon.journal import BURST, FloodGate, line_of, printable
 from fdhil.daemon.lock import BusLocked, sole_owner
 from fdhil.daemon.notify import notify
 from fdhil.daemon.peers import Peer
-from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
+from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProgramError
 from fdhil.guard.peers import Role
 from fdhil.records import Notice, Skill
 from tests.store.made import outcome, published
@@ -43,6 +43,27 @@ def listener(tmp_path: Path) -> Iterator[socket.socket]:
 def test_no_daemon_is_one_sentence_with_the_next_action(tmp_path: Path) -> None:
     with pytest.raises(ConnectError, match=r"is not running .*start it with `fdhil run CONFIG`"):
         ask(tmp_path / "absent", {"request": "status"})
+
+
+@pytest.mark.parametrize("code", [errno.EACCES, errno.EPERM])
+def test_a_socket_that_may_not_be_used_is_no_daemon_that_is_away(code: int) -> None:
+    """Who was told to start it would start a second one."""
+    denied = OSError(code, os.strerror(code))
+    told = str(ConnectError.of_socket("daemon", denied, "is not running; start it"))
+    assert told.startswith(f"daemon: may not be asked by this user ({os.strerror(code)}), so that whether it runs")
+    assert "start it" not in told
+
+
+async def test_what_could_not_be_read_is_told_with_its_exit_code(tmp_path: Path) -> None:
+    """It is no refusal: a program that is none is trouble."""
+
+    async def handle(request: Mapping[str, Any], peer: Peer) -> Mapping[str, Any]:
+        raise ProgramError(3, "G77", "is no G code; correct the program")
+
+    async with ControlServer(handle, lambda: None, lambda: None, Access()).serving(tmp_path / "c"):
+        answer = await asyncio.to_thread(ask, tmp_path / "c", {"request": "arm"})
+    assert (answer["ok"], answer["code"], answer["exit_code"]) == (False, "ProgramError", 3)
+    assert answer["advice"] == "correct the program"
 
 
 def test_a_daemon_that_does_not_answer_is_a_timeout(tmp_path: Path, listener: socket.socket) -> None:

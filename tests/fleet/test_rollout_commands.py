@@ -77,8 +77,9 @@ def test_from_the_works_to_a_machine_by_hand(works: Works, file: Path, capsys: A
 
 
 def test_who_accepted_what_is_in_the_audit(works: Works, file: Path, capsys: Any) -> None:
-    store = lay(works, file).store.directory
+    store, before = lay(works, file).store.directory, file.read_bytes()
     assert fdhil("offers", "accept", file, "friction", "--by", "Bert", capsys=capsys)[0] == 0
+    file.write_bytes(before)
     assert fdhil("offers", "reject", file, "friction", "--by", "Bert\x1b[2J", "--reason", "no", capsys=capsys)[0] == 0
     told = [{key: entry.get(key) for key in ("by", "asked", "answered", "offer", "result")} for entry, _ in
             audit.entries(store)]  # fmt: skip

@@ -188,6 +188,21 @@ def test_a_rejected_offer_changes_nothing_and_may_be_accepted_later(works: Works
     assert [each.answer for each in read_answers(store)] == ["rejected", "accepted"]
 
 
+def test_what_was_accepted_and_is_in_force_is_not_rejected(works: Works, file: Path) -> None:
+    """Nor when it is over by now; who has put the old values back may say so."""
+    before = file.read_bytes()
+    done = accept(works.carried(), file, "Bert", may_loosen=False)
+    for expires_s in (NOW + 3600, NOW - 1):
+        with pytest.raises(OfferRefused, match=r"accepted by Bert, and .* in force: it is not rejected; put .* before"):
+            reject(works.carried(expires_s=expires_s), file, "Anna", "no")
+    assert done.offer is not None
+    file.write_bytes(kept_file(file, done.offer).read_bytes())
+    assert file.read_bytes() == before
+    reject(works.carried(), file, "Anna", "it was worse")
+    answers = read_answers(present(file).config.store.directory)
+    assert [each.answer for each in answers] == ["accepted", "rejected"]
+
+
 def test_who_is_not_trusted_is_not_answered(works: Works, file: Path) -> None:
     place = works.carried()
     place.write_bytes(place.read_bytes().replace(b"0.061", b"0.062"))

@@ -85,6 +85,13 @@ def test_another_radius_is_refused() -> None:
         evaluate(runs(always(0.0), always(0.0)), 20.0)
 
 
+def test_the_program_has_the_numbers_that_were_asked_for() -> None:
+    """G code knows no exponents, and a circle of 50.12345 mm is none of 50.1234 mm."""
+    program = circle_program(("X", "Y"), 50.123456, 1_000_000.0)
+    assert "G3 X50.123456 Y0 I-50.123456 J0 P2 F1000000.000000" in program
+    assert "e" not in circle_program(("X", "Y"), 0.1, 0.00001)
+
+
 @pytest.mark.parametrize("plane", [("X", "Y"), ("X", "Z"), ("Y", "Z")])
 def test_the_program_runs_the_circle_first_counter_clockwise(plane: tuple[str, str], tmp_path: Path) -> None:
     """As the plane's axes count, in each plane, twice around in both directions."""

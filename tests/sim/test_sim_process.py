@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import struct
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -219,6 +221,36 @@ def test_lockstep_waits_for_a_client_whose_offset_is_zero_while_a_program_runs(t
         while not twin.happened("finished"):
             answer(bus, 0.0)
         assert twin.events[-1]["late_rpdo"] == {"X": 0, "Y": 0}
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_pipe_that_nobody_writes_to_can_be_left(number: signal.Signals, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.csv")
+    command = [
+        sys.executable,
+        "-m",
+        "fdhil",
+        "sim",
+        str(write_config(tmp_path)),
+        "--demand",
+        str(tmp_path / "pipe.csv"),
+    ]
+    with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        while not _catches(process.pid, signal.SIGTERM):
+            assert process.poll() is None
+            time.sleep(0.01)
+        time.sleep(0.2)  # it waits for the pipe by now; were it not so far, it would end all the same
+        process.send_signal(number)
+        assert process.wait(PATIENCE_S) == 130
+        assert process.stderr is not None
+        assert process.stderr.read().strip() == b"fdhil: stopped by the operator"
+
+
+def _catches(pid: int, number: signal.Signals) -> bool:
+    """Whether a process has set a handler of its own for a signal, by what the kernel says."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    caught = next(line for line in status.splitlines() if line.startswith("SigCgt"))
+    return bool(int(caught.split()[1], 16) >> (number - 1) & 1)
 
 
 def answer(bus: can.BusABC, gain: float = 1.0) -> None:

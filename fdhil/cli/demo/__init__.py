@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 )
 @click.option("--pdf", is_flag=True, help="Print the report as report.pdf too (needs chromium).")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of tables.")
-def demo(out: Path, realtime: bool, pdf: bool, as_json: bool) -> int:
+def demo(out: Path, realtime: bool, pdf: bool, as_json: bool) -> None:
     """Run the whole loop on the simulated machine: no hardware, no root, under a minute.
 
     Starts the twin (drives, sensors, NC), the guard and the daemon; commissions the drives; shuttles the axes and
@@ -53,7 +53,6 @@ def demo(out: Path, realtime: bool, pdf: bool, as_json: bool) -> int:
         click.echo(json.dumps({**_document(loop, report), "realistic": _realistic(realistic)}))
     else:
         _tables(loop, realistic, report)
-    return 0
 
 
 def _parameters(found: Published, truth: Parameters) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -52,21 +52,31 @@ def _in_order(config: MachineConfig, offline: bool) -> Iterator[Trouble]:
     """Examine from the cause to what depends on it: this PC, its interfaces, the devices behind them, the guard."""
     from fdhil.cli.doctor import computer, devices, offers, storage, uplink  # late: --help imports nothing heavy
 
-    yield from storage.examine_store(config)
-    yield from computer.examine_clock(newest_record_s(config.store.directory))
+    yield from _seen("store", lambda: storage.examine_store(config))
+    yield from _seen("clock", lambda: computer.examine_clock(newest_record_s(config.store.directory)))
     yield from computer.examine_processors()
-    secrets = list(storage.examine_secrets(config))
+    secrets = list(_seen("sockets", lambda: storage.examine_secrets(config)))
     yield from secrets
-    buses = computer.examine_buses(config)
+    buses = computer.examine_buses(config, offline)
     for troubles in buses.values():
         yield from troubles
     if not offline:
         heard = {name for name, troubles in buses.items() if not any(trouble.grave for trouble in troubles)}
         recorded = {trouble.place for trouble in secrets if trouble.code == storage.RECORD_BAD}
         yield from devices.examine_devices(config, heard, recorded, _progress)
-    yield from devices.examine_guard(config)
-    yield from uplink.examine_uplink(config, offline)
-    yield from offers.examine_offers(config)
+    yield from _seen("guard", lambda: devices.examine_guard(config))
+    yield from _seen("uplink", lambda: uplink.examine_uplink(config, offline))
+    yield from _seen("offers", lambda: offers.examine_offers(config))
+
+
+def _seen(place: str, examine: Callable[[], Iterator[Trouble]]) -> Iterator[Trouble]:
+    """Yield what an examination finds, and where this user may not look, that."""
+    try:
+        yield from examine()
+    except PermissionError as error:
+        what = f"{error.filename or place} may not be looked at by this user"
+        means = f"what may be wrong with the {place} is not known"
+        yield Trouble("NotSeen", place, what, means, "run fdhil doctor as the user of the daemon, or with sudo")
 
 
 def _progress(text: str) -> None:

@@ -31,24 +31,29 @@ BAD_STATES: Mapping[str, tuple[str, str]] = {
 }
 
 
-def examine_buses(config: MachineConfig) -> dict[str, list[Trouble]]:
-    """Return what keeps each CAN bus that an axis uses from being heard, as far as this PC knows."""
+def examine_buses(config: MachineConfig, offline: bool) -> dict[str, list[Trouble]]:
+    """Return what keeps each CAN bus that an axis uses from being heard, as far as this PC knows.
+
+    ``offline`` asks no hub of CAN frames whether it is there: a bus would have one more listener.
+    """
     used = dict.fromkeys(axis.drive.bus for axis in config.axis.values())
-    return {name: list(_bus(f"bus {name}", config.bus[name])) for name in used}
+    return {name: list(_bus(f"bus {name}", config.bus[name], offline)) for name in used}
 
 
-def _bus(place: str, bus: CanBus) -> Iterator[Trouble]:
+def _bus(place: str, bus: CanBus, offline: bool) -> Iterator[Trouble]:
     if bus.interface == "socketcand":
-        yield from _hub(place, bus)
+        yield from _hub(place, bus, offline)
     elif bus.interface == "socketcan":
         yield from _interface(place, bus)
 
 
-def _hub(place: str, bus: CanBus) -> Iterator[Trouble]:
+def _hub(place: str, bus: CanBus, offline: bool) -> Iterator[Trouble]:
     means = "no drive can be heard"
     if bus.port == 0:
         what = "the config gives no port of the CAN hub"
         yield Trouble("NoPort", place, what, means, "write the port that the hub or `fdhil sim` prints")
+        return
+    if offline:
         return
     try:
         with socket.create_connection((bus.host, bus.port), HUB_S):

@@ -27,7 +27,7 @@ RUNS = 50
               help="Noisy recordings behind each error of an estimator.")  # fmt: skip
 @click.option("--pdf", is_flag=True, help="Print the page as paper.pdf, too (needs chromium).")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of a table.")
-def paper(out: Path, runs: int, pdf: bool, as_json: bool) -> int:
+def paper(out: Path, runs: int, pdf: bool, as_json: bool) -> None:
     """Reproduce the paper that fdhil goes back to, claim by claim.
 
     Each claim is put to trials in simulated scenarios, which are configs/paper.toml with a few keys changed: it holds,
@@ -53,7 +53,6 @@ def paper(out: Path, runs: int, pdf: bool, as_json: bool) -> int:
         click.echo(json.dumps(told))
     else:
         _table(claims, out / "paper.html")
-    return 0
 
 
 def gather(runs: int, say: Callable[[str], object]) -> list[Claim]:

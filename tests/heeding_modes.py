@@ -1,0 +1,11 @@
+"""A command before a command: what it runs heeds the modes of files, also where root runs the tests."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+
+_LACKS = "-dac_override,-dac_read_search"
+HEEDING_MODES: Sequence[str] = (
+    ("setpriv", f"--bounding-set={_LACKS}", f"--inh-caps={_LACKS}") if os.geteuid() == 0 else ()
+)
