@@ -32,6 +32,7 @@ INF = float("inf")
 NEVER = 1 << 30
 INTERVALS = 32
 FOREIGN_CYCLES = 3
+FED = frozenset({Object.VELOCITY_OFFSET, Object.TORQUE_OFFSET})
 _NEEDED = frozenset({Object.STATUSWORD, Object.POSITION_ACTUAL, Object.MODE_DISPLAY})
 PDO_SET_UP = range(0x1400, 0x1C00)
 # what a commissioning record relies on besides: its options, the scale, the cycle, and "restore the defaults"
@@ -177,9 +178,9 @@ class Listener:
         """Any master's write to the drive (CiA 301 7.2.4, initiate download, plain or block): it may be another now."""
         if len(data) < 4 or not (data[0] >> 5 == 1 or data[0] & 0xE1 == 0xC0):
             return
-        index, name = first_axis_index(int.from_bytes(data[1:3], "little")), self.settings.axes[axis].name
-        if index == Object.POSITION_OFFSET:
-            self._alarm(Alarm("OffsetHijack", name, f"by SDO, {data.hex()}"))
+        index, of = first_axis_index(int.from_bytes(data[1:3], "little")), self.settings.axes[axis]
+        if index == Object.POSITION_OFFSET or (of.feedforward is not None and index in FED):
+            self._alarm(Alarm("OffsetHijack", of.name, f"by SDO, {data.hex()}"))
         elif index in SET_UP or index in PDO_SET_UP:
             self._nodes[axis].touched += 1
 

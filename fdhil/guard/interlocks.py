@@ -105,7 +105,11 @@ CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
     ),
     # other nodes
     "ForeignProducer": (_R, "two nodes send as this drive or NC", "find and remove the second node"),
-    "OffsetHijack": (_R, "another node sends our offset COB-ID", "hold the feed, find and remove that node"),
+    "OffsetHijack": (
+        _R,
+        "another node sends our offset COB-ID, or writes the offset by SDO",
+        "hold the feed, find and remove that node",
+    ),
     "BusLocked": (_R, "another guard's heartbeat is on the bus", "stop the other guard"),
     # the path
     "Misaligned": (_H, "the targets differ from the table's path", "plan the correction for the program that runs"),

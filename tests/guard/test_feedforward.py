@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+import struct
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
@@ -123,6 +124,25 @@ def test_a_fault_fades_it_out(what: str) -> None:
     cause = bench.state.feed.cause
     assert cause is not None
     assert cause.code == {"fault": "DriveNotEnabled", "daemon": "MainLost", "target": "TargetLost"}[what]
+
+
+@pytest.mark.fault("A19")
+@pytest.mark.parametrize("index", [0x60B1, 0x60B2])
+def test_another_masters_write_fades_it_out(index: int) -> None:
+    """By SDO, to an object that the guard sends; in a drive that is not fed it is of no concern here."""
+    write = struct.pack("<BHBi", 0x23, index, 0, 300)
+    bench = switched_on()
+    bench.inject(0x601, write)
+    bench.run(140)
+    assert bench.state.feed.mode is FeedMode.OFF
+    cause = bench.state.feed.cause
+    assert cause is not None
+    assert (cause.code, cause.axis) == ("OffsetHijack", "X")
+    other = machine.bench()
+    other.settle()
+    other.inject(0x601, write)
+    other.run(3)
+    assert other.alarms == []
 
 
 def test_a_lost_target_is_bridged() -> None:
