@@ -67,7 +67,7 @@ class Guard:
         self._last_sync_s = time.monotonic()
         self._stepped_s = 0.0
         self._rested_s = 0.0
-        self._silent = True
+        self._silent, self._put_off = True, False
         self._stopping = False
         self._lost_seen = 0
         self._restore_s = 0.0
@@ -190,14 +190,17 @@ class Guard:
             self._journal.write("bus_restored", text="the CAN bus is back; hold the feed, then adopt what is applied")
 
     def _sync(self, data: bytes, stamp_s: float, now_s: float, late: bool) -> None:
-        self._last_sync_s, self._silent = now_s, False
+        self._last_sync_s, self._silent, self._put_off = now_s, False, False
         axes, bus = self._listener.at_sync(data, stamp_s, now_s)
         self._advance(Inputs(True, axes, bus), late, now_s)
 
     def _local_timer(self) -> None:
         """Without SYNC for too long the core steps on the wall clock: it freezes, or ramps an event-driven RPDO."""
         now_s = time.monotonic()
-        if now_s - self._last_sync_s <= self.settings.silence_s or self._frames_wait():
+        if now_s - self._last_sync_s <= self.settings.silence_s:
+            return
+        if not self._put_off and self._frames_wait():
+            self._put_off = True  # once: whoever babbles does not hide that no SYNC was among what had waited
             return
         if not self._silent:
             self._silent = True

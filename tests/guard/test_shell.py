@@ -18,6 +18,7 @@ import pytest
 
 from fdhil.errors import DeviceError
 from fdhil.guard import intake, process, table
+from fdhil.guard.can_socket import Frame
 from fdhil.guard.control import MAX_CLIENTS, MAX_LINE_BYTES, Client, Closer, Control
 from fdhil.guard.journal import Journal, Notifier
 from fdhil.guard.landing import land
@@ -346,6 +347,27 @@ def test_without_sync_it_steps_by_the_local_timer_and_hears_frames_first(make: M
     client.send(b'{"request": "status"}\n')
     status = shop.answer(client, syncing=False)
     assert (status["sync_heard"], status["not_good"][0]["code"]) == (False, "SyncLost")
+
+
+def test_a_node_that_babbles_does_not_hide_that_no_sync_comes(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There is another frame of it whenever the guard looks whether some wait; before, that put the step off."""
+    shop = make()
+    shop.into_the_cut()
+    heard = shop.wire.receive
+
+    def babbling() -> list[Frame]:
+        frames = heard()
+        shop.wire.feed([(0x701, b"\x05", 0.0)])
+        return frames
+
+    monkeypatch.setattr(shop.wire, "receive", babbling)
+    shop.wire.feed([])
+    shop.guard._last_sync_s -= 10.0
+    shop.turn()
+    assert shop.state == "ACTIVE"  # what had waited is read first
+    for _ in range(2000):  # a step takes a SYNC period of time
+        shop.turn()
+    assert shop.state == "FROZEN"
 
 
 def test_of_two_sync_at_once_the_first_is_late(make: Make) -> None:
