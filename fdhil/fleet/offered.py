@@ -112,10 +112,12 @@ def _newest(config: MachineConfig) -> Mapping[str, int]:
 def _content(place: Path) -> bytes:
     """Return what stands in a file, one byte more than an offer has at most; OfferRefused where it is no file."""
     descriptor = os.open(place, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe would be waited for
-    with os.fdopen(descriptor, "rb") as file:
+    try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             raise OfferRefused("it is no file; have it written again")
-        return file.read(LARGEST + 1)
+        return os.read(descriptor, LARGEST + 1)
+    finally:
+        os.close(descriptor)
 
 
 def judge(place: Path, machine: Present) -> Judged:

@@ -126,13 +126,15 @@ class Interpreter:
     def _count(self, raw: str, line: int) -> None:
         self._blocks += 1
         if self._blocks > self._budget.max_blocks:
-            what = f"more than {self._budget.max_blocks} blocks were executed; raise max_blocks if they are meant"
+            what = f"more than {self._budget.max_blocks} blocks were executed; if they are meant,"
+            what += " raise max_blocks ([nc], or --max-blocks)"
             raise GcodeBudget(line, raw.strip()[:24], what)
         if self._flow.repeating:
             self._again += 1
             if self._again > self._budget.max_repeated_blocks:
                 what = f"more than {self._budget.max_repeated_blocks} blocks were executed again; is a loop endless?"
-                raise GcodeBudget(line, raw.strip()[:24], f"{what} If not, raise max_repeated_blocks")
+                what += " If not, raise max_repeated_blocks ([nc], or --max-repeated-blocks)"
+                raise GcodeBudget(line, raw.strip()[:24], what)
 
     def _state(self) -> object:
         """Return a copy of all that the program has changed so far but its place."""

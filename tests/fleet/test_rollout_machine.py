@@ -141,6 +141,7 @@ def test_an_older_version_never_follows_a_newer_one(works: Works, file: Path) ->
     os.mkfifo(lie / file_name("friction", 7))
     assert "offered version 5 in its place" in judged(works, file, version=4).wrong
     assert judge(lie / file_name("friction", 7), present(file)).wrong == "it is no file; have it written again"
+    assert judge(lie, present(file)).wrong == "it is no file; have it written again"
 
 
 def test_a_loosened_limit_is_named_and_asked_for(works: Works, file: Path) -> None:

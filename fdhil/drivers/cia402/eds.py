@@ -58,13 +58,13 @@ class _Section:
 def load_eds(path: Path, node_id: int | None = None) -> ObjectDictionary:
     """Read an EDS or DCF file; ``node_id`` resolves $NODEID. EdsError when it cannot be read or is no EDS."""
     if path.exists() and not path.is_file() and not path.is_dir():  # a pipe would be waited for without end
-        raise EdsError(path.name, "it is no plain file; check the path")
+        raise EdsError(str(path), "it is no plain file; check the path")
     try:
         with path.open("rb") as file:
             raw = file.read(MAX_BYTES + 1)
     except OSError as error:
-        raise EdsError(path.name, f"it cannot be read ({error.strerror}); check the path") from None
-    return parse_eds(raw, path.name, node_id)
+        raise EdsError(str(path), f"it cannot be read ({error.strerror}); check the path") from None
+    return parse_eds(raw, str(path), node_id)
 
 
 def parse_eds(raw: bytes, name: str, node_id: int | None = None) -> ObjectDictionary:
