@@ -17,7 +17,6 @@ NEEDS: Mapping[str, Mapping[str, float]] = {
     "correct": {"fdhil.correction.kernels": 10},
     "identify": {
         "fdhil.identification.kalman": 12,
-        "fdhil.identification.between": 2,
         "fdhil.model.feed_drive": 2,
     },
 }
