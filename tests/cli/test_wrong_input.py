@@ -107,10 +107,10 @@ def test_a_shell_that_has_no_completion_is_no_success() -> None:
 )
 def test_bytes_that_are_no_text_are_told(arguments: tuple[str, ...], tmp_path: Path) -> None:
     write_config(tmp_path)
-    command = [sys.executable, "-m", "fdhil", *arguments, os.fsdecode(b"caf\xe9")]
+    command = [sys.executable, "-m", "fdhil", *arguments, os.fsdecode(b"k\xe4se")]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100)
     assert done.returncode == 2
-    assert "'caf\\udce9' is no text" in (json.loads(done.stdout)["error"]["text"] if done.stdout else done.stderr)
+    assert "'k\\udce4se' is no text" in (json.loads(done.stdout)["error"]["text"] if done.stdout else done.stderr)
     assert "Traceback" not in done.stderr
 
 
