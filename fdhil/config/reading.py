@@ -112,10 +112,15 @@ def parse(
 
 def load_as(whole: type[S], path: Path, what: str) -> S:
     """Read another file than a machine's, whose tables are those of ``whole``; ConfigError with every fault."""
+    return checked_as(whole, read_toml(path, what), str(path))
+
+
+def checked_as(whole: type[S], tables: Mapping[str, Any], source: str) -> S:
+    """Check the tables of another file than a machine's, as ``load_as`` does; ConfigError with every fault."""
     try:
-        return whole.model_validate(read_toml(path, what))
+        return whole.model_validate(tables)
     except ValidationError as error:
-        raise ConfigError(str(path), _faults(error, whole=whole)) from None
+        raise ConfigError(source, _faults(error, whole=whole)) from None
 
 
 def unlikely(config: MachineConfig) -> list[str]:

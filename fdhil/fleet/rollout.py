@@ -18,7 +18,7 @@ from psycopg.rows import DictRow, dict_row
 from pydantic import Field
 
 from fdhil.config.fleet import Fleet
-from fdhil.config.reading import checked, read_toml
+from fdhil.config.reading import checked, checked_as, load_as
 from fdhil.config.section import Section
 from fdhil.config.uplink import Label, Labels
 from fdhil.errors import ConfigError, ConfigFault, ConnectError
@@ -108,8 +108,8 @@ class Standing:
 
 def read_change(path: Path) -> tuple[Change, int]:
     """Return the change that a file says, and how many days it is valid; ConfigError."""
-    file = checked(ChangeFile, read_toml(path, "a change to offer"), str(path))
-    return checked(Change, file.change, str(path)), file.valid_days
+    file = load_as(ChangeFile, path, "a change to offer")
+    return checked_as(Change, file.change, str(path)), file.valid_days
 
 
 def offer_of(change: Change, days: int, by: str, stage: int, machines: Sequence[str]) -> Offer:
