@@ -141,7 +141,8 @@ def test_eds_files_are_read_and_others_are_left(tmp_path: Path) -> None:
     (tmp_path / "readme.txt").write_text("nothing")
     found, faults = read_descriptions([tmp_path])
     assert [(d.path.name, d.fits(WHO)) for d in found] == [("good.eds", "exact")]
-    assert [str(fault) for fault in faults] == ["bad.dcf: line 1: it has no object at all; this is no EDS file"]
+    text = f"{tmp_path}/bad.dcf: line 1: it has no object at all; this is no EDS file"
+    assert [str(fault) for fault in faults] == [text]
 
 
 @pytest.mark.parametrize("text", [b"\x1b]0;owned\x07", b"a\rb\nc", b"\xff\xfe", b"x" * 500])
