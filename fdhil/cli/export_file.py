@@ -28,10 +28,10 @@ def export_file(recording: Path, out: Path, format_name: str | None, columns: Pa
     if is_log:
         from fdhil.drivers.can.bus_log import converted_log
 
-        content, frames = converted_log(recording, suffixes.suffix_of(suffixes.BUS_LOGS, name))
+        log = converted_log(recording, suffixes.BUS_LOGS[recording.suffix.lower()], name)
         with open_output(out) as file:
-            file.write(content)
-        return {"format": name, "frames": frames}
+            file.write(log.content)
+        return {"format": name} | log.report()
     table = read_table(recording, None if columns is None else read_column_map(columns))
     export_table(table, out, name)
     return {"format": name, "axis": table.headers.get("axis"), "rows": next(iter(table.columns.values())).size}

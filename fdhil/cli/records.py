@@ -169,6 +169,9 @@ def export(recording: Path, out: Path, format_name: str | None, columns: Path | 
     from fdhil.cli.export_file import export_file
 
     told = export_file(recording, out, format_name, columns)
+    for what, happened in (("left_out", "not in"), ("reduced", "lost in")):
+        for kind, count in told.get(what, {}).items():
+            click.echo(f"{count} {kind}: {happened} {out}", err=True)
     if as_json:
         click.echo(json.dumps({"schema": "fdhil-export-1", "recording": str(recording), "file": str(out)} | told))
 

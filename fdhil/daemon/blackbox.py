@@ -5,8 +5,10 @@ Files are numbered: which one is the newest does not hang on the wall clock.
 
 from __future__ import annotations
 
+import heapq
+import io
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -57,7 +59,7 @@ def dump(store: Path, code: str, frames: Callable[[], Mapping[str, str]]) -> Not
         before = kept(store)
         number = max((box.number for box in before), default=0) + 1
         file = folder / f"{number:06d}-{datetime.now(UTC).strftime(_TIME)}-{code}.log"
-        write_file(file, "".join(logs.values()).encode("ascii"))
+        write_file(file, _in_order(logs.values()).encode("ascii"))
         for old in before[: max(0, len(before) + 1 - KEPT_FILES)]:
             old.path.unlink()
     except (OSError, StoreError) as error:
@@ -65,3 +67,10 @@ def dump(store: Path, code: str, frames: Callable[[], Mapping[str, str]]) -> Not
         return Notice(trouble.code, "minor", f"the frames around the trip are not kept: {trouble}")
     lines = sum(log.count("\n") for log in logs.values())
     return Notice("BlackBox", "info", f"the last {lines} frames are in {file}")
+
+
+def _in_order(logs: Iterable[str]) -> str:
+    """Return the lines of several buses as ``candump -l`` writes them: in one order of time."""
+    merged = io.StringIO()  # not a list: a flood has hundreds of thousands of lines
+    merged.writelines(heapq.merge(*map(io.StringIO, logs), key=lambda line: float(line[1 : line.index(")")])))
+    return merged.getvalue()

@@ -10,7 +10,7 @@ import pytest
 from fdhil.arming.guard_link import TRIPPED, _changes
 from fdhil.daemon import blackbox
 from fdhil.drivers.can.frame_history import FrameHistory, candump
-from fdhil.drivers.can.frames import ERROR_FLAG, frames_of
+from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, frames_of
 
 
 def status(state: str, code: str = "") -> dict[str, Any]:
@@ -66,13 +66,33 @@ def test_a_history_keeps_ten_seconds_and_no_more() -> None:
 
 def test_the_log_is_candumps() -> None:
     frames = frames_of(
-        [(1_500_000_250, 0x080, b""), (2_000_001_000, 0x301, b"\x01\xff"), (3, ERROR_FLAG | 0x40, bytes(8))]
+        [
+            (1_500_000_250, 0x080, b""),
+            (2_000_001_000, 0x301, b"\x01\xff"),
+            (3, ERROR_FLAG | 0x40, bytes(8)),
+            (4_000, REMOTE_FLAG | 0x701, b""),
+            (5_000, REMOTE_FLAG | 0x601, bytes(8)),
+            (6_000, EXTENDED_FLAG | 0x123, b"\x01"),
+            (7_000, EXTENDED_FLAG | REMOTE_FLAG | 0x18FF1234, bytes(2)),
+        ]
     )
     assert candump("can0", frames).splitlines() == [
         "(1.500000) can0 080#",
         "(2.000001) can0 301#01FF",
         "(0.000000) can0 20000040#0000000000000000",
+        "(0.000004) can0 701#R",
+        "(0.000005) can0 601#R8",
+        "(0.000006) can0 00000123#01",
+        "(0.000007) can0 18FF1234#R2",
     ]
+
+
+def test_black_box_has_the_frames_of_all_buses_in_order_of_time(tmp_path: Path) -> None:
+    logs = {"can0": "(9.000000) can0 080#\n(10.5) can0 080#\n", "can1": "(9.5) can1 080#\n(10.000000) can1 181#\n"}
+    blackbox.dump(tmp_path, "SyncLost", lambda: logs)
+    (file,) = (tmp_path / "blackbox").glob("*.log")
+    stamps = [line.split(")")[0] for line in file.read_text().splitlines()]
+    assert stamps == ["(9.000000", "(9.5", "(10.000000", "(10.5"]
 
 
 def test_a_dump_is_one_file_and_the_oldest_go(tmp_path: Path) -> None:

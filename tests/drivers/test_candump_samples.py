@@ -37,6 +37,16 @@ def test_a_lost_frame_is_a_hole_and_counted(monkeypatch: pytest.MonkeyPatch) -> 
     assert np.diff(found.tick).max() == 2
 
 
+@pytest.mark.parametrize("frame", ["181#R8", "00000181#0102030405060708", "20000181#0000000000000000", "181##00102"])
+def test_frames_of_other_kinds_give_no_samples(frame: str) -> None:
+    lines = candump("can0", Wire().frames()).splitlines(keepends=True)
+    foreign = [line for each in lines for line in (each, f"{each.split()[0]} can0 {frame}\n")]
+    found, plain = (samples_of_log("".join(each).encode(), machine())["X"] for each in (foreign, lines))
+    assert found.lost == plain.lost
+    np.testing.assert_array_equal(found.tick, plain.tick)
+    np.testing.assert_array_equal(found.position_mm, plain.position_mm)
+
+
 @pytest.mark.parametrize(
     ("log", "said"),
     [(b"", "no log of candump"), (b"PK\x03\x04 something else\n", "no log of candump"), (b"x" * 200, "more than")],

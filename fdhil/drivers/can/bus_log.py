@@ -1,42 +1,116 @@
-"""Logs of all frames of a bus, from one program's format to another's: candump, BLF, ASC, TRC (python-can's own)."""
+"""Logs of all frames of a bus, from one program's format to another's: candump, BLF, ASC, TRC.
+
+A log is read twice, so that its head is known before its first frame is written and none of it is held.
+"""
 
 from __future__ import annotations
 
-import struct
-import zlib
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
-import can
-
+from fdhil.drivers.can.logged_frame import LoggedFrame, LogHeader, error_frame, number_buses
 from fdhil.errors import RecordingError
 
-_UNREADABLE = (
-    can.CanError,
-    ValueError,
-    LookupError,
-    OSError,
-    EOFError,
-    TypeError,
-    AttributeError,
-    struct.error,
-    zlib.error,
-)
+_MILLISECOND_NS = 1_000_000
+ERROR_FRAMES = "error frames"
+ERROR_DETAILS = "class and data of error frames"
+FINE_TIMES = "times finer than 1 us"
+BUS_NAMES = "names of buses"
 
 
-def converted_log(path: Path, suffix: str) -> tuple[bytes, int]:
-    """Return a log in the format of ``suffix``, and how many frames it has; RecordingError when it is none."""
+@dataclass(frozen=True, slots=True)
+class ConvertedLog:
+    """A log in another format. ``frames`` are in ``content``; ``left_out`` counts what is not, ``reduced`` what lost a
+    part, both by what it is; ``buses`` has the number (candump: the name) of each bus of the log."""
+
+    content: bytes
+    frames: int
+    left_out: Mapping[str, int]
+    reduced: Mapping[str, int]
+    buses: Mapping[str, int | str]
+
+    def report(self) -> dict[str, Any]:
+        """Return what ``--json`` tells of it."""
+        names = ("frames", "left_out", "reduced", "buses")
+        return {name: getattr(self, name) for name in names}
+
+
+@dataclass(slots=True)
+class _Survey:
+    """What the frames of a log have in common, and what ``format_name`` does not have of them."""
+
+    format_name: str
+    frames: int = 0
+    first_ns: int = 0
+    is_sent: bool = False
+    is_fine: bool = False
+    buses: dict[str, None] = field(default_factory=dict)
+    left_out: Counter[str] = field(default_factory=Counter)
+    reduced: Counter[str] = field(default_factory=Counter)
+
+    def add(self, frame: LoggedFrame) -> None:
+        """Take in one frame."""
+        if _is_left_out(frame, self.format_name):
+            self.left_out[ERROR_FRAMES] += 1
+            return
+        self.first_ns = min(self.first_ns, frame.t_ns) if self.frames else frame.t_ns
+        self.frames += 1
+        self.is_sent |= bool(frame.sent)
+        self.buses[frame.bus] = None
+        fine = frame.t_ns % 1000 != 0
+        self.is_fine |= fine
+        if self.format_name in ("asc", "trc"):
+            self.reduced[FINE_TIMES] += fine
+        if self.format_name == "asc" and frame.is_error:
+            generic = error_frame(frame.t_ns, frame.bus, frame.sent)
+            self.reduced[ERROR_DETAILS] += frame != generic
+
+    def header(self, source: str) -> LogHeader:
+        """Return the head of the log that is written."""
+        start_ns = self.first_ns // _MILLISECOND_NS * _MILLISECOND_NS
+        shows_received = self.is_sent or source == "candump"
+        return LogHeader(start_ns, number_buses(self.buses), shows_received, 9 if self.is_fine else 6)
+
+
+def converted_log(path: Path, source: str, target: str) -> ConvertedLog:
+    """Return a log of format ``source`` in the format ``target``; RecordingError when it is none."""
+    survey, skipped = _Survey(target), Counter[str]()
+    for frame in _frames(path, source, skipped):
+        survey.add(frame)
+    if not survey.frames:
+        lost = "".join(f"; {count} {what}, which {target} does not have" for what, count in survey.left_out.items())
+        raise RecordingError(f"{path} has no frame{lost}: it is no log of a bus, or nothing was on it")
+    header = survey.header(source)
     with TemporaryDirectory() as folder:
-        part = Path(folder) / f"log{suffix}"
-        frames = 0
-        try:
-            with can.LogReader(path) as reader, can.Logger(part) as writer:
-                for message in reader:
-                    writer.on_message_received(message)
-                    frames += 1
-        except _UNREADABLE as error:
-            first = (str(error).splitlines() or [type(error).__name__])[0][:200]
-            raise RecordingError(f"{path} is no log of a bus that can be read: {first}; copy it again") from None
-        if not frames:
-            raise RecordingError(f"{path} has no frame: it is no log of a bus, or nothing was on it")
-        return part.read_bytes(), frames
+        part = Path(folder) / "log"
+        frames = (frame for frame in _frames(path, source, Counter()) if not _is_left_out(frame, target))
+        _module(target).write(part, frames, header)
+        content = part.read_bytes()
+    reduced = survey.reduced + Counter({what: n for what, n in skipped.items() if what.startswith("the date")})
+    left_out = survey.left_out + Counter({what: n for what, n in skipped.items() if what not in reduced})
+    buses: Mapping[str, int | str] = header.buses
+    if target == "candump":
+        buses = {name: name for name in header.buses}
+    elif target == "blf":
+        reduced[BUS_NAMES] = sum(name != f"can{number - 1}" for name, number in header.buses.items())
+    return ConvertedLog(content, survey.frames, dict(+left_out), dict(+reduced), buses)
+
+
+def _is_left_out(frame: LoggedFrame, format_name: str) -> bool:
+    return format_name == "trc" and frame.is_error
+
+
+def _frames(path: Path, format_name: str, skipped: Counter[str]) -> Iterator[LoggedFrame]:
+    try:
+        yield from _module(format_name).read(path, skipped)
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read ({error.strerror}); check the file and its rights") from None
+
+
+def _module(format_name: str) -> Any:
+    return import_module(f"fdhil.drivers.can.{format_name}_log")

@@ -6,7 +6,8 @@ from collections import deque
 
 import numpy as np
 
-from fdhil.drivers.can.frames import ERROR_FLAG, FRAME, Frames, pages_for
+from fdhil.drivers.can.candump_log import shown_id
+from fdhil.drivers.can.frames import FRAME, REMOTE_FLAG, Frames, pages_for
 
 KEPT_S = 10.0
 CHUNK_FRAMES = 1 << 13
@@ -63,7 +64,9 @@ def _lines(bus: str, frames: Frames) -> str:
     lines = []
     columns = (frames[name].tolist() for name in ("t_ns", "id", "dlc", "data"))
     for t_ns, can_id, length, data in zip(*columns, strict=True):
-        shown = f"{can_id:08X}" if can_id & ERROR_FLAG or can_id > 0x7FF else f"{can_id:03X}"
-        payload = int(data).to_bytes(8, "little")[:length].hex().upper()
-        lines.append(f"({t_ns // 1_000_000_000}.{t_ns // 1000 % 1_000_000:06d}) {bus} {shown}#{payload}\n")
+        if can_id & REMOTE_FLAG:
+            payload = f"R{length or ''}"
+        else:
+            payload = int(data).to_bytes(8, "little")[:length].hex().upper()
+        lines.append(f"({t_ns // 1_000_000_000}.{t_ns // 1000 % 1_000_000:06d}) {bus} {shown_id(can_id)}#{payload}\n")
     return "".join(lines)

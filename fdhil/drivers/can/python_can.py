@@ -91,7 +91,8 @@ def append(ring: FrameRing, message: can.Message, stamp_ns: int) -> None:
     """Put a message of the library into the ring."""
     can_id = message.arbitration_id | (EXTENDED_FLAG if message.is_extended_id else 0)
     can_id |= (ERROR_FLAG if message.is_error_frame else 0) | (REMOTE_FLAG if message.is_remote_frame else 0)
-    ring.append(stamp_ns, can_id, bytes(message.data[:8]))
+    data = bytes(min(message.dlc, 8)) if message.is_remote_frame else bytes(message.data[:8])  # its DLC is kept
+    ring.append(stamp_ns, can_id, data)
 
 
 def _library_filters(filters: Sequence[Filter]) -> list[dict[str, Any]] | None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import re
+import contextlib
+import io
 from collections.abc import Sequence
 
 import numpy as np
 
 from fdhil.config import MachineConfig
+from fdhil.drivers.can.candump_log import parse_line
 from fdhil.drivers.can.frames import Frames, frames_of
 from fdhil.drivers.cia402.bus_decoder import BusDecoder
 from fdhil.errors import RecordingError
@@ -15,7 +17,6 @@ from fdhil.records import AxisSamples
 
 LARGEST_LOG = 64 * 1024 * 1024
 BLOCK_FRAMES = 4096
-_LINE = re.compile(rb"\((\d{1,12})\.(\d{6})\) (\S{1,32}) ([0-9A-F]{3}|[0-9A-F]{8})#([0-9A-F]{0,16})")
 
 
 def samples_of_log(log: bytes, config: MachineConfig) -> dict[str, AxisSamples]:
@@ -39,10 +40,11 @@ def _frames(log: bytes) -> dict[str, Frames]:
     if len(log) > LARGEST_LOG:
         raise RecordingError(f"the log has more than {LARGEST_LOG >> 20} MiB, nothing of it is read; cut it")
     rows: dict[str, list[tuple[int, int, bytes]]] = {}
-    for seconds, micros, bus, can_id, data in _LINE.findall(log):
-        stamp_ns = (int(seconds) * 1_000_000 + int(micros)) * 1000
-        row = (stamp_ns, int(can_id, 16), bytes.fromhex(data.decode("ascii")) if len(data) % 2 == 0 else b"")
-        rows.setdefault(bus.decode("ascii", "replace"), []).append(row)
+    for line in io.StringIO(log.decode("ascii", "replace")):
+        with contextlib.suppress(ValueError, IndexError):  # a line that was cut is no frame
+            frame = parse_line(line)
+            if frame.fd is None:
+                rows.setdefault(frame.bus, []).append((frame.t_ns, frame.can_id, frame.data))
     if not rows:
         raise RecordingError("this is no log of candump, or nothing was on the bus")
     return {bus: frames_of(found) for bus, found in rows.items()}

@@ -1,0 +1,128 @@
+"""A frame of a bus log, whatever the file format, and what is common to the formats."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
+
+IDENTIFIER_MASK = 0x1FFFFFFF
+BUS_ERROR = ERROR_FLAG | 0x80  # what an error frame without a class is, as can-utils has it
+RATE_SWITCH, ERROR_STATE = 1, 2  # the flags of CAN FD that candump writes
+FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # by DLC
+CLASSIC_BYTES = 8
+_MOST_NUMBERED = 254
+_BY_NUMBER = re.compile(r"can(0|[1-9]\d{0,2})")
+
+
+@dataclass(frozen=True, slots=True)
+class LoggedFrame:
+    """A frame at ``t_ns`` (since 1970, or the log's own zero) on ``bus``; ``can_id`` has the flags of SocketCAN.
+
+    ``dlc`` is the data length code; of a remote frame the length that is requested. ``fd`` are the flags of a CAN FD
+    frame, None for a classic one. ``sent`` is None where the log does not distinguish sent from received frames.
+    """
+
+    t_ns: int
+    bus: str
+    can_id: int
+    dlc: int
+    data: bytes = b""
+    fd: int | None = None
+    sent: bool | None = None
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a frame that no bus can carry."""
+        if self.identifier > (IDENTIFIER_MASK if self.can_id & (EXTENDED_FLAG | ERROR_FLAG) else 0x7FF):
+            raise ValueError(f"identifier {self.identifier:X} is too large")
+        length = 0 if self.is_remote else FD_LENGTHS[self.dlc] if self.fd is not None else min(self.dlc, CLASSIC_BYTES)
+        if not 0 <= self.dlc < len(FD_LENGTHS) or len(self.data) != length:
+            raise ValueError(f"{len(self.data)} bytes of data do not match DLC {self.dlc}")
+
+    @property
+    def identifier(self) -> int:
+        """The identifier without flags; of an error frame its class."""
+        return self.can_id & IDENTIFIER_MASK
+
+    @property
+    def is_error(self) -> bool:
+        """Whether it is an error frame."""
+        return bool(self.can_id & ERROR_FLAG)
+
+    @property
+    def is_remote(self) -> bool:
+        """Whether it is a remote frame."""
+        return bool(self.can_id & REMOTE_FLAG)
+
+    @property
+    def is_extended(self) -> bool:
+        """Whether its identifier has 29 bits."""
+        return bool(self.can_id & EXTENDED_FLAG)
+
+
+def error_frame(t_ns: int, bus: str, sent: bool | None = None) -> LoggedFrame:
+    """Return an error frame of which nothing else is known."""
+    return LoggedFrame(t_ns, bus, BUS_ERROR, CLASSIC_BYTES, bytes(CLASSIC_BYTES), sent=sent)
+
+
+@dataclass(frozen=True, slots=True)
+class LogHeader:
+    """What a log's head has: ``start_ns`` is whole milliseconds and not after any frame; ``buses`` numbers from 1."""
+
+    start_ns: int
+    buses: Mapping[str, int]
+    shows_received: bool
+    digits: int = 6
+
+
+def number_buses(names: Iterable[str]) -> dict[str, int]:
+    """Return a number from 1 for each bus: ``can0`` is 1, as in can-utils; other names take the free numbers.
+
+    >>> number_buses(["vcan0", "can1", "can0"])
+    {'can1': 2, 'can0': 1, 'vcan0': 3}
+    """
+    numbers, others = {}, []
+    for name in names:
+        match = _BY_NUMBER.fullmatch(name)
+        if match is not None and int(match[1]) < _MOST_NUMBERED:
+            numbers[name] = int(match[1]) + 1
+        else:
+            others.append(name)
+    free = (number for number in range(1, 1 << 16) if number not in numbers.values())
+    return numbers | dict(zip(others, free, strict=False))
+
+
+def bus_name(number: int) -> str:
+    """Return the name of a bus that a log numbers from 1; 0 is what some programs write for none."""
+    return f"can{number - 1}" if number > 0 else "can"
+
+
+_REMARK = re.compile(r"\W*fdhil: bus (\d+) is (\S+)")
+
+
+def name_remarks(header: LogHeader) -> list[str]:
+    """Return the remarks that name those buses which their number does not name."""
+    return [f"fdhil: bus {number} is {name}" for name, number in header.buses.items() if bus_name(number) != name]
+
+
+def named_by(line: str) -> Iterator[tuple[int, str]]:
+    """Yield number and name of a bus where a line is such a remark."""
+    if (match := _REMARK.match(line)) is not None:
+        yield int(match[1]), match[2]
+
+
+def decimal_ns(seconds: str) -> int:
+    """Return a decimal number of seconds in ns, exactly.
+
+    >>> decimal_ns("1714557600.249713")
+    1714557600249713000
+    """
+    whole, _, fraction = seconds.partition(".")
+    return int(whole) * 1_000_000_000 + int(fraction[:9].ljust(9, "0"))
+
+
+def micros(ns: int) -> int:
+    """Return whole microseconds, rounded."""
+    return (ns + 500) // 1000

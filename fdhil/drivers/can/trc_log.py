@@ -1,0 +1,141 @@
+"""PEAK's TRC logs: versions 1.0 to 2.1 are read, 2.1 is written.
+
+Source: PEAK CAN TRC file format, 2020-07-27. Start times are taken as UTC, as python-can writes them.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import UTC, datetime
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+from fdhil.drivers.can.frames import EXTENDED_FLAG, REMOTE_FLAG
+from fdhil.drivers.can.logged_frame import (
+    ERROR_STATE,
+    FD_LENGTHS,
+    RATE_SWITCH,
+    LoggedFrame,
+    LogHeader,
+    bus_name,
+    error_frame,
+    micros,
+    name_remarks,
+    named_by,
+)
+from fdhil.errors import RecordingError
+
+OTHER_ROWS = "rows that are not CAN frames"
+NO_DATE = "the date, which is not in the head"
+_COLUMNS = {"1.0": "N,O,I,L,D", "1.1": "N,O,d,I,L,D", "1.2": "N,O,B,d,I,L,D", "1.3": "N,O,B,d,I,R,L,D"}
+_FD_TYPES = {"FD": 0, "FB": RATE_SWITCH, "FE": ERROR_STATE, "BI": RATE_SWITCH | ERROR_STATE}
+_TYPE_OF_FD = {flags: name for name, flags in _FD_TYPES.items()}
+_DAY_NS = 86_400_000_000_000
+_EPOCH_DAYS = 25569  # 1970-01-01, counted from 1899-12-30
+_WARNING_ID = "FFFFFFFF"
+
+
+class _Head:
+    """What the lines that begin with a semicolon say."""
+
+    def __init__(self) -> None:
+        self.columns: Sequence[str] = ()
+        self.start_ns: int | None = None
+        self.names: dict[int, str] = {}
+        self._version = "1.0"
+
+    def take(self, line: str) -> None:
+        """Take in one line; InvalidOperation for a start that is no number."""
+        self.names |= dict(named_by(line))
+        key, _, value = line.partition("=")
+        if key == ";$FILEVERSION":
+            self._version = value.strip()
+        elif key == ";$STARTTIME":
+            days = Decimal(value.strip().replace(",", ".")) - _EPOCH_DAYS
+            self.start_ns = micros(int(days * _DAY_NS)) * 1000
+        elif key == ";$COLUMNS":
+            self.columns = value.strip().split(",")
+
+    def complete(self) -> Sequence[str]:
+        """Return the columns; ValueError where neither head nor version names them."""
+        columns = self.columns or _COLUMNS.get(self._version, "").split(",")
+        if not {"O", "I", "D"} <= set(columns) or not {"l", "L"} & set(columns):
+            raise ValueError(f"columns of version {self._version} are not known")
+        return columns
+
+
+def read(path: Path, skipped: Counter[str]) -> Iterator[LoggedFrame]:
+    """Yield the frames of a log; RecordingError names the first line that cannot be read."""
+    head = _Head()
+    columns: Sequence[str] = ()
+    with path.open(encoding="latin-1") as file:
+        for number, line in enumerate(file, 1):
+            try:
+                if line.startswith(";"):
+                    head.take(line)
+                    continue
+                if not line.strip():
+                    continue
+                if not columns:
+                    columns = head.complete()
+                    skipped[NO_DATE] += head.start_ns is None
+                frame = _frame(line, columns, head)
+            except (ValueError, LookupError, InvalidOperation) as error:
+                what = str(error) if isinstance(error, ValueError) else "half a row"
+                raise RecordingError(f"{path}, line {number}: {what}; copy the log again") from None
+            if frame is None:
+                skipped[OTHER_ROWS] += 1
+            else:
+                yield frame
+
+
+def _frame(line: str, columns: Sequence[str], head: _Head) -> LoggedFrame | None:
+    """Return the frame of a row, None where it is another row."""
+    words = line.split()
+    row = dict(zip(columns, words, strict=False))
+    t_ns = (head.start_ns or 0) + int(Decimal(row["O"]) * 1_000_000)
+    number = row.get("B", "1")
+    bus = head.names.get(int(number)) or bus_name(int(number)) if number.isdecimal() else bus_name(1)
+    kind, way = row.get("T", "DT"), row.get("d", "Rx")
+    rest = words[columns.index("D") :]
+    if kind == "ER" or way == "Error" or "ERROR" in rest[:1]:
+        return error_frame(t_ns, bus)
+    if kind not in ("DT", "RR", *_FD_TYPES) or way not in ("Rx", "Tx") or row["I"] == _WARNING_ID:
+        return None
+    can_id = int(row["I"], 16) | (EXTENDED_FLAG if len(row["I"]) > 4 else 0)
+    fd = _FD_TYPES.get(kind)
+    dlc = _dlc(row, fd)
+    if kind == "RR" or rest[:1] == ["RTR"]:
+        return LoggedFrame(t_ns, bus, can_id | REMOTE_FLAG, dlc, sent=way == "Tx")
+    data = bytes.fromhex("".join(rest))
+    return LoggedFrame(t_ns, bus, can_id, dlc, data, fd, way == "Tx")
+
+
+def _dlc(row: Mapping[str, str], fd: int | None) -> int:
+    """Return the data length code; column l has a length instead."""
+    if "L" in row:
+        return int(row["L"])
+    return FD_LENGTHS.index(int(row["l"])) if fd is not None else int(row["l"])
+
+
+def write(path: Path, frames: Iterable[LoggedFrame], header: LogHeader) -> None:
+    """Write a log of version 2.1. Error frames have no row that holds what SocketCAN says of them: none may come."""
+    days = Decimal(header.start_ns) / _DAY_NS + _EPOCH_DAYS
+    date = datetime.fromtimestamp(header.start_ns // 1_000_000_000, UTC)
+    lines = [";$FILEVERSION=2.1", f";$STARTTIME={days:.15f}", ";$COLUMNS=N,O,T,B,I,d,R,L,D", ";"]
+    lines += [f";   Start time: {date:%d.%m.%Y %H:%M:%S}.{header.start_ns // 1_000_000 % 1000:03d}.0 UTC"]
+    lines += [";   Generated by fdhil", *(f";   {remark}" for remark in name_remarks(header))]
+    lines += [";---+-- ------+------ +- +- --+----- +- +- +--- +- -- -- -- -- -- -- --"]
+    with path.open("w", encoding="ascii", errors="replace", newline="\r\n") as file:
+        file.writelines(f"{line}\n" for line in lines)
+        for number, frame in enumerate(frames, 1):
+            file.write(f"{_row(number, frame, header)}\n")
+
+
+def _row(number: int, frame: LoggedFrame, header: LogHeader) -> str:
+    milli, micro = divmod(micros(frame.t_ns - header.start_ns), 1000)
+    kind = "RR" if frame.is_remote else "DT" if frame.fd is None else _TYPE_OF_FD[frame.fd & 3]
+    name = f"{frame.identifier:08X}" if frame.is_extended else f"{frame.identifier:04X}"
+    head = f"{number:>7} {milli:9d}.{micro:03d} {kind} {header.buses[frame.bus]:>2} {name:>8}"
+    return f"{head} {'Tx' if frame.sent else 'Rx'} -  {frame.dlc:<4} {frame.data.hex(' ').upper()}".rstrip()
