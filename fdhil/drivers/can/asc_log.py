@@ -126,9 +126,8 @@ def read(path: Path, skipped: Counter[str]) -> Iterator[LoggedFrame]:
             try:
                 frame = _frame(event[2].split(), (head.start_ns or 0) + now_ns, head)
             except (ValueError, IndexError) as error:
-                raise RecordingError(
-                    f"{path}, line {number}: {str(error) or 'half a frame'}; copy the log again"
-                ) from None
+                what = str(error) if isinstance(error, ValueError) else "half a frame"
+                raise RecordingError(f"{path}, line {number}: {what}; copy the log again") from None
             if frame is None:
                 skipped[OTHER_EVENTS] += 1
             else:

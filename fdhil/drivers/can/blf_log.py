@@ -57,10 +57,8 @@ def _frame(message: can.Message, start_ns: int, of_socketcan: bool) -> LoggedFra
     if message.is_fd:
         fd = (RATE_SWITCH if message.bitrate_switch else 0) | (ERROR_STATE if message.error_state_indicator else 0)
         dlc = FD_LENGTHS.index(len(data))
-    t_ns, bus = (
-        start_ns + round(message.timestamp * 1e9),
-        bus_name(number + 1 if isinstance(number := message.channel, int) else 1),
-    )
+    t_ns = start_ns + round(message.timestamp * 1e9)
+    bus = bus_name(message.channel + 1 if isinstance(message.channel, int) else 1)
     if message.is_error_frame:
         if not of_socketcan:
             return error_frame(t_ns, bus)

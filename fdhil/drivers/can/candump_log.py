@@ -46,10 +46,8 @@ def parse_line(line: str) -> LoggedFrame:
     if dlc > CLASSIC_BYTES and fd is None and raw is None:
         raise ValueError(f"{dlc} bytes in a classic frame")
     can_id = _flagged(int(name, 16), len(name) > 3) | (0 if asked is None else REMOTE_FLAG)
-    way = match["way"]
-    return LoggedFrame(
-        decimal_ns(match["time"]), match["bus"], can_id, dlc, data, fd, None if way is None else way in "Tt"
-    )
+    sent = None if match["way"] is None else match["way"] in "Tt"
+    return LoggedFrame(decimal_ns(match["time"]), match["bus"], can_id, dlc, data, fd, sent)
 
 
 def _flagged(can_id: int, is_long: bool) -> int:
