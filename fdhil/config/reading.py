@@ -16,6 +16,7 @@ from pydantic.fields import FieldInfo
 from fdhil.config.machine import MachineConfig
 from fdhil.config.plausible import doubts
 from fdhil.config.section import LARGEST, Section
+from fdhil.config.sensors import unit_remark
 from fdhil.errors import ConfigError, ConfigFault
 
 MAX_CONFIG_BYTES = 256 * 1024
@@ -126,7 +127,11 @@ def checked_as(whole: type[S], tables: Mapping[str, Any], source: str) -> S:
 def unlikely(config: MachineConfig) -> list[str]:
     """Return a sentence for everything about the axes that can be, but hardly is."""
     found = [(name, doubt) for name, axis in config.axis.items() for doubt in doubts(axis)]
-    return [f"axis.{name}.{doubt.key} is unlikely: {doubt.text}" for name, doubt in found]
+    told = [f"axis.{name}.{doubt.key} is unlikely: {doubt.text}" for name, doubt in found]
+    sections = ("voltage", "temperature", "table")
+    places = [(f"axis.{name}.{key}", getattr(axis, key)) for name, axis in config.axis.items() for key in sections]
+    places.append(("nc_source.modbus_coil", config.nc_source.modbus_coil))
+    return told + [remark for path, place in places if place is not None and (remark := unit_remark(path, place))]
 
 
 def checked(section: type[S], values: Mapping[str, Any], path: str) -> S:

@@ -18,6 +18,7 @@ from fdhil.config.section import Finite, NotNegative, Positive, Section, one_of
 BAUD_RATES = (1200, 2400, 4800, 9600, 14400, 19200, 28800, 38400, 57600, 115200, 230400, 460800, 921600)
 ValueType = Literal["int16", "uint16", "int32", "uint32", "float32", "float64"]
 NO_DEVICE = ""
+LAST_UNIT = 247  # "MODBUS over serial line" 2.2; 248 to 255 are reserved
 
 
 def _of_a_line(rate: int) -> int:
@@ -66,13 +67,34 @@ class ModbusPlace(SerialPlace):
     )
     host: str = Field("127.0.0.1", description="modbus: address of the device")
     port: int = Field(0, ge=0, le=65535, description="modbus: TCP port; 0 lets the simulator choose one")
-    unit: int = Field(1, ge=0, le=255, description="modbus: unit identifier; on a serial device 1 to 247")
+    framing: Literal["tcp", "rtu"] = Field(
+        "tcp", description="modbus: rtu for a transparent serial server, which passes RTU frames over TCP"
+    )
+    unit: int = Field(
+        1,
+        ge=0,
+        le=255,
+        description="modbus: unit identifier; on a serial line 1 to 247, or what a device alone there is asked by",
+    )
+
+    @property
+    def is_rtu(self) -> bool:
+        """Whether the units are on a serial line, also behind a serial server."""
+        return bool(self.device) or self.framing == "rtu"
 
     @model_validator(mode="after")
     def _answers(self) -> ModbusPlace:
-        if self.device and not 1 <= self.unit <= 247:
-            raise ValueError("unit: a unit on a serial line has a number from 1 to 247")
+        if self.is_rtu and self.unit == 0:
+            raise ValueError("unit: a unit on a serial line has a number from 1 to 247; 0 asks all, and none answers")
         return self
+
+
+def unit_remark(path: str, place: ModbusPlace) -> str:
+    """Return a sentence about a unit number that the standard reserves; empty for another."""
+    if not place.is_rtu or place.unit <= LAST_UNIT:
+        return ""
+    text = f"{path}.unit = {place.unit} is not one of 1 to {LAST_UNIT}, which units on a serial line have: keep it only"
+    return f"{text} where the device's manual names it, and the device is alone on its line (as a PZEM-017 at 248)"
 
 
 class ModbusValue(Section):
@@ -85,6 +107,9 @@ class ModbusValue(Section):
     type: ValueType = Field("float32", description="modbus: int16, uint16, int32, uint32, float32, float64")
     word_order: Literal["big", "little"] = Field(
         "big", description="modbus: big has the high word of a value in its first register, little the low word"
+    )
+    byte_order: Literal["big", "little"] = Field(
+        "big", description="modbus: of the two bytes of each register; big is Modbus' own, little has them swapped"
     )
 
 
@@ -136,7 +161,7 @@ class VoltageBlock(Section):
     )
 
 
-_SAYS_WHERE = ("function", "address", "word_order", "block")
+_SAYS_WHERE = ("function", "address", "word_order", "byte_order", "block")
 
 
 class Voltage(Scaled, TextValue, ModbusValue, ModbusPlace, Sourced):
@@ -153,7 +178,8 @@ class Voltage(Scaled, TextValue, ModbusValue, ModbusPlace, Sourced):
     type: ValueType | None = Field(  # type: ignore[assignment]
         None,
         description="modbus: int16, uint16, int32, uint32, float32, float64; left out: float32 (int16 in a block) "
-        "where function, address, word_order or a block is given, else the registers of fdhil's simulated sensor",
+        "where function, address, word_order, byte_order or a block is given, else the registers of fdhil's "
+        "simulated sensor",
     )
     period_s: Positive = Field(
         0.02, ge=1e-3, le=10.0, description="how often a sensor that shows one value is asked, or tells by itself"

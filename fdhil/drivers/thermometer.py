@@ -29,7 +29,7 @@ class SlidewayThermometer:
         if settings.source == "serial":
             self._meter = TextMeter(self.name, settings, settings, settings.period_s)
         else:
-            self._meter = ModbusMeter(self.name, settings, settings, settings.type)
+            self._meter = ModbusMeter(self.name, settings, settings, settings.type, PLAUSIBLE_C[1])
 
     @property
     def link(self) -> Link:

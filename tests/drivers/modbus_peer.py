@@ -29,6 +29,7 @@ class SensorPeer:
         self.frozen_at: int | None = None
         self.port = 0
         self.served: Sequence[int] = ()
+        self.other_unit = 0
         self.connections: dict[asyncio.StreamWriter, asyncio.Event] = {}
 
     @property
@@ -88,6 +89,8 @@ class SensorPeer:
                 if self.mode == "hang up":
                     break
                 body = self.answer(request)
+                if self.mode == "other unit":
+                    unit = self.other_unit
                 writer.write(struct.pack(">HHHB", transaction, 0, len(body) + 1, unit) + body)
         writer.close()
         with contextlib.suppress(ConnectionError):

@@ -21,7 +21,7 @@ from unittest.mock import patch
 from pymodbus.framer import FramerRTU
 
 from fdhil.drivers.modbus import rtu_line
-from fdhil.drivers.serial import port
+from fdhil.drivers.serial import byte_stream, port
 
 LOOK_S = 0.01
 Spoil = Callable[[bytes], list[bytes]]
@@ -76,6 +76,7 @@ def patiently(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., N
         with (
             patch.object(rtu_line, "time", loop),
             patch.object(port, "time", loop),
+            patch.object(byte_stream, "time", loop),
             asyncio.Runner(loop_factory=lambda: loop) as runner,
         ):
             runner.run(test(*given, **named))

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from fdhil.config import MachineConfig, Voltage, parse
+from fdhil.config.reading import unlikely
 from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.modbus.link import ModbusLink
 from fdhil.drivers.sensor_source import Record, Sensor, SensorSource, sensors_of
@@ -24,6 +25,7 @@ from fdhil.records import Notice, Temperature, VoltageSamples
 from fdhil.sim.wire.modbus_sensor import VoltageSensor
 from fdhil.sim.wire.sensor_wires import SensorWires
 from tests.bench import bench_axis
+from tests.drivers.modbus_peer import sensor_peer
 from tests.held_port import held_port
 
 PATIENCE_S = 60.0  # with a busy computer
@@ -94,6 +96,47 @@ async def test_a_plain_value_of_every_type(kind: str, order: str, on_a_line: boo
         volts = await volts_of(sensor)
         assert volts.size
         np.testing.assert_allclose(volts, -12.34, atol=TYPES[kind] if kind[0] != "f" else 1e-4)
+
+
+@pytest.mark.parametrize("kind", ["int16", "int32", "float32", "float64"])
+@pytest.mark.parametrize("over_rtu", [False, True])
+async def test_bytes_of_a_register_may_be_swapped_and_frames_be_those_of_a_serial_line(
+    kind: str, over_rtu: bool
+) -> None:
+    voltage = {"source": "modbus", "type": kind, "byte_order": "little", "scale": TYPES[kind], "period_s": 0.01}
+    voltage |= {"framing": "rtu", "unit": 3} if over_rtu else {"word_order": "little"}
+    async with shop(voltage) as served:
+        sensor = served.sensors()["voltage"]
+        assert type(sensor.link).__name__ == "ModbusLink"
+        np.testing.assert_allclose(await volts_of(sensor), -12.34, atol=TYPES[kind] if kind[0] != "f" else 1e-4)
+
+
+@pytest.mark.parametrize(
+    ("words", "keys"),
+    [
+        ([0x4841, 0], "byte_order = 'little'"),
+        ([0, 0x4148], "word_order = 'little'"),
+        ([0, 0x4841], "word_order = 'little' and byte_order = 'little'"),
+    ],
+)
+async def test_value_in_another_order_of_bytes_is_named(words: list[int], keys: str) -> None:
+    async with sensor_peer() as peer:
+        peer.served = words
+        place = {"source": "modbus", "port": peer.port, "type": "float32", "timeout_s": PATIENCE_S}
+        made = parse({"machine": {"name": "bench"}, "axis": {"X": bench_axis(corrected=False, voltage=place)}})
+        sensor = sensors_of("X", made)["voltage"]
+        await sensor.link.connect()
+        with pytest.raises(ProtocolError, match=rf"register 0 gives .* \(with {keys} it would be 12\.5\); compare"):
+            await sensor.poll(TickClock(0.001))
+        sensor.link.close()
+
+
+def test_unit_number_that_the_standard_reserves_is_used_with_a_remark() -> None:
+    for place, remarks in (({"device": "/dev/ttyUSB0"}, 1), ({"port": 502, "framing": "rtu"}, 1), ({"port": 502}, 0)):
+        voltage = {"source": "modbus", "type": "uint16", "unit": 248, "period_s": 0.5, **place}
+        made = parse({"machine": {"name": "bench"}, "axis": {"X": bench_axis(corrected=False, voltage=voltage)}})
+        told = [text for text in unlikely(made) if "axis.X.voltage.unit = 248 is not one of 1 to 247" in text]
+        assert len(told) == remarks
 
 
 async def test_a_float_at_0_needs_one_line_more_than_its_place(tmp_path: Path) -> None:

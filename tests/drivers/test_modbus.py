@@ -23,6 +23,7 @@ from fdhil.drivers.sensor_source import Record, SensorSource
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
 from fdhil.records import Notice, Temperature, TickTimes, VoltageSamples
 from tests.drivers.modbus_peer import VOLTS_PER_COUNT, SensorPeer, sensor_peer
+from tests.drivers.serial_peer import framed
 from tests.drivers.wire import machine
 from tests.held_port import held_port
 
@@ -97,6 +98,68 @@ async def test_each_misbehaviour_is_one_error(mode: str, error: type[DeviceError
             await sensor.poll(TickClock(0.001))
         assert says in str(caught.value)
         sensor.link.close()
+
+
+@pytest.mark.parametrize("other", [0, 1, 255])
+async def test_unit_that_answers_under_another_number_is_named(other: int) -> None:
+    async with sensor_peer() as peer:
+        peer.served, peer.mode, peer.other_unit = [7, 8], "other unit", other
+        link = ModbusLink("sensor", ModbusPlace(port=peer.port, unit=3, timeout_s=60.0))
+        await link.connect()
+        for asked in (1, 2):
+            with pytest.raises(
+                ProtocolError, match=f"unit {other} answers where unit 3 was asked; give unit = {other}"
+            ) as caught:
+                await link.read(3, 0, 1)
+            assert link.fault_code(caught.value) == "ModbusUnit"
+            assert link.counted == {"ModbusUnit": asked}
+        peer.other_unit = 3
+        assert await link.read(3, 0, 2) == [7, 8]
+        link.close()
+        link = ModbusLink("sensor", ModbusPlace(port=peer.port, unit=0, timeout_s=60.0))
+        await link.connect()
+        assert await link.read(3, 1, 1) == [8]  # 0 asks the device itself, whatever it calls itself
+        link.close()
+
+
+async def test_silent_tcp_device_may_be_a_serial_server() -> None:
+    async with sensor_peer() as peer:
+        peer.mode = "silent"
+        link = ModbusLink("sensor", ModbusPlace(port=peer.port, timeout_s=0.1))
+        await link.connect()
+        with pytest.raises(DeviceTimeout, match="passes RTU frames needs framing = 'rtu'"):
+            await link.read(3, 0, 1)
+        link.close()
+
+
+async def test_serial_server_passes_rtu_frames_and_may_go_away() -> None:
+    parts = bytearray()
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while request := await reader.read(8):
+            parts.extend(request)
+            frame = framed(3, b"\x04\x04\x41\x48\x00\x00")
+            for piece in (frame[:4], frame[4:]):  # as the server packs them
+                writer.write(piece)
+                await writer.drain()
+                await asyncio.sleep(0.03)
+            if len(parts) == 16:
+                break
+        writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    place = ModbusPlace(port=server.sockets[0].getsockname()[1], unit=3, framing="rtu", timeout_s=60.0)
+    link = ModbusLink("sensor", place)
+    await link.connect()
+    assert [await link.read(4, 0, 2) for _ in range(2)] == [[0x4148, 0]] * 2
+    assert bytes(parts) == framed(3, bytes.fromhex("0400000002")) * 2
+    with pytest.raises(ConnectError, match=r"the serial server .* is gone"):
+        await link.read(4, 0, 2)
+    assert not link.connected
+    server.close()
+    await server.wait_closed()
+    with pytest.raises(ConnectError, match="cannot be reached"):
+        await link.connect()
 
 
 async def test_a_source_that_is_stopped_just_as_the_answer_comes_ends() -> None:

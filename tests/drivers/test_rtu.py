@@ -116,7 +116,7 @@ async def test_a_damaged_answer_is_asked_for_again_and_counted(what: str) -> Non
         with pytest.raises(ProtocolError) as caught:
             await link.read_input(0, 2)
         assert link.fault_code(caught.value) == kind
-        assert len(peer.requests) == 6
+        assert len(peer.requests) == (7 if what in ("noise", "ModbusShape") else 6)  # one was a probe
         assert await link.read_input(0, 2) == [7, 8]
         link.close()
 

@@ -86,6 +86,27 @@ def test_a_torn_number_has_words_of_two_moments() -> None:
     assert numbers == [0x1FFF7, 0x1FFFE, 0x10005, 0x2000C]  # the high word of the answer before, the low one of now
 
 
+@pytest.mark.parametrize(
+    ("request_", "answered"),
+    [
+        ("010300000001", "03"),
+        ("01100000000102000a", "9002"),  # only what may be written
+        ("0107", "8701"),
+        ("012b0e0100", "ab01"),
+        ("01170000000100000001020007", "9701"),
+        ("01080000a537", "8801"),
+        ("0100", "8001"),
+    ],
+)
+def test_units_on_a_line_answer_every_function_as_over_tcp(request_: str, answered: str) -> None:
+    party, (registers, faults) = RtuUnits(), (Counted(), SensorFaults())
+    party.units[1] = registers, faults
+    (frame,) = party.take(framed(1, bytes.fromhex(request_)[1:]))
+    assert frame.hex().startswith(f"01{answered}")
+    assert framed(1, frame[1:-2]) == frame
+    assert answer(registers, faults, bytes.fromhex(request_)[1:])[:1] == frame[1:2]
+
+
 # -- through the driver
 
 

@@ -6,7 +6,7 @@ import math
 
 from fdhil.config import MachineConfig
 from fdhil.config.sensors import block_registers
-from fdhil.drivers.modbus.values import numbers, registers_of
+from fdhil.drivers.modbus.values import numbers, other_orders, registers_of
 from fdhil.drivers.modbus.voltage import ModbusVoltage, SensorBlock
 from fdhil.errors import ProtocolError
 from fdhil.records import frozen
@@ -21,6 +21,7 @@ class BlockVoltage(ModbusVoltage):
         assert settings.block is not None
         assert settings.type is not None
         self._settings, self._map, self._kind = settings, settings.block, settings.type
+        self._orders = settings.word_order, settings.byte_order
         self._first, self._registers = block_registers(settings)
         self._modulus = 1 << 16 * registers_of(self._map.counter_type)
         self._newest: int | None = None
@@ -42,14 +43,16 @@ class BlockVoltage(ModbusVoltage):
         if held > block.samples:
             text = f"register {block.count_address} tells {held} samples in a block of {block.samples}"
             raise ProtocolError(self.name, f"{text}; compare voltage.block with the sensor's register map")
-        raw = numbers(words(settings.address, held * registers_of(self._kind)), self._kind, settings.word_order)
+        raw = numbers(words(settings.address, held * registers_of(self._kind)), self._kind, *self._orders)
         raw = raw[::-1] if block.newest_first else raw
         volts = settings.scale * raw + settings.offset
         if not all(math.isfinite(v) and abs(v) <= self.limit_v for v in volts):
             text = f"registers {settings.address} on give {float(volts[0]):g} V as {self._kind}"
-            raise ProtocolError(self.name, f"{text}; compare type, word_order and scale with its register map")
+            text += other_orders(words(settings.address, registers_of(self._kind)), self._kind, settings, self.limit_v)
+            text += "; compare type, word_order, byte_order and scale with its register map"
+            raise ProtocolError(self.name, text)
         count = registers_of(block.counter_type)
-        told = int(numbers(words(block.counter_address, count), block.counter_type, settings.word_order)[0])
+        told = int(numbers(words(block.counter_address, count), block.counter_type, *self._orders)[0])
         newest = self._unwrapped(told + (held - 1 if block.counter_of == "oldest" else 0))
         if block.count_address is not None and newest + 1 < held:  # it had begun anew before it was first asked
             self._newest = newest = newest + self._modulus

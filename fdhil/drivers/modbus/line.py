@@ -68,9 +68,9 @@ class Answer:
     answered_ns: int
 
 
-def no_answer(request: Request) -> DeviceTimeout:
-    """Return the error of a unit that said nothing."""
-    text = f"register {request.address} was not answered within {request.timeout_s:g} s; check the device and its line"
+def no_answer(request: Request, advice: str = "check the device and its line") -> DeviceTimeout:
+    """Return the error of a unit that did not answer."""
+    text = f"register {request.address} was not answered within {request.timeout_s:g} s; {advice}"
     return DeviceTimeout(request.name, text)
 
 

@@ -16,11 +16,15 @@ _IN_USE: WeakValueDictionary[Hashable, Line] = WeakValueDictionary()
 
 def line_to(place: ModbusPlace) -> Line:
     """Return the line to a device: the one that is in use, else a new one, not yet connected."""
-    where = (place.device, place.baud_rate, place.parity, place.stop_bits) if place.device else (place.host, place.port)
+    where = (
+        (place.device, place.baud_rate, place.parity, place.stop_bits)
+        if place.device
+        else (place.host, place.port, place.framing)
+    )
     key = (_running_loop(), where)  # a line waits within one event loop
     line = _IN_USE.get(key)
     if line is None:
-        line = RtuLine(place) if place.device else TcpLine(place.host, place.port)
+        line = RtuLine(place) if place.is_rtu else TcpLine(place.host, place.port)
         _IN_USE[key] = line
     return line
 

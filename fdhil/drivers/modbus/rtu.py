@@ -99,7 +99,7 @@ def fault_in(data: bytes, unit: int, function: int, count: int) -> tuple[str, st
     """Return class and words of what is wrong with bytes in which there is no answer."""
     whole = _whole_frame(data)
     if whole and data[0] != unit:
-        return "ModbusUnit", f"unit {data[0]} answers where unit {unit} was asked; check that no two have one number"
+        return "ModbusUnit", foreign_unit(data[0], unit)
     wanted = data_bytes(function, count)
     if whole and data[1] == function and function in _READS and data[2] != wanted:
         return "ModbusShape", f"{data[2]} bytes came for {wanted} asked; check that one client asks at a time"
@@ -107,6 +107,12 @@ def fault_in(data: bytes, unit: int, function: int, count: int) -> tuple[str, st
         return "ModbusCrc", "an answer came damaged; check shield, termination and the baud rate of the line"
     text = f"{len(data)} bytes came that are no answer; check baud rate, parity and that one client asks at a time"
     return "ModbusShape", text
+
+
+def foreign_unit(answering: int, asked: int) -> str:
+    """Return the words for an answer of a unit that was not asked."""
+    text = f"unit {answering} answers where unit {asked} was asked; give unit = {answering}"
+    return f"{text} where that is the device, or check that no two have one number"
 
 
 def _whole_frame(data: bytes) -> bool:

@@ -1,13 +1,16 @@
 """A serial line with Modbus RTU units: one request at a time, silent intervals kept, late and foreign answers told.
 
 An answer names its unit and function but not what was asked. So what comes unasked is thrown away before the next
-request, and after a request that was not answered in time the line is heard for as long again before anybody asks.
+request, and after a request that was not answered in time the line is heard for as long again before anybody asks. An
+answer that is later still is told by its shape: while one is owed, nothing of the same shape is asked before the unit
+has answered a probe of another shape (:mod:`fdhil.drivers.modbus.owed_answers`).
 Noise, or a piece, is no answer: ours may still come, and must not be taken for that of the next request.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import struct
 import time
 from collections import Counter
@@ -16,6 +19,7 @@ from weakref import WeakSet
 
 from fdhil.config.sensors import ModbusPlace
 from fdhil.drivers.modbus.line import Answer, DamagedAnswer, ModbusRefused, Request, no_answer
+from fdhil.drivers.modbus.owed_answers import OwedAnswers
 from fdhil.drivers.modbus.rtu import (
     ERROR,
     WRITE_REGISTER,
@@ -26,30 +30,36 @@ from fdhil.drivers.modbus.rtu import (
     is_damaged,
     numbers_in,
 )
+from fdhil.drivers.serial.byte_stream import ByteStream
 from fdhil.drivers.serial.port import SerialPort
+from fdhil.drivers.serial.server_port import ServerPort
 
 RETRIES = 2
 SILENT_CHARACTERS = 3.5
 SILENT_ABOVE_19200_S = 1.75e-3  # fixed there, "MODBUS over serial line" 2.5.1.1
 FASTEST_BY_CHARACTERS = 19200
+NETWORK_S = 0.2  # and so far where a serial server packs them
 ADAPTER_S = 0.02  # bytes of one frame may come so far apart: a USB adapter hands them over every 16 ms
 _REQUEST_BYTES = 8
 MOST_BYTES = 512  # two frames of the longest: what is kept of what is no answer
 
 
 class RtuLine:
-    """The units on one serial device."""
+    """The units on one serial device, or behind a serial server that passes their frames over TCP."""
 
     def __init__(self, place: ModbusPlace) -> None:
-        self._port = SerialPort(place)
-        self.place = f"Modbus RTU {place.device}"
+        over_tcp = not place.device
+        self._port: ByteStream = ServerPort(place.host, place.port) if over_tcp else SerialPort(place)
+        self.place = f"Modbus RTU {place.device or f'{place.host}:{place.port}'}"
+        self._advice = "check the device and its line" + ("; framing = 'tcp' is for Modbus TCP" if over_tcp else "")
+        self._apart_s = NETWORK_S if over_tcp else None
         self.users: MutableSet[object] = WeakSet()
         self.counted: Counter[str] = Counter()
         self._turn = asyncio.Lock()
         fast = place.baud_rate > FASTEST_BY_CHARACTERS
         self.silence_s = SILENT_ABOVE_19200_S if fast else SILENT_CHARACTERS * self._port.character_s
         self._busy_until_ns = 0
-        self._owed: Request | None = None
+        self._owed = OwedAnswers()
         self._late_until_ns = 0
 
     @property
@@ -61,7 +71,7 @@ class RtuLine:
         """Open the device where it is not; ConnectError."""
         async with self._turn:
             if not self._port.is_open:
-                self._port.open(name)
+                await self._port.connect(name, timeout_s)
 
     async def ask(self, request: Request) -> Answer:
         """Ask and return the answer; what came damaged is asked for again, what did not come is not."""
@@ -70,6 +80,8 @@ class RtuLine:
                 try:
                     return await self._exchange(request)
                 except DamagedAnswer as error:
+                    if error.kind == "ModbusUnit":  # counted when it came, and waited out
+                        raise
                     self.counted[error.kind] += 1
                     if not left:
                         raise
@@ -77,28 +89,50 @@ class RtuLine:
 
     async def _exchange(self, request: Request) -> Answer:
         await self._late_answers(request.name)
+        if self._owed.hide(request):
+            await self._resynchronise(request)
+        return await self._transact(request)
+
+    async def _resynchronise(self, request: Request) -> None:
+        """Have the unit answer what no late answer can be taken for; DeviceTimeout while it does not."""
+        probe = self._owed.probe_for(request)
+        if probe is not None:
+            with contextlib.suppress(ModbusRefused):
+                await self._transact(probe)
+            return
+        self._late_until_ns = time.monotonic_ns() + round(request.timeout_s * 1e9)
+        await self._late_answers(request.name)
+        if self._owed.hide(request):
+            raise no_answer(request, self._advice)
+
+    async def _transact(self, request: Request) -> Answer:
+        """Ask and return the answer, which settles what the unit was asked before."""
         await self._fall_silent()
         body = struct.pack(">BHH", request.function, request.address, request.value)
         frame = framed(request.unit, body)
         sent_ns = self._port.send(request.name, frame)
         self._busy_until_ns = asked_ns = sent_ns + self._port.wire_ns(_REQUEST_BYTES)
+        self._owed.add(request, sent_ns)  # whoever asked may be stopped before it is answered
+        self._late_until_ns = asked_ns + round(2 * request.timeout_s * 1e9)
         echo = b"" if request.function == WRITE_REGISTER else frame
         answer, answered_ns = await self._answer(request, asked_ns, echo)
-        if answer[0] == request.function | ERROR:
+        refused = answer[0] == request.function | ERROR
+        self._owed.settle_unit(request.unit, certain=not refused)
+        if refused:
             raise ModbusRefused(request.name, request.address, answer[1])
         registers = numbers_in(answer[2:], request.function, request.count) if request.count else ()
         return Answer(registers, min(asked_ns, answered_ns), answered_ns)
 
     async def _late_answers(self, name: str) -> None:
         """Hear the line after a request that was not answered, until the late answer is through or time is up."""
-        stale, data, owed = bool(self._port.discard()), b"", self._owed
-        while owed is not None and time.monotonic_ns() < self._late_until_ns:
+        stale, data = bool(self._port.discard()), b""
+        self._owed.forget(time.monotonic_ns())
+        while self._owed and time.monotonic_ns() < self._late_until_ns:
             chunk = await self._port.receive(name, self._late_until_ns)
             data = (data + (chunk.data if chunk is not None else b""))[-MOST_BYTES:]
-            if find_answer(data, owed.unit, owed.function, owed.count) is not None:
-                break
+            if self._owed.settle(data):
+                stale, data = True, b""
         self.counted["ModbusStale"] += stale or bool(data)
-        self._owed = None
 
     async def _fall_silent(self) -> None:
         """Wait until nothing was on the line for 3.5 characters, and forget what was."""
@@ -118,9 +152,10 @@ class RtuLine:
         port, unit, function, count = self._port, request.unit, request.function, request.count
         data, first_ns = b"", 0
         noise: DamagedAnswer | None = None
+        foreign: DamagedAnswer | None = None
         wanted = answer_bytes(function, count)
         deadline_ns = asked_ns + round(request.timeout_s * 1e9) + port.wire_ns(wanted)
-        pause_ns = round((self.silence_s + ADAPTER_S) * 1e9)
+        pause_ns = round((self.silence_s + (self._apart_s or ADAPTER_S)) * 1e9)
         while True:
             until_ns = min(deadline_ns, time.monotonic_ns() + pause_ns) if data else deadline_ns
             chunk = await port.receive(request.name, until_ns)
@@ -135,17 +170,19 @@ class RtuLine:
                 continue
             if data:
                 damaged = DamagedAnswer(request.name, *fault_in(data, unit, function, count))
-                if damaged.kind == "ModbusUnit":
+                if self._owed.settle(data):
+                    self.counted["ModbusStale"] += 1  # ours is still to come
+                elif damaged.kind == "ModbusUnit":
                     self.counted[damaged.kind] += 1  # it may have been asked by another master: ours may still come
+                    foreign = damaged
                 elif is_damaged(data, unit, function, count):
+                    self._owed.settle_unit(unit, certain=False)
                     raise damaged
                 else:
                     noise = damaged
                 data, first_ns = b"", 0
             if time.monotonic_ns() >= deadline_ns:
-                self._owed = request
-                self._late_until_ns = time.monotonic_ns() + round(request.timeout_s * 1e9)
-                raise noise or no_answer(request)
+                raise noise or foreign or no_answer(request, self._advice)
 
     def close(self) -> None:
         """Release the device."""

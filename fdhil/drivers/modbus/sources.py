@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fdhil.config import MachineConfig
-from fdhil.drivers.meter import MeterVoltage
+from fdhil.drivers.meter import BEYOND_LIMIT, MeterVoltage
 from fdhil.drivers.modbus.block import BlockVoltage
 from fdhil.drivers.modbus.meter import ModbusMeter
 from fdhil.drivers.modbus.voltage import ModbusVoltage
@@ -16,4 +16,5 @@ def modbus_voltage(axis: str, config: MachineConfig) -> ModbusVoltage | MeterVol
         return ModbusVoltage(axis, config)
     if settings.block is not None:
         return BlockVoltage(axis, config)
-    return MeterVoltage(axis, config, ModbusMeter(f"voltage sensor {axis}", settings, settings, settings.type))
+    most = BEYOND_LIMIT * config.axis[axis].regulators.voltage_limit_v
+    return MeterVoltage(axis, config, ModbusMeter(f"voltage sensor {axis}", settings, settings, settings.type, most))

@@ -19,10 +19,20 @@ from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.pdu import ModbusPDU
 
 from fdhil.drivers.modbus.line import Answer, DamagedAnswer, ModbusRefused, Request, no_answer
-from fdhil.drivers.modbus.rtu import BIT_READS, READ_COILS, READ_DISCRETE, READ_HOLDING, READ_INPUT, WRITE_REGISTER
+from fdhil.drivers.modbus.rtu import (
+    BIT_READS,
+    READ_COILS,
+    READ_DISCRETE,
+    READ_HOLDING,
+    READ_INPUT,
+    WRITE_REGISTER,
+    foreign_unit,
+)
 from fdhil.errors import ConnectError, DeviceError
 
 CONNECT_S = 2.0  # beyond the time an answer may take
+SILENT_ADVICE = "check the device and its line; a serial server that passes RTU frames needs framing = 'rtu'"
+ANY_UNIT = 0  # of a device that is not behind a gateway
 LIBRARYS_OWN_S = 100.0  # its one time-out for everything is longer than any of ours
 
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
@@ -30,6 +40,14 @@ logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
 class _Nonsense(ModbusException):
     """Bytes came that the library cannot read."""
+
+
+class _OtherUnit(ModbusException):
+    """Another unit than the one that was asked answered the request; ``unit`` is its number."""
+
+    def __init__(self, unit: int) -> None:
+        super().__init__(f"unit {unit}")
+        self.unit = unit
 
 
 class TcpLine:
@@ -60,6 +78,7 @@ class TcpLine:
                 self._host, port=self._port, timeout=LIBRARYS_OWN_S, retries=0, reconnect_delay=0
             )
             _end_waiting_at_nonsense(self._client)
+            _refuse_other_units(self._client)
             try:
                 async with asyncio.timeout(timeout_s + CONNECT_S):
                     connected = await self._client.connect()
@@ -110,6 +129,9 @@ class TcpLine:
                 answer = await call
         except TimeoutError:
             raise self._silent(request) from None
+        except _OtherUnit as error:
+            self.counted["ModbusUnit"] += 1
+            raise DamagedAnswer(request.name, "ModbusUnit", foreign_unit(error.unit, request.unit)) from None
         except _Nonsense:
             self.close()
             text = "what came is no answer of Modbus TCP, the connection is made anew; compare host and port"
@@ -133,7 +155,7 @@ class TcpLine:
     def _silent(self, request: Request) -> DeviceError:
         # a late answer must not be taken for the next one's: the connection is made anew
         self.close()
-        return no_answer(request)
+        return no_answer(request, SILENT_ADVICE)
 
     def close(self) -> None:
         """End the connection."""
@@ -157,3 +179,22 @@ def _end_waiting_at_nonsense(client: AsyncModbusTcpClient) -> None:
             return len(data)
 
     wire.callback_data = taken  # type: ignore[method-assign] # the library has no place for it
+
+
+def _refuse_other_units(client: AsyncModbusTcpClient) -> None:
+    """Have an answer under another unit's number end the waiting: the library skips it, and waits on in vain.
+
+    Its transaction number shows that it answers this request.
+    """
+    wire = client.ctx
+    framer, decode = wire.framer, wire.framer.decode
+
+    def decoded(data: bytes) -> tuple[int, int, int, bytes]:
+        size, unit, transaction, body = decode(data)
+        is_ours = body and transaction == wire.request_transaction_id
+        if is_ours and unit != wire.request_dev_id != ANY_UNIT and not wire.response_future.done():
+            wire.response_future.set_exception(_OtherUnit(unit))
+            wire.response_future.exception()  # nobody may wait any more
+        return size, unit, transaction, body
+
+    framer.decode = decoded  # type: ignore[method-assign, assignment] # the library has no place for it

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 import struct
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 
 from fdhil.records import Float
 
 WordOrder = Literal["big", "little"]
+ORDERS: tuple[WordOrder, ...] = ("big", "little")
+SMALLEST = 1e-30  # a float below is one whose words or type are others
+LIKELY = (1e-6, 1e6)  # what instruments show, in their own unit
 CODES = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f", "float64": ">d"}
 
 
@@ -23,14 +28,18 @@ def registers_of(kind: str) -> int:
     return struct.calcsize(CODES[kind]) // 2
 
 
-def numbers(registers: Sequence[int], kind: str, order: WordOrder = "big") -> Float:
+def numbers(registers: Sequence[int], kind: str, word_order: WordOrder = "big", byte_order: WordOrder = "big") -> Float:
     """Return the numbers (n,) of this type that the registers hold one after the other.
 
     >>> float(numbers([0x0000, 0x4248], "float32", "little")[0])
     50.0
+    >>> float(numbers([0x4842, 0x0000], "float32", byte_order="little")[0])
+    50.0
     """
     words = np.array(registers, ">u2").reshape(-1, registers_of(kind))
-    if order == "little":
+    if byte_order == "little":
+        words = words.byteswap()
+    if word_order == "little":
         words = words[:, ::-1]
     return np.frombuffer(words.tobytes(), np.dtype(CODES[kind])).astype(np.float64)
 
@@ -47,3 +56,39 @@ def float32(registers: Sequence[int], at: int = 0) -> float:
 def uint32(registers: Sequence[int], at: int = 0) -> int:
     """Return the unsigned integer in two registers, high word first."""
     return registers[at] << 16 | registers[at + 1]
+
+
+class ValuePlace(Protocol):
+    """Where a value is and what it means: the keys of :class:`fdhil.config.sensors.ModbusValue` and ``scale``."""
+
+    @property
+    def function(self) -> int: ...
+    @property
+    def address(self) -> int: ...
+    @property
+    def word_order(self) -> WordOrder: ...
+    @property
+    def byte_order(self) -> WordOrder: ...
+    @property
+    def scale(self) -> float: ...
+    @property
+    def offset(self) -> float: ...
+
+
+def other_orders(registers: Sequence[int], kind: str, where: ValuePlace, most: float = LIKELY[1]) -> str:
+    """Return what the first value of the registers would be in another order of words and bytes, for a message.
+
+    Only what an instrument can show is named: 0, or between ``LIKELY[0]`` and ``most``, scaled.
+    """
+    found = []
+    first = registers[: registers_of(kind)]
+    for word_order, byte_order in itertools.product(ORDERS if registers_of(kind) > 1 else ORDERS[:1], ORDERS):
+        if (word_order, byte_order) == (where.word_order, where.byte_order) or not first:
+            continue
+        raw = float(numbers(first, kind, word_order, byte_order)[0])
+        value = where.scale * raw + where.offset
+        if math.isfinite(raw) and (raw == 0 or LIKELY[0] < abs(raw)) and abs(value) < most:
+            given = ("word_order", word_order, where.word_order), ("byte_order", byte_order, where.byte_order)
+            keys = " and ".join(f"{key} = {order!r}" for key, order, now in given if order != now)
+            found.append(f"with {keys} it would be {value:g}")
+    return f" ({', '.join(found)})" if found else ""

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from fdhil.drivers.serial.port import Chunk, SerialPort
+from fdhil.drivers.serial.byte_stream import Chunk
+from fdhil.drivers.serial.port import SerialPort
 
 LONGEST = 512  # characters; what is longer without an end is no line of an instrument
 

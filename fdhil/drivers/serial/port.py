@@ -1,4 +1,4 @@
-"""A serial port as a stream of bytes, each with the time at which it was read. The one place that knows pyserial."""
+"""A serial port as a stream of bytes. The one place that knows pyserial."""
 
 from __future__ import annotations
 
@@ -6,47 +6,33 @@ import asyncio
 import os
 import termios
 import time
-from collections import deque
-from dataclasses import dataclass
 from pathlib import Path
 
 import serial
 
 from fdhil.config.sensors import SerialPlace
+from fdhil.drivers.serial.byte_stream import ByteStream
 from fdhil.errors import ConnectError
 
-MOST_KEPT = 1 << 16  # bytes that nobody has asked for; the oldest are let go
 _PARITY = {"even": serial.PARITY_EVEN, "odd": serial.PARITY_ODD, "none": serial.PARITY_NONE}
 
 
-@dataclass(frozen=True, slots=True)
-class Chunk:
-    """Bytes that were read together, and when (host-monotonic ns): they had arrived by then, the first ones earlier."""
-
-    data: bytes
-    t_ns: int
-
-
-class SerialPort:
+class SerialPort(ByteStream):
     """An open device; nobody else may open it meanwhile. ``name`` is the sensor's, for messages.
 
     A pseudo terminal knows neither rate nor parity: ``wire_ns`` is 0 there.
     """
 
     def __init__(self, place: SerialPlace) -> None:
+        super().__init__()
         self.device = place.device
+        self.where = f"the serial device {place.device}"
         self._place = place
         bits = 1 + 8 + (place.parity != "none") + place.stop_bits
         self.character_s = bits / place.baud_rate
         self._is_pty = os.path.realpath(place.device).startswith("/dev/pts/")
         self._serial: serial.Serial | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._chunks: deque[Chunk] = deque()
-        self._kept = 0
-        self._came = asyncio.Event()
-        self._gone = ""
-        self.dropped = 0
-        self.last_ns = 0
 
     @property
     def is_open(self) -> bool:
@@ -55,7 +41,11 @@ class SerialPort:
 
     def wire_ns(self, count: int) -> int:
         """How long ``count`` characters take on the wire."""
-        return 0 if self._is_pty else round(count * self.character_s * 1e9)
+        return 0 if self._is_pty else super().wire_ns(count)
+
+    async def connect(self, name: str, timeout_s: float) -> None:
+        """Open the device: it is there at once or not at all."""
+        self.open(name)
 
     def open(self, name: str) -> None:
         """Open the device; ConnectError when it is not there, may not be used, or another program has it."""
@@ -97,18 +87,11 @@ class SerialPort:
         if not data:
             self._end("it was unplugged")
             return
-        self.last_ns = time.monotonic_ns()
-        self._chunks.append(Chunk(data, self.last_ns))
-        self._kept += len(data)
-        while self._kept > MOST_KEPT:
-            self.dropped += len(self._chunks[0].data)
-            self._kept -= len(self._chunks.popleft().data)
-        self._came.set()
+        self._take(data)
 
     def _end(self, why: str) -> None:
-        self._gone = why
+        super()._end(why)
         self._stop_reading()
-        self._came.set()
 
     def send(self, name: str, data: bytes) -> int:
         """Write at once and return when (host-monotonic ns); ConnectError when the device is gone or takes nothing."""
@@ -123,35 +106,10 @@ class SerialPort:
             raise self._lost(name)
         return time.monotonic_ns()
 
-    async def receive(self, name: str, until_ns: int) -> Chunk | None:
-        """Return the next bytes, None when none have come by ``until_ns``; ConnectError when the device is gone."""
-        while not self._chunks:
-            self._held(name)
-            self._came.clear()
-            try:
-                async with asyncio.timeout((until_ns - time.monotonic_ns()) / 1e9):
-                    await self._came.wait()
-            except TimeoutError:
-                if not self._chunks:
-                    return None
-        chunk = self._chunks.popleft()
-        self._kept -= len(chunk.data)
-        return chunk
-
-    def discard(self) -> int:
-        """Forget what has come and was not asked for; return how many bytes that were."""
-        kept, self._kept = self._kept, 0
-        self._chunks.clear()
-        return kept
-
     def _held(self, name: str) -> serial.Serial:
         if self._serial is None or self._gone:
             raise self._lost(name)
         return self._serial
-
-    def _lost(self, name: str) -> ConnectError:
-        why = self._gone or "it is not open"
-        return ConnectError(name, f"the serial device {self.device} is gone ({why}); check the adapter and its cable")
 
     def _stop_reading(self) -> None:
         if self._serial is not None and self._loop is not None and not self._loop.is_closed():

@@ -8,7 +8,8 @@ from __future__ import annotations
 import asyncio
 import struct
 import threading
-from collections.abc import Mapping
+import time
+from collections.abc import Awaitable, Callable, Mapping
 from functools import partial
 
 from fdhil.errors import ConnectError
@@ -16,6 +17,7 @@ from fdhil.sim.wire.modbus_answers import Seal, answer, spoilt
 from fdhil.sim.wire.modbus_sensor import VoltageSensor
 from fdhil.sim.wire.registers import RegisterMap
 from fdhil.sim.wire.sensor_faults import SensorFaults
+from fdhil.sim.wire.serial_lines import RtuUnits
 
 _HEADER = struct.Struct(">HHHB")  # transaction, protocol (0), bytes that follow, unit
 _MOST_BYTES = 254
@@ -23,6 +25,7 @@ _GATEWAY_TARGET = 11  # exception of a gateway whose unit does not answer
 _PIECES_S = 0.005
 ANY_UNIT = 0
 _Units = Mapping[int, tuple[RegisterMap, SensorFaults]]
+_Conversation = Callable[[asyncio.StreamReader, asyncio.StreamWriter, _Units], Awaitable[None]]
 
 
 class SensorServers:
@@ -37,11 +40,14 @@ class SensorServers:
         addresses: Mapping[str, tuple[str, int]],
         maps: Mapping[str, RegisterMap] | None = None,
         units: Mapping[str, int] | None = None,
+        over_rtu: frozenset[str] = frozenset(),
     ) -> None:
         """Serve the sensors that have an address, each with the registers of ``maps`` in place of its own.
 
-        Those with one address are behind a gateway: each answers to its own number of ``units`` only.
+        Those with one address are behind a gateway: each answers to its own number of ``units`` only. Those of
+        ``over_rtu`` are behind a serial server, which passes RTU frames.
         """
+        self._over_rtu = over_rtu
         self._sensors, self._addresses, self._units = sensors, addresses, units or {}
         self._maps: Mapping[str, RegisterMap] = sensors if maps is None else maps
         self._servers: list[asyncio.Server] = []
@@ -88,8 +94,11 @@ class SensorServers:
             self._units[axis] if len(axes) > 1 else ANY_UNIT: (self._maps[axis], self._sensors[axis].faults)
             for axis in axes
         }
+        if axes[0] in self._over_rtu:
+            units = {self._units[axis]: (self._maps[axis], self._sensors[axis].faults) for axis in axes}
+        converse = _pass_frames if axes[0] in self._over_rtu else _converse
         try:
-            server = await asyncio.start_server(partial(self._client, units), host, port)
+            server = await asyncio.start_server(partial(self._client, converse, units), host, port)
         except OSError:
             raise ConnectError(
                 f"voltage sensor {axes[0]}",
@@ -100,9 +109,11 @@ class SensorServers:
         return int(server.sockets[0].getsockname()[1])
 
     @staticmethod
-    async def _client(units: _Units, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _client(
+        converse: _Conversation, units: _Units, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
         try:
-            await _converse(reader, writer, units)
+            await converse(reader, writer, units)
         except (asyncio.IncompleteReadError, OSError, asyncio.CancelledError):
             return  # it has gone, or this machine ends
         finally:
@@ -115,6 +126,21 @@ class SensorServers:
         for task in others:
             task.cancel()
         await asyncio.gather(*others, return_exceptions=True)
+
+
+async def _pass_frames(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, units: _Units) -> None:
+    """Pass what comes to units on a serial line, and what they answer back, until the client leaves."""
+    line = RtuUnits()
+    line.units = dict(units)
+    while data := await reader.read(_MOST_BYTES):
+        pieces = line.take(data)
+        if (due_s := line.due_s()) < float("inf"):
+            await asyncio.sleep(due_s - time.monotonic())
+            pieces = line.tell()
+        for place, piece in enumerate(pieces):
+            await asyncio.sleep(_PIECES_S if place else 0.0)
+            writer.write(piece)
+            await writer.drain()
 
 
 async def _converse(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, units: _Units) -> None:

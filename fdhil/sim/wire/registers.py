@@ -37,15 +37,15 @@ class RegisterMap(Protocol):
         """The trigger was written."""
 
 
-def packed(value: float, kind: str, order: str) -> list[int]:
+def packed(value: float, kind: str, word_order: str, byte_order: str = "big") -> list[int]:
     """Return a number as registers; a whole number stops at the ends of its type, as a converter does."""
     if not kind.startswith("float"):
         bits = 8 * struct.calcsize(_FORMATS[kind])
         low, high = (0, 2**bits - 1) if kind.startswith("u") else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
         value = min(max(round(value), low), high) if math.isfinite(value) else high
     data = struct.pack(_FORMATS[kind], value)
-    words = list(struct.unpack(f">{len(data) // 2}H", data))
-    return words if order == "big" else words[::-1]
+    words = list(struct.unpack(f"{'>' if byte_order == 'big' else '<'}{len(data) // 2}H", data))
+    return words if word_order == "big" else words[::-1]
 
 
 def _placed(address: int, words: list[int]) -> dict[int, int]:
@@ -64,7 +64,7 @@ class OneValue:
         """Return the registers of the number."""
         settings = self._settings
         raw = (self._read() - settings.offset) / settings.scale
-        return _placed(settings.address, packed(raw, self._kind, settings.word_order))
+        return _placed(settings.address, packed(raw, self._kind, settings.word_order, settings.byte_order))
 
     def latch(self) -> None:
         """There is nothing to latch."""
@@ -95,12 +95,13 @@ class Block:
         count, volts = self._samples.newest(block.samples)
         held = volts[::-1] if block.newest_first else volts
         raw = [(v - settings.offset) / settings.scale for v in held]
-        numbers = [word for v in raw for word in packed(v, self._kind, settings.word_order)]
+        numbers = [word for v in raw for word in packed(v, self._kind, settings.word_order, settings.byte_order)]
         size = block.samples * struct.calcsize(_FORMATS[self._kind]) // 2
         words = _placed(settings.address, numbers + [0] * (size - len(numbers)))
         told = (count - 1 if block.counter_of == "newest" else count - len(volts)) % (1 << 32)
         told %= 1 << 8 * struct.calcsize(_FORMATS[block.counter_type])
-        words |= _placed(block.counter_address, packed(told, block.counter_type, settings.word_order))
+        number = packed(told, block.counter_type, settings.word_order, settings.byte_order)
+        words |= _placed(block.counter_address, number)
         if block.count_address is not None:
             words[block.count_address] = len(volts)
         return dict.fromkeys(range(min(words), max(words)), 0) | words  # one request reads them all

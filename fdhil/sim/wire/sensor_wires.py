@@ -49,7 +49,8 @@ class SensorWires:
                 registers = Joined(registers, OneValue(table, table.type, self._places[axis]))
             maps[axis], addresses[axis] = registers, (voltage.host, voltage.port)
         units = {axis: config.axis[axis].voltage.unit for axis in addresses}
-        self._tcp = SensorServers(sensors, addresses, maps, units)
+        over_rtu = frozenset(axis for axis in addresses if config.axis[axis].voltage.is_rtu)
+        self._tcp = SensorServers(sensors, addresses, maps, units, over_rtu)
         self._lines = SerialLines(self._parties) if self._parties else None
         self.ready: dict[str, dict[str, Any]] = {}
 

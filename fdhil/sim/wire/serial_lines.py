@@ -27,7 +27,7 @@ from fdhil.sim.wire.modbus_answers import answer, spoilt
 from fdhil.sim.wire.registers import RegisterMap
 from fdhil.sim.wire.sensor_faults import SensorFaults
 
-_REQUEST = 8
+_REQUEST, _SHORTEST, _LONGEST = 8, 4, 256
 _TURN_S = 0.25
 _PIECES_S = 0.005
 _FRAME_END_S = 0.02  # so long a silence ends a frame, whatever of it has come
@@ -47,7 +47,7 @@ class Party(Protocol):
 
 
 class RtuUnits:
-    """Modbus RTU units by number; each answers functions 3, 4 and 6 as its faults allow."""
+    """Modbus RTU units by number; each answers as one on Modbus TCP does, as its faults allow."""
 
     def __init__(self) -> None:
         self.units: dict[int, tuple[RegisterMap, SensorFaults]] = {}
@@ -60,10 +60,8 @@ class RtuUnits:
         now_s = time.monotonic()
         self._begun = data if now_s - self._last_s > _FRAME_END_S else self._begun + data
         self._last_s = now_s
-        if len(self._begun) < _REQUEST:
-            return []
-        request, self._begun = self._begun[:_REQUEST], self._begun[_REQUEST:]
-        if _sealed(request[:-2]) != request or request[0] not in self.units:
+        request = self._whole_request()
+        if not request or request[0] not in self.units:
             return []
         registers, faults = self.units[request[0]]
         pieces = spoilt(faults, _framed, request[0], answer(registers, faults, request[1:-2]))
@@ -71,6 +69,16 @@ class RtuUnits:
             return pieces
         self._late.append((now_s + faults.slow_s, pieces))
         return []
+
+    def _whole_request(self) -> bytes:
+        """Return a request that has come whole, with whichever function; empty while there is none."""
+        for size in (_REQUEST, len(self._begun)):
+            request = self._begun[:size]
+            if len(request) == size >= _SHORTEST and _sealed(request[:-2]) == request:
+                self._begun = self._begun[size:]
+                return request
+        self._begun = self._begun[-_LONGEST:]
+        return b""
 
     def due_s(self) -> float:
         """Return when an answer that is late comes."""

@@ -9,7 +9,7 @@ from fdhil.config.sensors import ModbusPlace
 from fdhil.drivers.modbus.line import Answer, Request
 from fdhil.drivers.modbus.rtu import READ_COILS, READ_HOLDING, READ_INPUT, WRITE_REGISTER, framed
 from fdhil.drivers.modbus.rtu_line import RtuLine
-from fdhil.drivers.serial.port import Chunk
+from fdhil.drivers.serial.byte_stream import Chunk
 from fdhil.errors import DeviceError
 from tests.fuzz.tasting import Target
 
