@@ -17,6 +17,7 @@ from fdhil.config.sensors import Thermometer, Voltage
 from fdhil.config.table import Accelerometer, TableEncoder
 
 # the built-in ceilings of what may ever be added to a set-point; a config can only lower them
+MOST_FILE_BYTES = 4 << 20  # more than an EDS or a profile may have
 CEILING_OFFSET_UM = 250.0
 CEILING_SPEED_MM_S = 20.0
 CEILING_ACCELERATION_MM_S2 = 2000.0
@@ -73,6 +74,12 @@ class FeedforwardLimits(Section):
     max_speed_rate_rad_s2: Positive = Field(5e3, description="largest rate of the speed offset")
 
 
+def _content(path: Path) -> bytes:
+    """Return a file's bytes, as many as a profile or an EDS may have: one that has more is refused when it is read."""
+    with path.open("rb") as file:
+        return file.read(MOST_FILE_BYTES)
+
+
 class Drive(Section):
     """[axis.X.drive]: how the drive is reached and scaled."""
 
@@ -84,7 +91,7 @@ class Drive(Section):
         eds = [] if self.eds is None else [folder / self.eds]
         changes: dict[str, Any] = {"profile": str(own[0]) if own else self.profile, "eds": eds[0] if eds else None}
         drive = self.model_copy(update=changes)
-        told = b"".join(path.read_bytes() for path in (*own, *eds) if path.is_file())
+        told = b"".join(_content(path) for path in (*own, *eds) if path.is_file())
         drive._files = hashlib.sha256(told).hexdigest() if own or eds else ""
         return drive
 

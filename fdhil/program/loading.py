@@ -15,6 +15,9 @@ from fdhil.program.interpreter import interpret
 from fdhil.program.planner import plan
 from fdhil.records import Trajectory
 
+MAX_BYTES = 1 << 30  # ten million lines of a hundred characters
+_PIECE_BYTES = 1 << 20
+
 
 def load_trajectory(path: Path, config: MachineConfig) -> Trajectory:
     """Return the reference that a file orders of the machine.
@@ -29,15 +32,25 @@ def load_trajectory(path: Path, config: MachineConfig) -> Trajectory:
 def program_digest(path: Path) -> str:
     """Return the SHA-256 of a program's or demand's bytes, 64 hexadecimal digits.
 
-    ProgramError when it is not there, or no plain file: a pipe would never end, and nothing could be read of it again.
+    ProgramError when it is not there, larger than any program, or no plain file: a pipe would never end, and nothing
+    could be read of it again.
     """
+    digest, left = hashlib.sha256(), MAX_BYTES
     try:
         with open(path, "rb", opener=_at_once) as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            found = os.fstat(file.fileno())
+            if not stat.S_ISREG(found.st_mode):
                 raise ProgramError(0, "", f"{path} is a pipe or a device; give the program as a plain file")
-            return hashlib.file_digest(file, "sha256").hexdigest()
+            left -= found.st_size  # a file of holes has a size, and takes no room on the disk
+            while left >= 0 and (piece := file.read(_PIECE_BYTES)):
+                digest.update(piece)
+                left = min(left, MAX_BYTES - file.tell())  # it may grow meanwhile
     except OSError as error:
         raise ProgramError(0, "", f"{path} cannot be read ({error.strerror}); check the path") from None
+    if left < 0:
+        text = f"{path} is larger than {MAX_BYTES >> 20} MiB, and nothing of it is read; give a program, or cut it"
+        raise ProgramError(0, "", text)
+    return digest.hexdigest()
 
 
 def _at_once(path: str, flags: int) -> int:

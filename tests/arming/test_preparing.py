@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import os
+import stat
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -32,7 +34,7 @@ from fdhil.config import MachineConfig
 from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.errors import ProgramError
 from fdhil.identification.loops import DIFFER
-from fdhil.program import program_digest
+from fdhil.program import loading, program_digest
 from fdhil.records import LoopEstimate, Notice, Reason, Skill, Verdict
 from fdhil.store.rows import Revision, Stamp
 from tests.daemon.machine import config_of
@@ -239,6 +241,26 @@ def test_a_pipe_is_no_program_and_nobody_waits_for_it(config: MachineConfig, tmp
     for program in (tmp_path / "program.ngc", Path(os.devnull)):
         with pytest.raises(ProgramError, match="give the program as a plain file"):
             prepare(program, None, config, dict.fromkeys(config.axis, axis))
+
+
+@pytest.mark.timeout(100)
+@pytest.mark.parametrize("name", ["program.ngc", "demand.csv"])
+def test_file_of_holes_is_refused_by_its_size(name: str, config: MachineConfig, tmp_path: Path) -> None:
+    """It takes no room on the disk, and hashing it takes many minutes, in which nothing else can be armed."""
+    (tmp_path / name).touch()
+    os.truncate(tmp_path / name, 1 << 40)
+    known = dict.fromkeys(config.axis, AxisKnowledge(published(), 0.0, None, ()))
+    with pytest.raises(ProgramError, match="is larger than 1024 MiB, and nothing of it is read"):
+        prepare(tmp_path / name, None, config, known)
+
+
+def test_program_that_grows_while_it_is_read_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loading, "MAX_BYTES", 10)
+    monkeypatch.setattr(os, "fstat", lambda _file: SimpleNamespace(st_mode=stat.S_IFREG, st_size=4))
+    program = tmp_path / "program.ngc"
+    program.write_bytes(b"G1 X10 F1000\n")
+    with pytest.raises(ProgramError, match="is larger than"):
+        program_digest(program)
 
 
 def test_a_changed_load_is_remembered_until_new_parameters_come(config: MachineConfig, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import shutil
 import subprocess
 from collections import Counter
@@ -259,6 +260,16 @@ def test_screen_form_of_candump_is_named(line: str, tmp_path: Path) -> None:
 def test_damaged_line_is_refused_with_its_number(line: str, said: str, tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=f"line 2: .*({said})"):
         convert(f"(12.000000) can0 080#\n{line}\n", "asc", tmp_path)
+
+
+@pytest.mark.timeout(100)
+@pytest.mark.parametrize("name", FORMATS)
+def test_file_of_holes_is_refused_without_reading_it(name: str, tmp_path: Path) -> None:
+    log = tmp_path / f"bus{suffix(name)}"
+    log.touch()
+    os.truncate(log, 1 << 40)
+    with pytest.raises(RecordingError, match=r"no log of a bus|no BLF log"):
+        converted_log(log, name, "candump")
 
 
 def test_asc_of_other_programs_is_read(tmp_path: Path) -> None:

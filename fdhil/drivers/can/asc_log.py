@@ -19,6 +19,7 @@ from fdhil.drivers.can.logged_frame import (
     bus_name,
     decimal_ns,
     error_frame,
+    lines_of,
     micros,
     name_remarks,
     named_by,
@@ -110,28 +111,27 @@ class _Head:
 def read(path: Path, skipped: Counter[str]) -> Iterator[LoggedFrame]:
     """Yield the frames of a log; RecordingError names the first line of a frame that cannot be read."""
     head, now_ns, begun = _Head(), 0, False
-    with path.open(encoding="utf-8", errors="replace") as file:
-        for number, line in enumerate(file, 1):
-            event = _EVENT.match(line)
-            if event is None:
-                head.take(line)
-                continue
-            now_ns = now_ns + decimal_ns(event[1]) if head.relative else decimal_ns(event[1])
-            if event[2].lower().startswith("start of measurement"):
-                head.begin_measurement()
-                continue
-            if not begun and head.start_ns is None:
-                skipped[NO_DATE] += 1
-            begun = True
-            try:
-                frame = _frame(event[2].split(), (head.start_ns or 0) + now_ns, head)
-            except (ValueError, IndexError) as error:
-                what = str(error) if isinstance(error, ValueError) else "half a frame"
-                raise RecordingError(f"{path}, line {number}: {what}; copy the log again") from None
-            if frame is None:
-                skipped[OTHER_EVENTS] += 1
-            else:
-                yield frame
+    for number, line in lines_of(path, "utf-8"):
+        event = _EVENT.match(line)
+        if event is None:
+            head.take(line)
+            continue
+        now_ns = now_ns + decimal_ns(event[1]) if head.relative else decimal_ns(event[1])
+        if event[2].lower().startswith("start of measurement"):
+            head.begin_measurement()
+            continue
+        if not begun and head.start_ns is None:
+            skipped[NO_DATE] += 1
+        begun = True
+        try:
+            frame = _frame(event[2].split(), (head.start_ns or 0) + now_ns, head)
+        except (ValueError, IndexError) as error:
+            what = str(error) if isinstance(error, ValueError) else "half a frame"
+            raise RecordingError(f"{path}, line {number}: {what}; copy the log again") from None
+        if frame is None:
+            skipped[OTHER_EVENTS] += 1
+        else:
+            yield frame
 
 
 def _frame(words: Sequence[str], t_ns: int, head: _Head) -> LoggedFrame | None:

@@ -15,6 +15,7 @@ from fdhil.drivers.can.logged_frame import (
     LoggedFrame,
     LogHeader,
     decimal_ns,
+    lines_of,
 )
 from fdhil.errors import RecordingError
 
@@ -82,14 +83,13 @@ def _content(frame: LoggedFrame) -> str:
 
 def read(path: Path, _skipped: Counter[str]) -> Iterator[LoggedFrame]:
     """Yield the frames of a log; RecordingError names the first line that is none."""
-    with path.open(encoding="ascii", errors="replace") as file:
-        for number, line in enumerate(file, 1):
-            if not line.strip():
-                continue
-            try:
-                yield parse_line(line)
-            except (ValueError, IndexError) as error:
-                raise RecordingError(f"{path}, line {number}: {_advice(line, error)}") from None
+    for number, line in lines_of(path, "ascii"):
+        if not line.strip():
+            continue
+        try:
+            yield parse_line(line)
+        except (ValueError, IndexError) as error:
+            raise RecordingError(f"{path}, line {number}: {_advice(line, error)}") from None
 
 
 def _advice(line: str, error: Exception) -> str:

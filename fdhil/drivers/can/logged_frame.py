@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
+from fdhil.errors import RecordingError
 
 IDENTIFIER_MASK = 0x1FFFFFFF
 BUS_ERROR = ERROR_FLAG | 0x80  # what an error frame without a class is, as can-utils has it
@@ -14,6 +17,7 @@ RATE_SWITCH, ERROR_STATE = 1, 2  # the flags of CAN FD that candump writes
 FD_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # by DLC
 CLASSIC_BYTES = 8
 _MOST_NUMBERED = 254
+_MOST_CHARACTERS = 4096  # of a line
 _BY_NUMBER = re.compile(r"can(0|[1-9]\d{0,2})")
 
 
@@ -111,6 +115,21 @@ def named_by(line: str) -> Iterator[tuple[int, str]]:
     """Yield number and name of a bus where a line is such a remark."""
     if (match := _REMARK.match(line)) is not None:
         yield int(match[1]), match[2]
+
+
+def lines_of(path: Path, encoding: str) -> Iterator[tuple[int, str]]:
+    """Yield the lines of a log with their numbers; RecordingError for one that no log has: it may never end."""
+    try:
+        with path.open(encoding=encoding, errors="replace") as file:
+            for number in itertools.count(1):
+                if not (line := file.readline(_MOST_CHARACTERS)):
+                    return
+                if len(line) == _MOST_CHARACTERS:
+                    text = f"line {number} has {_MOST_CHARACTERS} characters and more"
+                    raise RecordingError(f"{path}, {text}: it is no log of a bus; copy it again")
+                yield number, line
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read ({error.strerror}); check the file and its rights") from None
 
 
 def decimal_ns(seconds: str) -> int:

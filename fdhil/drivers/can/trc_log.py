@@ -20,6 +20,7 @@ from fdhil.drivers.can.logged_frame import (
     LogHeader,
     bus_name,
     error_frame,
+    lines_of,
     micros,
     name_remarks,
     named_by,
@@ -69,25 +70,24 @@ def read(path: Path, skipped: Counter[str]) -> Iterator[LoggedFrame]:
     """Yield the frames of a log; RecordingError names the first line that cannot be read."""
     head = _Head()
     columns: Sequence[str] = ()
-    with path.open(encoding="latin-1") as file:
-        for number, line in enumerate(file, 1):
-            try:
-                if line.startswith(";"):
-                    head.take(line)
-                    continue
-                if not line.strip():
-                    continue
-                if not columns:
-                    columns = head.complete()
-                    skipped[NO_DATE] += head.start_ns is None
-                frame = _frame(line, columns, head)
-            except (ValueError, LookupError, InvalidOperation) as error:
-                what = str(error) if isinstance(error, ValueError) else "half a row"
-                raise RecordingError(f"{path}, line {number}: {what}; copy the log again") from None
-            if frame is None:
-                skipped[OTHER_ROWS] += 1
-            else:
-                yield frame
+    for number, line in lines_of(path, "latin-1"):
+        try:
+            if line.startswith(";"):
+                head.take(line)
+                continue
+            if not line.strip():
+                continue
+            if not columns:
+                columns = head.complete()
+                skipped[NO_DATE] += head.start_ns is None
+            frame = _frame(line, columns, head)
+        except (ValueError, LookupError, InvalidOperation) as error:
+            what = str(error) if isinstance(error, ValueError) else "half a row"
+            raise RecordingError(f"{path}, line {number}: {what}; copy the log again") from None
+        if frame is None:
+            skipped[OTHER_ROWS] += 1
+        else:
+            yield frame
 
 
 def _frame(line: str, columns: Sequence[str], head: _Head) -> LoggedFrame | None:
