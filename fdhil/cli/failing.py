@@ -15,6 +15,7 @@ from typing import Any, ParamSpec, TextIO, TypeVar
 
 import click
 
+from fdhil.cli.terminal_text import without_controls
 from fdhil.errors import ConfigError, ConfigFault, FdhilError
 
 SCHEMA = "fdhil-error-1"
@@ -164,7 +165,7 @@ def _usage(error: click.ClickException) -> str:
 def _say(text: str) -> None:
     """Say it on standard error; where that takes nothing, the exit code still tells."""
     try:
-        click.echo(text, err=True)
+        click.echo(without_controls(text), err=True)
     except OSError:
         _drop(sys.stderr)
 

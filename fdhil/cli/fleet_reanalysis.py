@@ -113,10 +113,11 @@ def _bar() -> Iterator[Callable[[int, int], None]]:
 
         yield unseen
         return
-    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    from fdhil.cli.console import PrintableConsole
+
     shown = (TextColumn("analysing"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*shown, console=Console(stderr=True), transient=True) as progress:
+    with Progress(*shown, console=PrintableConsole(stderr=True), transient=True) as progress:
         task = progress.add_task("analysing")
         yield lambda done, total: progress.update(task, completed=done, total=total)

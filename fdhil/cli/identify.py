@@ -159,17 +159,17 @@ def _analyse(
     columns: Path | None,
 ) -> list[FileResult]:
     """Analyse the files, with a progress bar on stderr when that is a terminal."""
-    from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
     from fdhil.cli.batch import analyse_files
+    from fdhil.cli.console import PrintableConsole
     from fdhil.store.column_map import read_column_map
 
     told = None if columns is None else read_column_map(columns)
     if not sys.stderr.isatty():
         return list(analyse_files(paths, settings, machine, accelerometer=accelerometer, columns=told))
     shown = (TextColumn("identifying"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with Progress(*shown, console=Console(stderr=True), transient=True) as progress:
+    with Progress(*shown, console=PrintableConsole(stderr=True), transient=True) as progress:
         task = progress.add_task("identifying", total=len(paths))
         return list(analyse_files(paths, settings, machine, partial(progress.advance, task), accelerometer, told))
 
@@ -270,14 +270,14 @@ def _parameters(estimate: Estimate | None, verdict: Verdict) -> dict[str, Any]:
 def _show(results: Sequence[FileResult], axes: Mapping[str, Axis], with_loops: bool) -> None:
     """Write a table per file for people: every window, then the pool, then the loops."""
     from rich import box
-    from rich.console import Console
     from rich.table import Table
 
+    from fdhil.cli.console import PrintableConsole
     from fdhil.cli.loops_view import show_loops
     from fdhil.identification.windows import moving_range
     from fdhil.records import PARAMETERS
 
-    console = Console()
+    console = PrintableConsole()
     for result in results:
         if result.error is not None:
             click.echo(f"fdhil: {result.error['text']}", err=True)

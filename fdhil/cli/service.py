@@ -17,6 +17,7 @@ from fdhil.cli.audited import write_after, write_before
 from fdhil.cli.consent import agreed
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import FILE
+from fdhil.cli.terminal_text import without_controls
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, DriveFault
 
 if TYPE_CHECKING:
@@ -262,12 +263,12 @@ def _tell(answer: Mapping[str, Any], as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps(answer))
     elif answer["ok"]:
-        click.echo(answer.get("text", "done"))
+        click.echo(without_controls(answer.get("text", "done")))
     else:
         advice = f"; {answer['advice']}" if answer.get("advice") else ""
-        click.echo(f"refused: {answer['code']}: {answer['text']}{advice}", err=True)
+        click.echo(without_controls(f"refused: {answer['code']}: {answer['text']}{advice}"), err=True)
         for more in answer.get("refused", [])[1:]:
             told = more if isinstance(more, str) else f"{more['code']}: {more['text']}; {more['advice']}"
-            click.echo(f"also: {told}", err=True)
+            click.echo(without_controls(f"also: {told}"), err=True)
     if not answer["ok"]:
         click.get_current_context().exit(answer.get("exit_code", 1))

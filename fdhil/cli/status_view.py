@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from fdhil.cli.console import PrintableConsole
 from fdhil.cli.loops_view import loops_line
 from fdhil.records import PARAMETERS
 from fdhil.report.parameter_view import MEANING, cell, half_of, head
@@ -40,7 +41,7 @@ COUNTED = {
 
 def open_console() -> Console:
     """Return a console for stdout: as wide as the terminal or as COLUMNS says, 80 columns where there is neither."""
-    return Console(width=shutil.get_terminal_size((80, 24)).columns)
+    return PrintableConsole(width=shutil.get_terminal_size((80, 24)).columns)
 
 
 def show(status: Mapping[str, Any], console: Console | None = None) -> None:

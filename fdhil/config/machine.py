@@ -17,7 +17,7 @@ from fdhil.config.offset_bounds import limit_faults
 from fdhil.config.plausible import doubts
 from fdhil.config.publish import Publish
 from fdhil.config.regulators import period_faults
-from fdhil.config.section import AxisName, Positive, Section
+from fdhil.config.section import AxisName, Positive, Section, ShownName
 from fdhil.config.sensors import WORDS, LineUser, line_faults, line_user
 from fdhil.config.service import Access, Guard, Maintenance, Play, Store
 from fdhil.config.simulation import Sim
@@ -30,7 +30,7 @@ BESIDE_THE_MACHINE = {"access", "web", "publish", "uplink", "offers"}
 class Machine(Section):
     """[machine]"""
 
-    name: str = Field(min_length=1, max_length=64, description="what the reports call this machine")
+    name: ShownName = Field(min_length=1, max_length=64, description="what the reports call this machine")
     sync_period_s: Positive = Field(0.001, ge=1e-4, le=0.02, description="period of the SYNC message on the CAN bus")
 
 

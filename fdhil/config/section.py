@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import unicodedata
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -24,6 +25,15 @@ def _of_a_machine(value: float) -> float:
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False), AfterValidator(_of_a_machine)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False), AfterValidator(_of_a_machine)]
 Finite = Annotated[float, Field(allow_inf_nan=False), AfterValidator(_of_a_machine)]
+
+
+def _without_controls(name: str) -> str:
+    if any(unicodedata.category(letter) in ("Cc", "Cs", "Zl", "Zp") for letter in name):
+        raise ValueError("must be one line without control characters")
+    return name
+
+
+ShownName = Annotated[str, AfterValidator(_without_controls)]  # on terminals, pages and in other programs
 AxisName = Annotated[str, Field(pattern="^[A-Z]$")]
 
 

@@ -104,13 +104,13 @@ def _document(loop: Loop, report: Path) -> dict[str, Any]:
 
 
 def _tables(loop: Loop, realistic: Realistic, report: Path) -> None:
-    from rich.console import Console
     from rich.table import Table
 
+    from fdhil.cli.console import PrintableConsole
     from fdhil.cli.demo import realistic_page
     from fdhil.cli.demo.report import CUT_HEAD, PARAMETER_HEAD, cut_rows, parameter_rows
 
-    console = Console()
+    console = PrintableConsole()
     for title, head, rows in (
         ("Identified from the rapids", PARAMETER_HEAD, parameter_rows(loop)),
         ("Contour error, measured by the twin at its own table", CUT_HEAD, cut_rows(loop)),

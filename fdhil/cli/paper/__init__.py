@@ -78,12 +78,12 @@ def _make(out: Path) -> None:
 
 
 def _table(claims: list[Claim], report: Path) -> None:
-    from rich.console import Console
     from rich.table import Table
 
+    from fdhil.cli.console import PrintableConsole
     from fdhil.cli.paper.page import SUMMARY_HEAD, counts, summary_rows
 
-    console = Console()
+    console = PrintableConsole()
     table = Table(title="The paper, claim by claim", title_justify="left")
     for name in SUMMARY_HEAD:
         table.add_column(name)

@@ -1,0 +1,23 @@
+"""Makes text from outside harmless for a terminal: names of machines, programs, files and devices."""
+
+from __future__ import annotations
+
+import unicodedata
+
+_LAYOUT = "\n\t"
+_REPLACEMENT = "\N{REPLACEMENT CHARACTER}"
+
+
+def without_controls(text: str) -> str:
+    """Return text in which each control or direction character but a line's end and a tab is a mark.
+
+    >>> without_controls("axis \\x1b[2J X\\n") == "axis \\N{REPLACEMENT CHARACTER}[2J X\\n"
+    True
+    """
+    if text.isprintable():
+        return text
+    return "".join(_REPLACEMENT if _steers(letter) else letter for letter in text)
+
+
+def _steers(letter: str) -> bool:
+    return letter not in _LAYOUT and unicodedata.category(letter) in ("Cc", "Cf", "Zl", "Zp", "Cs")
