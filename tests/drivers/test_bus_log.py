@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdhil.drivers.can import candump_log
+from fdhil.drivers.can import blf_log, candump_log
 from fdhil.drivers.can.bus_log import ConvertedLog, converted_log
 from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
 from fdhil.drivers.can.logged_frame import BUS_ERROR, FD_LENGTHS, LoggedFrame, LogHeader
@@ -127,6 +127,34 @@ def test_log2asc_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert came[-1].startswith("(1714557601.004300)")
 
 
+@pytest.mark.skipif(shutil.which("asc2log") is None, reason="needs can-utils")
+def test_asc2log_reads_what_is_written(tmp_path: Path) -> None:
+    out, _ = convert(CANDUMP + ERRORS, "asc", tmp_path)
+    theirs = subprocess.run(["asc2log", "-I", out], check=True, capture_output=True, text=True).stdout
+    came = [line.split()[1:3] for line in theirs.splitlines()]
+    generic = [["can0", "20000080#0000000000000000"]] * 3
+    assert came == [line.split()[1:3] for line in CANDUMP.splitlines()] + generic
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_logs_of_python_can_are_read(name: str, tmp_path: Path) -> None:
+    """Its TRC has no remote, error and FD frames, its ASC no frames of CAN FD without data, and candump no lengths."""
+    log, theirs = tmp_path / "bus.log", tmp_path / f"theirs{suffix(name)}"
+    lines = [line for line in CANDUMP.splitlines() if "##" not in line and ("#R" not in line or line.endswith("#R"))]
+    wanted = [line for line in lines if "#R" not in line or name != "trc"]
+    log.write_text("\n".join(lines))
+    with can.Logger(theirs) as writer:
+        for message in oracle(log):
+            writer.on_message_received(message)
+    told = converted_log(theirs, name, "candump")
+    came = told.content.decode().splitlines()
+    assert [line.split()[1:3] for line in came] == [line.split()[1:3] for line in wanted]
+    if name != "asc":  # whose head has milliseconds alone, cut off
+        assert [line.split()[0] for line in came] == [line.split()[0] for line in wanted]
+    assert told.left_out == {}
+    assert set(told.reduced) <= ({"times finer than 1 us"} if name == "blf" else set())  # of its floats
+
+
 def oracle(path: Path, **options: Any) -> list[can.Message]:
     with can.LogReader(path, **options) as reader:
         return list(reader)
@@ -173,10 +201,15 @@ def test_sent_frames_and_times_that_go_back_are_kept(name: str, tmp_path: Path) 
 )
 def test_nanoseconds_are_kept_or_counted(name: str, lost: dict[str, int], tmp_path: Path) -> None:
     text = "(1714557600.249713123) can0 080#\n(1714557600.250000000) can0 080#\n"
-    _, told = convert(text, name, tmp_path)
+    out, told = convert(text, name, tmp_path)
     assert told.reduced == lost
-    if not lost:
-        assert through(text, name, tmp_path) == text
+    if name == "candump":
+        assert out.read_text() == text
+    if name == "blf":
+        back = converted_log(out, "blf", "candump")
+        assert back.content.decode() == "(1714557600.249713) can0 080#\n(1714557600.250000) can0 080#\n"
+        assert back.reduced == {"times finer than 1 us": 1}
+        assert [frame.t_ns for frame in blf_log.read(out, Counter())] == [NOW_NS + 249713123, NOW_NS + 250000000]
 
 
 IDS = st.one_of(st.integers(0, 0x7FF), st.integers(0, 0x1FFFFFFF).map(EXTENDED_FLAG.__or__))

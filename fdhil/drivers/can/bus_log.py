@@ -44,6 +44,7 @@ class ConvertedLog:
 class _Survey:
     """What the frames of a log have in common, and what ``format_name`` does not have of them."""
 
+    source: str
     format_name: str
     frames: int = 0
     first_ns: int = 0
@@ -64,28 +65,35 @@ class _Survey:
         self.buses[frame.bus] = None
         fine = frame.t_ns % 1000 != 0
         self.is_fine |= fine
-        if self.format_name in ("asc", "trc"):
+        if self.format_name != "blf" and not self.keeps_fine_times:
             self.reduced[FINE_TIMES] += fine
         if self.format_name == "asc" and frame.is_error:
             generic = error_frame(frame.t_ns, frame.bus, frame.sent)
             self.reduced[ERROR_DETAILS] += frame != generic
 
-    def header(self, source: str) -> LogHeader:
+    @property
+    def keeps_fine_times(self) -> bool:
+        """Whether nine digits are written: only where they were read, since most programs that read candump's logs
+        take the digits for microseconds, however many there are."""
+        return self.source == self.format_name == "candump"
+
+    def header(self) -> LogHeader:
         """Return the head of the log that is written."""
         start_ns = self.first_ns // _MILLISECOND_NS * _MILLISECOND_NS
-        shows_received = self.is_sent or source == "candump"
-        return LogHeader(start_ns, number_buses(self.buses), shows_received, 9 if self.is_fine else 6)
+        shows_received = self.is_sent or self.source == "candump"
+        digits = 9 if self.is_fine and self.keeps_fine_times else 6
+        return LogHeader(start_ns, number_buses(self.buses), shows_received, digits)
 
 
 def converted_log(path: Path, source: str, target: str) -> ConvertedLog:
     """Return a log of format ``source`` in the format ``target``; RecordingError when it is none."""
-    survey, skipped = _Survey(target), Counter[str]()
+    survey, skipped = _Survey(source, target), Counter[str]()
     for frame in _frames(path, source, skipped):
         survey.add(frame)
     if not survey.frames:
         lost = "".join(f"; {count} {what}, which {target} does not have" for what, count in survey.left_out.items())
         raise RecordingError(f"{path} has no frame{lost}: it is no log of a bus, or nothing was on it")
-    header = survey.header(source)
+    header = survey.header()
     with TemporaryDirectory() as folder:
         part = Path(folder) / "log"
         frames = (frame for frame in _frames(path, source, Counter()) if not _is_left_out(frame, target))

@@ -16,6 +16,7 @@ from fdhil.drivers.can.logged_frame import (
     LogHeader,
     decimal_ns,
     lines_of,
+    micros,
 )
 from fdhil.errors import RecordingError
 
@@ -57,8 +58,8 @@ def _flagged(can_id: int, is_long: bool) -> int:
 
 def format_frame(frame: LoggedFrame, header: LogHeader) -> str:
     """Return the line of a frame."""
-    second, fraction = divmod(frame.t_ns, 1_000_000_000)
-    stamp = f"({second}.{f'{fraction:09d}'[: header.digits]})"
+    second, fraction = divmod(frame.t_ns if header.digits == 9 else micros(frame.t_ns), 10**header.digits)
+    stamp = f"({second}.{fraction:0{header.digits}d})"
     raw = f"_{frame.dlc:X}" if frame.fd is None and frame.dlc > CLASSIC_BYTES else ""
     way = " T" if frame.sent else " R" if frame.sent is False and header.shows_received else ""
     return f"{stamp} {frame.bus} {shown_id(frame.can_id)}#{_content(frame)}{raw}{way}\n"
