@@ -9,6 +9,9 @@ VCAN   := bash tests/integration/vcan-vm.sh -t 1800 -M 2048
 # tests against LinuxCNC stand in these folders; of it a computer runs one at a time
 LINUXCNC := tests/linuxcnc tests/program
 
+# with COVERAGE=1 the tests note which branches of the guard they take
+PYTEST  = $(BIN)/python $(if $(COVERAGE),-m coverage run) -m pytest
+
 # of make fuzz: inputs to each way in, and when to go on to the next one before that
 N       ?= 2000
 SECONDS ?= 100000
@@ -16,7 +19,7 @@ SECONDS ?= 100000
 # a child process need not translate fdhil anew
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup docs demo test test-vcan test-full faults fuzz guard mutants audit loaded lint bench study lock clean
+.PHONY: help setup docs demo test test-system test-full test-vcan near nightly faults fuzz guard mutants audit loaded lint bench study lock clean
 
 help:            ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -46,23 +49,34 @@ setup: $(VENV)/.kernels ## make .venv with everything in it, kernels compiled
 demo: setup      ## the whole loop on the simulated machine; the report is out/report.html
 	@$(BIN)/fdhil demo --out out
 
-test: setup      ## the default tests: in-process bus and loopback hub, no Debian packages
-	@$(BIN)/python -m pytest -q -m "not socketcan and not debian" -n 2 --dist loadfile
+test: setup      ## the fast tests: no processes, no Debian packages
+	@$(PYTEST) -q -m "not system" -n 2 --dist loadfile
+
+test-system: setup ## the tests with processes, terminals, browsers, brokers and other people's programs; needs Debian packages
+	@command -v rs274 >/dev/null || { echo "make test-system needs rs274: apt-get install linuxcnc-uspace" >&2; exit 1; }
+	@command -v npm >/dev/null || { echo "make test-system needs npm: apt-get install nodejs npm" >&2; exit 1; }
+	@command -v chromium >/dev/null || { echo "make test-system needs chromium: apt-get install chromium" >&2; exit 1; }
+	@PATH="$$PATH:/usr/sbin"; command -v mosquitto >/dev/null || { echo "make test-system needs mosquitto: apt-get install mosquitto" >&2; exit 1; }
+	@command -v promtool >/dev/null || { echo "make test-system needs promtool: apt-get install prometheus" >&2; exit 1; }
+	@command -v strace >/dev/null && command -v faketime >/dev/null || { echo "make test-system needs strace and faketime: apt-get install strace faketime" >&2; exit 1; }
+	@PATH="$$PATH:/usr/sbin"; command -v nats-server >/dev/null && ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 || { echo "make test-system needs nats-server and PostgreSQL: apt-get install nats-server postgresql" >&2; exit 1; }
+	@npm ci --prefix tests/foreign --ignore-scripts --no-audit --no-fund --silent
+	@$(PYTEST) -q -m "system and debian and not socketcan" $(LINUXCNC)
+	@$(PYTEST) -q -m "system and not socketcan" $(LINUXCNC:%=--ignore %) -n 3 --dist loadfile
+
+test-full: test test-system ## both
 
 test-vcan: setup ## the integration suite and the socket tests on a real SocketCAN interface
 	@$(VCAN) $(BIN)/python -m pytest -q -p no:cacheprovider -m socketcan tests/socketcan tests/integration tests/foreign
 
-test-full: test  ## adds the tests against programs of others: LinuxCNC (linuxcnc-uspace), a CANopen stack (nodejs, npm), a browser (chromium), mosquitto, prometheus, strace, faketime, nats-server, postgresql
-	@command -v rs274 >/dev/null || { echo "make test-full needs rs274: apt-get install linuxcnc-uspace" >&2; exit 1; }
-	@command -v npm >/dev/null || { echo "make test-full needs npm: apt-get install nodejs npm" >&2; exit 1; }
-	@command -v chromium >/dev/null || { echo "make test-full needs chromium: apt-get install chromium" >&2; exit 1; }
-	@PATH="$$PATH:/usr/sbin"; command -v mosquitto >/dev/null || { echo "make test-full needs mosquitto: apt-get install mosquitto" >&2; exit 1; }
-	@command -v promtool >/dev/null || { echo "make test-full needs promtool: apt-get install prometheus" >&2; exit 1; }
-	@command -v strace >/dev/null && command -v faketime >/dev/null || { echo "make test-full needs strace and faketime: apt-get install strace faketime" >&2; exit 1; }
-	@PATH="$$PATH:/usr/sbin"; command -v nats-server >/dev/null && ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 || { echo "make test-full needs nats-server and PostgreSQL: apt-get install nats-server postgresql" >&2; exit 1; }
-	@npm ci --prefix tests/foreign --ignore-scripts --no-audit --no-fund --silent
-	@$(BIN)/python -m pytest -q -m debian $(LINUXCNC)
-	@$(BIN)/python -m pytest -q -m debian $(LINUXCNC:%=--ignore %) -n 2 --dist loadfile
+near: setup      ## the fast tests nearest to what was changed, as many as fit into half a minute
+	@$(BIN)/python -m pytest -q -m "not system" -p tests.near -n 2 --dist loadfile
+
+nightly: setup   ## what takes hours: fuzzing by the million, Monte-Carlo studies, mutants, the fault matrix (power cuts among it)
+	@$(MAKE) fuzz N=1000000
+	@$(MAKE) study
+	@$(MAKE) mutants
+	@$(MAKE) faults
 
 faults: setup    ## the fault matrix, row by row, and the goals R1 to R20: to docs/studies/faults.md; needs what make test-full needs
 	@$(BIN)/python -m pytest -q -p tests.fault_table --fault-table docs/studies/faults.md -m "(fault or goal) and not socketcan"
@@ -76,7 +90,7 @@ guard: setup     ## the guard's own tests, in its processes too; a branch of it 
 	@$(BIN)/python -m coverage erase
 	@$(BIN)/python -m coverage run -m pytest -q -m "not socketcan and not debian" -n 2 --dist loadfile tests/guard
 	@$(BIN)/python -m coverage combine -q
-	@$(BIN)/python -m coverage report --include 'fdhil/guard/*' --show-missing --skip-covered --fail-under 100
+	@$(BIN)/python -m coverage report --show-missing --skip-covered --fail-under 100
 	@$(BIN)/python -m coverage erase
 
 mutants: setup   ## what the guard's tests notice of mistakes put into it, one at a time (hours); the page is docs/studies/mutants.md

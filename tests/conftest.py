@@ -14,6 +14,7 @@ from hypothesis import Phase, settings
 
 from fdhil.guard.signals import KEPT
 
+pytest_plugins = ["tests.tiers"]
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported; as the command line does
 gc.disable()  # until all tests are collected
 

@@ -1,0 +1,91 @@
+"""Sorts tests into tiers by what they request, and fails a test that does more than its tier allows.
+
+A test is of the *system* tier when it requests one of ``SYSTEM_FIXTURES``, itself or through another fixture, or needs
+a Debian package or a CAN interface; all others are of the *fast* tier. ``make test`` runs the fast tier, ``make
+test-system`` the system tier. A fast test starts no process, does not sleep and uses little processor time; what it
+does beyond that is its failure, with the name of the fixture to request.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+SYSTEM_FIXTURES = frozenset({"processes", "long_computation"})
+SYSTEM_MARKS = ("debian", "socketcan")
+MOST_SLEEP_S = 0.1
+MOST_PROCESSOR_S = 5.0  # a guard against what grew by a factor: the slowest test needs a third of it
+STARTS_PROCESS = frozenset({"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.exec"})
+WHOLE_MODULE = re.compile(r"^pytestmark = .*(usefixtures\(\"processes\"|mark\.(debian|socketcan))", re.MULTILINE)
+
+
+class AuditTrail:
+    """What Python's audit events report of the test that runs: processes started, seconds slept."""
+
+    def __init__(self) -> None:
+        self.processes: list[str] = []
+        self.slept_s = 0.0
+        sys.addaudithook(self._record)
+
+    def clear(self) -> None:
+        """Forget the test before."""
+        self.processes.clear()
+        self.slept_s = 0.0
+
+    def _record(self, event: str, arguments: tuple[object, ...]) -> None:
+        if event in STARTS_PROCESS:
+            self.processes.append(f"{event}{arguments[:2]}"[:120])
+        elif event == "time.sleep":
+            self.slept_s += float(arguments[0])  # type: ignore[arg-type] # a number, by Python's table of audit events
+
+
+TRAIL = AuditTrail()
+
+
+@pytest.fixture(scope="session")
+def processes() -> None:
+    """Allow a test to start processes and to wait for them: it is of the system tier."""
+
+
+@pytest.fixture(scope="session")
+def long_computation() -> None:
+    """Allow a test to compute for longer than the fast tier can afford: it is of the system tier."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests of the system tier, before ``-m`` selects."""
+    for item in items:
+        requested = SYSTEM_FIXTURES.intersection(getattr(item, "fixturenames", ()))
+        if requested or any(item.get_closest_marker(mark) for mark in SYSTEM_MARKS):
+            item.add_marker("system")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave modules unread that are of the system tier as a whole, where that tier is not wanted: imports cost."""
+    if config.option.markexpr != "not system" or collection_path.suffix != ".py":
+        return None
+    return True if WHOLE_MODULE.search(collection_path.read_text("utf-8")) else None
+
+
+@pytest.fixture(autouse=True)
+def within_tier(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Fail a test of the fast tier that starts a process, sleeps, or computes for long."""
+    TRAIL.clear()
+    start_s = time.process_time()
+    yield
+    if request.node.get_closest_marker("system"):
+        return
+    used_s = time.process_time() - start_s
+    fast = "a test of the fast tier"
+    assert not TRAIL.processes, f"{fast} starts a process, {TRAIL.processes[0]}: request the fixture 'processes'"
+    assert TRAIL.slept_s <= MOST_SLEEP_S, f"{fast} sleeps {TRAIL.slept_s:.2f} s: wait for an event, on a virtual clock"
+    assert used_s <= MOST_PROCESSOR_S, (
+        f"{fast} used {used_s:.1f} s of processor time, more than {MOST_PROCESSOR_S:g}: share the result in the "
+        "module, or request the fixture 'long_computation'"
+    )
