@@ -83,7 +83,7 @@ def _document(
         },
         "profile": profile.name,
         "suggested_profile": suggested,
-        "notes": list(profile.notes),
+        "notes": [*profile.notes, *device.doubts],
         "abilities": [asdict(ability) for ability in found],
         "named_alike": {what: [_object(at) for at in objects] for what, objects in alike.items()},
         "pdos": [_pdo(spec) for spec in (*profile.rpdos, *profile.tpdos)],
@@ -137,7 +137,7 @@ def _show(
     for what, objects in alike.items():
         if objects:
             out.print(Text(f"by its name may be {CANDIDATES[what]}: {_named(objects)}"), soft_wrap=True)
-    for note in profile.notes if device.is_drive else ():
+    for note in (*profile.notes, *device.doubts) if device.is_drive else device.doubts:
         out.print(Text(f"note: {note}"), soft_wrap=True)
     _show_pdos(out, profile if device.is_drive else None)
 

@@ -13,12 +13,12 @@ from typing import Literal
 from fdhil import tables
 from fdhil.cia402 import Object
 from fdhil.drivers.cia402.device import Device, DeviceObject, PdoPlace
+from fdhil.drivers.cia402.mapping import SYNC_TYPES
 from fdhil.drivers.cia402.profile import DriveProfile, ObjectKey, PdoSpec
 from fdhil.drivers.cia402.profile_file import read_profile
 
 Answer = Literal["yes", "no", "perhaps"]
 SYNC_ID = 0x1005
-SYNC_TYPES = range(1, 241)
 SENSOR = "wire a sensor ([axis.X.voltage] source = 'modbus')"
 GENERIC = "cia402"
 _TWIN = "fdhil_twin"
@@ -122,25 +122,37 @@ def _mapped(device: Device, profile: DriveProfile) -> Ability:
     differ += [spec.name for spec in profile.tpdos if not _same(spec, device.tpdos)]
     if not differ:
         return Ability("mapping", "yes", "its default PDOs are the profile's")
-    stuck = [name for name in differ if _stuck(device, name)]
+    specs = [*((spec, device.rpdos) for spec in profile.rpdos), *((spec, device.tpdos) for spec in profile.tpdos)]
+    stuck = [spec.name for spec, places in specs if spec.name in differ and _stuck(spec, places)]
     if stuck:
-        why = f"it has no {', '.join(stuck)}, or of another mapping that is fixed"
+        why = f"it has no {', '.join(stuck)}, or of another mapping, COB-ID or type that is fixed"
         return Ability("mapping", "no", why, "choose profile 'cia402', which takes what the EDS offers")
     why = f"{', '.join(differ)} must be set up: the defaults are others"
     return Ability("mapping", "yes", why, "`fdhil commission --set-pdos`, or the drive's own tool")
 
 
 def _same(spec: PdoSpec, places: Sequence[PdoPlace]) -> bool:
-    place = next((place for place in places if place.number == spec.number), None)
-    if place is None or place.mapped != tuple(entry.mapping for entry in spec.entries):
+    place = _place_of(spec, places)
+    if place is None or place.mapped != _words(spec):
         return False
     return place.valid == spec.valid and place.cob_base == spec.cob_base and place.kind == spec.every_sync
 
 
-def _stuck(device: Device, name: str) -> bool:
-    places = device.rpdos if name.startswith("R") else device.tpdos
-    place = next((place for place in places if f"{name[:4]}{place.number}" == name), None)
-    return place is None or place.fixed
+def _stuck(spec: PdoSpec, places: Sequence[PdoPlace]) -> bool:
+    """Whether a PDO is not the profile's and cannot be made so."""
+    place = _place_of(spec, places)
+    if place is None or (place.fixed and place.mapped != _words(spec)):
+        return True
+    other_id = place.valid != spec.valid or place.cob_base not in (None, spec.cob_base)
+    return (place.cob_fixed and other_id) or (place.kind_fixed and place.kind != spec.every_sync)
+
+
+def _place_of(spec: PdoSpec, places: Sequence[PdoPlace]) -> PdoPlace | None:
+    return next((place for place in places if place.number == spec.number), None)
+
+
+def _words(spec: PdoSpec) -> tuple[int, ...]:
+    return tuple(entry.mapping for entry in spec.entries)
 
 
 def _voltage(device: Device, profile: DriveProfile) -> Ability:
@@ -230,10 +242,14 @@ def _safety(device: Device, profile: DriveProfile) -> Iterator[Ability]:
         yield Ability("stop alone", "yes", f"6007 = {values} and 1016 make it stop when the heartbeat is lost")
     if device.find((int(Object.PRODUCER_HEARTBEAT), 0)) is None:
         yield Ability("heartbeat", "no", "it sends none (1017): only its PDOs show that it lives")
-    elif not device.default(Object.PRODUCER_HEARTBEAT):
+        return
+    period_ms = device.default(Object.PRODUCER_HEARTBEAT)
+    if period_ms is None:
+        yield Ability("heartbeat", "yes", "its EDS does not say its period (1017)", "set it to 100")
+    elif not period_ms:
         yield Ability("heartbeat", "yes", "1017 is 0 by default", "set it to 100")
     else:
-        yield Ability("heartbeat", "yes", f"1017 is {device.default(Object.PRODUCER_HEARTBEAT)} ms")
+        yield Ability("heartbeat", "yes", f"1017 is {period_ms} ms")
 
 
 def _scale(device: Device) -> Iterator[Ability]:

@@ -8,22 +8,21 @@ from pathlib import Path
 from typing import Any
 
 from fdhil.cia402 import LOGICAL_AXES, LOGICAL_AXIS_STEP, Object
+from fdhil.drivers.cia402.eds_numbers import octal_reading, read_number
 from fdhil.drivers.cia402.profile import ObjectKey
 
 MOST_PDOS = 512
+COB_ID_BITS, EXTENDED = 0x7FF, 1 << 29
 DRIVE = 402
-_NODE = 1  # resolves $NODEID; taken off again
-# data types of CiA 301, 7.4.7.1: bits and whether signed; what is no integer cannot be decoded from a PDO
-_INTEGERS: Mapping[int, tuple[int, bool]] = {
-    0x01: (1, False), 0x02: (8, True), 0x03: (16, True), 0x04: (32, True), 0x05: (8, False), 0x06: (16, False),
-    0x07: (32, False), 0x10: (24, True), 0x12: (40, True), 0x13: (48, True), 0x14: (56, True), 0x15: (64, True),
-    0x16: (24, False), 0x18: (40, False), 0x19: (48, False), 0x1A: (56, False), 0x1B: (64, False),
-}  # fmt: skip
+_ANY_NODE = 1  # resolves $NODEID of a file that is of no node; taken off again
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceObject:
-    """One variable of the dictionary; ``bits`` 0: it is no integer. ``default`` None: the file gives none."""
+    """One variable of the dictionary; ``bits`` 0: it is no integer. ``default`` None: the file gives none.
+
+    ``relative``: the default contains the node-ID. ``doubt`` is how a default with a leading zero can be read, too.
+    """
 
     key: ObjectKey
     name: str
@@ -32,6 +31,13 @@ class DeviceObject:
     access: str
     mappable: bool
     default: int | None
+    relative: bool = False
+    doubt: str = ""
+
+    @property
+    def fixed(self) -> bool:
+        """Whether it cannot be written."""
+        return self.access in ("ro", "const")
 
     @property
     def in_rpdo(self) -> bool:
@@ -53,7 +59,8 @@ class DeviceObject:
 class PdoPlace:
     """One PDO of the device: its number, default COB-ID less the node-ID, and how many objects it can map.
 
-    ``mapped`` are the default mapping words; ``fixed``: they cannot be written. ``cob_base`` None: the file gives none.
+    ``mapped`` are the default mapping words; ``fixed``: they cannot be written. ``cob_base`` None: the file gives none,
+    or one that belongs to a node it does not name. ``cob_fixed``, ``kind_fixed``: COB-ID and transmission type stay.
     """
 
     number: int
@@ -63,6 +70,8 @@ class PdoPlace:
     room: int
     mapped: tuple[int, ...]
     fixed: bool
+    cob_fixed: bool = False
+    kind_fixed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +86,11 @@ class Device:
     objects: Mapping[ObjectKey, DeviceObject]
     rpdos: tuple[PdoPlace, ...]
     tpdos: tuple[PdoPlace, ...]
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What the file writes so that it can be read in two ways, a sentence each."""
+        return tuple(found.doubt for found in self.objects.values() if found.doubt)
 
     def find(self, key: ObjectKey) -> DeviceObject | None:
         """Return an object, None where the device has none."""
@@ -110,7 +124,10 @@ def read_device(path: Path) -> Device:
     """Read an EDS or DCF file; EdsError when it cannot be read. A DCF's values count as its defaults."""
     from fdhil.drivers.cia402.eds import load_eds  # late: most profiles need no EDS, and its library loads slowly
 
-    dictionary = load_eds(path, _NODE)
+    dictionary = load_eds(path)
+    own = dictionary.node_id  # of a DCF: its absolute COB-IDs are of this node (CiA 306)
+    if own is None:
+        dictionary = load_eds(path, _ANY_NODE)
     told = dictionary.device_information
     objects = {found.key: found for found in _objects(dictionary)}
     identity = [objects.get((int(Object.IDENTITY), sub)) for sub in (1, 2)]
@@ -122,17 +139,24 @@ def read_device(path: Path) -> Device:
         vendor_id=int(told.vendor_number or 0) or vendor,
         product_code=int(told.product_number or 0) or product,
         objects=objects,
-        rpdos=_pdos(objects, Object.RPDO_PARAMETER, Object.RPDO_MAPPING),
-        tpdos=_pdos(objects, Object.TPDO_PARAMETER, Object.TPDO_MAPPING),
+        rpdos=_pdos(objects, Object.RPDO_PARAMETER, Object.RPDO_MAPPING, own),
+        tpdos=_pdos(objects, Object.TPDO_PARAMETER, Object.TPDO_MAPPING, own),
     )
 
 
 def _objects(dictionary: Any) -> Iterable[DeviceObject]:
+    from fdhil.drivers.cia402.eds import INTEGERS
+
     for index in dictionary:
         entry = dictionary[index]
         for sub, variable in getattr(entry, "subindices", {0: entry}).items():
-            bits, signed = _INTEGERS.get(variable.data_type, (0, False))
+            bits, signed = INTEGERS.get(variable.data_type, (0, False))
+            written = getattr(variable, "value_raw", None) or getattr(variable, "default_raw", None) or ""
             value = variable.default if variable.value is None else variable.value
+            octal = octal_reading(written) if bits else None
+            if octal is not None:
+                value = read_number(written)
+            shown = f"{index:04X}:{sub:02X} is written {written}"
             yield DeviceObject(
                 key=(index, sub),
                 name=entry.name if entry.name == variable.name else f"{entry.name}: {variable.name}",
@@ -141,10 +165,14 @@ def _objects(dictionary: Any) -> Iterable[DeviceObject]:
                 access=str(variable.access_type).lower(),
                 mappable=bool(variable.pdo_mappable),
                 default=value if isinstance(value, int) else None,
+                relative="$NODEID" in written,
+                doubt="" if octal is None else f"{shown}: taken as {value}, it is {octal} if octal is meant",
             )
 
 
-def _pdos(objects: Mapping[ObjectKey, DeviceObject], parameter: int, mapping: int) -> tuple[PdoPlace, ...]:
+def _pdos(
+    objects: Mapping[ObjectKey, DeviceObject], parameter: int, mapping: int, own: int | None
+) -> tuple[PdoPlace, ...]:
     found = []
     for place in range(MOST_PDOS):
         cob, kind = (objects.get((parameter + place, sub)) for sub in (1, 2))
@@ -154,16 +182,27 @@ def _pdos(objects: Mapping[ObjectKey, DeviceObject], parameter: int, mapping: in
         count = objects.get((mapping + place, 0))
         words = [slot.default or 0 for slot in slots]
         mapped = words[: len(words) if count is None or count.default is None else count.default]
-        number = None if cob.default is None else cob.default & 0x7FF
         found.append(
             PdoPlace(
                 number=place + 1,
-                cob_base=number - _NODE if number else None,
+                cob_base=_cob_base(cob, own),
                 valid=cob.default is None or not cob.default >> 31 & 1,
                 kind=None if kind is None else kind.default,
                 room=len(slots),
                 mapped=tuple(word for word in mapped if word),
-                fixed=bool(slots) and all(slot.access in ("ro", "const") for slot in slots),
+                fixed=bool(slots) and all(slot.fixed for slot in slots),
+                cob_fixed=cob.fixed,
+                kind_fixed=kind is None or kind.fixed,
             )
         )
     return tuple(found)
+
+
+def _cob_base(cob: DeviceObject, own: int | None) -> int | None:
+    """Return a COB-ID less the node-ID that it contains; None where none is given, or it is an unknown node's."""
+    number = (cob.default or 0) & COB_ID_BITS
+    if not number or (cob.default or 0) & EXTENDED:
+        return None
+    if cob.relative or own is not None:
+        return number - (own or _ANY_NODE)
+    return None if number & 0x7F else number  # without a node-ID: it was left out of the file

@@ -11,12 +11,14 @@ import configparser
 import io
 import re
 from bisect import bisect_left
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from canopen.objectdictionary import ObjectDictionary, import_od
 
+from fdhil.drivers.cia402.eds_compact_storage import is_list, written_out
+from fdhil.drivers.cia402.eds_numbers import octal_reading, read_expression, read_number
 from fdhil.errors import EdsError
 
 MAX_BYTES = 2 * 1024 * 1024
@@ -25,16 +27,28 @@ MAX_SECTIONS, MAX_KEYS = 8_000, 50_000  # with these it is as quick
 MAX_LINE = 4096
 MAX_SUB_INDEX = 254
 
+_NODE_IDS = range(1, 128)
+_NO_NODE_ID = (0, 255)  # as files of no node have it
 _LIBRARY_ERRORS = (ValueError, TypeError, AttributeError, LookupError, configparser.Error)
 _SECTION = re.compile(r"\[([^\]]*)\]")
-_OBJECT = re.compile(r"[0-9A-Fa-f]{4}(sub[0-9A-Fa-f]{1,2})?$", re.IGNORECASE)
+_OBJECT = re.compile(r"([0-9A-F]{4})(?:sub([0-9A-F]{1,2}))?$", re.IGNORECASE)
+_COMMISSIONING = re.compile(r"device[ _]?com+is+ion+ing$", re.IGNORECASE)
+_NODE_KEY = re.compile(r"node[ _-]?id$", re.IGNORECASE)
 _KEY = re.compile(r"[A-Za-z0-9_ ]+$")
+_VALUE_KEYS = ("DefaultValue", "ParameterValue")
+_PDO_SET_UP = range(0x1400, 0x1C00)
+# data types of CiA 301, 7.4.7.1: bits and whether signed; what is no integer cannot be decoded from a PDO
+INTEGERS: Mapping[int, tuple[int, bool]] = {
+    0x01: (1, False), 0x02: (8, True), 0x03: (16, True), 0x04: (32, True), 0x05: (8, False), 0x06: (16, False),
+    0x07: (32, False), 0x10: (24, True), 0x12: (40, True), 0x13: (48, True), 0x14: (56, True), 0x15: (64, True),
+    0x16: (24, False), 0x18: (40, False), 0x19: (48, False), 0x1A: (56, False), 0x1B: (64, False),
+}  # fmt: skip
 _TEXT_KEYS = frozenset({"ParameterName", "VendorName", "ProductName", "OrderCode", "Description", "FileName"})
 _NUMBER_KEYS = frozenset(
     {
         "VendorNumber", "ProductNumber", "RevisionNumber", "SimpleBootUpMaster", "SimpleBootUpSlave", "Granularity",
         "DynamicChannelsSupported", "GroupMessaging", "NrOfRXPDO", "NrOfTXPDO", "LSS_Supported", "ObjectType",
-        "PDOMapping", "SubNumber", "NrOfEntries", "CompactSubObj", "DataType",
+        "PDOMapping", "SubNumber", "NrOfEntries", "CompactSubObj", "DataType", "CompactPDO",
         *(f"BaudRate_{rate}" for rate in (10, 20, 50, 125, 250, 500, 800, 1000)),
         *(f"Dummy{number:04d}" for number in range(1, 8)),
     }
@@ -56,7 +70,10 @@ class _Section:
 
 
 def load_eds(path: Path, node_id: int | None = None) -> ObjectDictionary:
-    """Read an EDS or DCF file; ``node_id`` resolves $NODEID. EdsError when it cannot be read or is no EDS."""
+    """Read an EDS or DCF file; EdsError when it cannot be read or is no EDS.
+
+    ``node_id`` resolves $NODEID, left out: the node-ID that a DCF has itself. The dictionary has the one that was used.
+    """
     if path.exists() and not path.is_file() and not path.is_dir():  # a pipe would be waited for without end
         raise EdsError(str(path), "it is no plain file; check the path")
     try:
@@ -109,7 +126,7 @@ def _sections(raw: bytes, name: str) -> list[_Section]:
     for number, line in _lines(raw, name):
         header = _SECTION.match(line)
         if header:
-            title = header[1].strip()
+            title = _title(header[1].strip())
             if title not in sections:
                 sections[title] = _Section(title, number)
                 objects += bool(_OBJECT.match(title))
@@ -125,7 +142,24 @@ def _sections(raw: bytes, name: str) -> list[_Section]:
         raise EdsError(name, "line 1: it is XML (an XDD, or an ESI of EtherCAT); ask the drive's maker for its EDS")
     if not any(_OBJECT.match(title) for title in sections):
         raise EdsError(name, "line 1: it has no object at all; this is no EDS file")
-    return _complete(sections)
+    for title, values in written_out({title: section.values for title, section in sections.items()}):
+        sections[title] = _Section(title, _line_of(title, sections), {**values})
+        if len(sections) > MAX_SECTIONS:
+            raise EdsError(name, f"it has more than {MAX_SECTIONS} objects in compact form; this is no drive's EDS")
+    return _complete(sections, name)
+
+
+def _title(found: str) -> str:
+    """Return the name of a section as the library has it."""
+    if match := _OBJECT.match(found):
+        return match[1].upper() + (f"sub{int(match[2], 16):X}" if match[2] else "")
+    return "DeviceComissioning" if _COMMISSIONING.match(found) else found
+
+
+def _line_of(title: str, sections: Mapping[str, _Section]) -> int:
+    """The line of a section, or of the object that it was made of."""
+    found = sections.get(title) or sections.get(title[:4]) or sections.get("DeviceInfo")
+    return found.line if found else 1
 
 
 def _lines(raw: bytes, name: str) -> Iterator[tuple[int, str]]:
@@ -143,13 +177,13 @@ def _lines(raw: bytes, name: str) -> Iterator[tuple[int, str]]:
 
 
 def _store(section: _Section, key: str, value: str, line: int, name: str) -> None:
-    key = _KNOWN.get(key.lower(), key)
+    key = "NodeID" if _NODE_KEY.match(key) else _KNOWN.get(key.lower(), key)
     if not _KEY.match(key):
         return
     marks = r"\s;.*$" if key in _TEXT_KEYS else r"(^|\s)[;#].*$"
     value = re.sub(marks, "", " " + value).strip()
     if key in _NUMBER_KEYS:
-        number = _number(value)
+        number = read_number(value) if value else 0
         if number is None:
             raise EdsError(name, f"line {line}: {key} is {value[:40]!r} where a number belongs; correct it")
         if key in ("CompactSubObj", "NrOfEntries") and number > MAX_SUB_INDEX:
@@ -158,33 +192,74 @@ def _store(section: _Section, key: str, value: str, line: int, name: str) -> Non
     section.values[key] = value
 
 
-def _number(text: str) -> int | None:
-    """Read a number as it is found: blank is 0, leading zeros are decimal."""
-    if not text:
-        return 0
-    try:
-        return int(text, 0)
-    except ValueError:
-        return int(text) if text.isascii() and text.isdigit() and len(text) < 20 else None
-
-
-def _complete(sections: dict[str, _Section]) -> list[_Section]:
+def _complete(sections: dict[str, _Section], name: str) -> list[_Section]:
     """Drop what the library stumbles over, fill in what it insists on, and put objects before their sub-objects."""
-    for title in [t for t in sections if t.lower() in ("comments", "")]:
+    for title in [t for t in sections if t.lower() in ("comments", "") or is_list(t)]:
         del sections[title]
     sections.setdefault("DeviceInfo", _Section("DeviceInfo", 1))
+    parents = {match[1] for title in sections if (match := _OBJECT.match(title)) and match[2]}
     for section in sections.values():
         if section.name.lower() == "dummyusage":
             for number in range(1, 8):
                 section.values.setdefault(f"Dummy{number:04d}", "0")
         elif section.name == "DeviceComissioning":
-            for key in ("NodeID", "Baudrate"):
-                number_text = section.values.pop(key, "")
-                if number_text and _number(number_text) is not None:
-                    section.values[key] = str(_number(number_text))
+            section.values = _commissioning(section, name)
         elif _OBJECT.match(section.name):
+            section.values.pop("CompactSubObj", None)
             section.values.setdefault("ParameterName", section.name)
             section.values.setdefault("AccessType", "ro")
             if section.values.get("ObjectType") == "0":
                 del section.values["ObjectType"]
+            if section.name in parents and section.values.get("ObjectType") != "8":
+                section.values["ObjectType"] = "9"
+            if read_number(section.values.get("DataType", "")) in INTEGERS:
+                _complete_values(section, name)
     return sorted(sections.values(), key=lambda s: (bool(_OBJECT.match(s.name)) and len(s.name) > 4, s.line))
+
+
+def _commissioning(section: _Section, name: str) -> dict[str, str]:
+    """The node-ID and bit rate of a DCF; EdsError for a node-ID that is none, or can be read in two ways."""
+    found: dict[str, str] = {}
+    for key, text in section.values.items():
+        number = read_number(text)
+        if key == "NodeID" and text:
+            _require_one_reading(section, "NodeID", text, name)
+            if number in _NO_NODE_ID:
+                continue
+            if number is None or number not in _NODE_IDS:
+                what = f"line {section.line}: NodeID is {text[:40]!r}, not from 1 to 127"
+                raise EdsError(name, f"{what}: its COB-IDs are of no known node; correct it or leave it out")
+            found["NodeID"] = str(number)
+        elif key == "Baudrate" and number is not None:
+            found["Baudrate"] = str(number)
+    return found
+
+
+def _complete_values(section: _Section, name: str) -> None:
+    """Write the numbers of an object as the library reads them; EdsError where a PDO's can be read in no or two ways.
+
+    Any other number that is written in octal or decimal stays as it is: whoever needs it names both.
+    """
+    of_pdo = int(section.name[:4], 16) in _PDO_SET_UP
+    for key in _VALUE_KEYS:
+        text = section.values.get(key, "")
+        found = read_expression(text)
+        if of_pdo and text:
+            _require_one_reading(section, key, text, name)
+            if found is None:
+                what = f"line {section.line}: {key} of [{section.name}] is {text[:40]!r} where a number belongs"
+                raise EdsError(name, f"{what}; correct it or leave it out")
+        if (found is None and text) or octal_reading(text) is not None:
+            continue
+        if found is None:
+            section.values.pop(key, None)
+        else:
+            section.values[key] = f"$NODEID+{found[0]}" if found[1] else str(found[0])
+
+
+def _require_one_reading(section: _Section, key: str, text: str, name: str) -> None:
+    """EdsError where a number with a leading zero is another in octal than in decimal."""
+    if (octal := octal_reading(text)) is not None:
+        what = f"line {section.line}: {key} of [{section.name}] is {text[:40]!r}"
+        readings = f"as octal {octal:#x}, as decimal {read_expression(text)[0]:#x}"  # type: ignore[index] # it is one
+        raise EdsError(name, f"{what}: {readings}; write it without the leading zero, or with 0x")

@@ -6,7 +6,7 @@ and offset in a slower one. Where the device's mapping is fixed, its own is take
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 
 from fdhil.cia402 import COB_RPDO, COB_TPDO, Object, lay_out
@@ -14,6 +14,7 @@ from fdhil.drivers.cia402.device import Device, PdoPlace
 from fdhil.drivers.cia402.profile import ObjectKey, PdoSpec
 
 SLOW_EVERY = 10
+SYNC_TYPES = range(1, 241)
 MAX_BITS = 64
 Entry = tuple[int, int, int, bool]
 
@@ -21,7 +22,7 @@ Entry = tuple[int, int, int, bool]
 def suggest_rpdos(device: Device, target: ObjectKey, offset: ObjectKey, fed: Sequence[ObjectKey]) -> list[PdoSpec]:
     """Return RPDOs: controlword and target, the offset in one of its own, speed and torque offset not exchanged."""
     groups = [[(int(Object.CONTROLWORD), 0), target], [offset], list(fed)]
-    places = list(device.rpdos)
+    places = [place for place in device.rpdos if _has_cob_id(place, COB_RPDO)]
     found: list[PdoSpec] = []
     for keys in groups:
         entries = [device.entry(key) for key in keys if _sent(device, key)]
@@ -37,10 +38,11 @@ def suggest_rpdos(device: Device, target: ObjectKey, offset: ObjectKey, fed: Seq
 
 def suggest_tpdos(device: Device, fast: Iterable[ObjectKey], slow: Iterable[ObjectKey]) -> list[PdoSpec]:
     """Return TPDOs that carry ``fast`` with every SYNC and ``slow`` now and then, as far as there is room."""
-    if device.tpdos and all(place.fixed for place in device.tpdos):
-        kept = [_fixed(device, place, "TPDO", COB_TPDO) for place in device.tpdos]
+    places, fast = [place for place in device.tpdos if _has_cob_id(place, COB_TPDO)], list(fast)
+    if places and all(place.fixed for place in places):
+        kept = [_fixed(device, place, "TPDO", COB_TPDO, fast) for place in places]
         return [spec for spec in kept if spec is not None]
-    free = [place for place in device.tpdos if not place.fixed]
+    free = [place for place in places if not place.fixed]
     filled: list[tuple[PdoPlace, list[Entry], int]] = []
     for every, keys in ((1, fast), (SLOW_EVERY, slow)):
         for entry in filter(None, (device.entry(key) for key in keys if _heard(device, key))):
@@ -88,16 +90,30 @@ def _spec(place: PdoPlace, kind: str, bases: Sequence[int], entries: Sequence[En
     return PdoSpec(f"{kind}{place.number}", place.number, _cob_base(place, bases), lay_out(entries), every)
 
 
+def _has_cob_id(place: PdoPlace, bases: Sequence[int]) -> bool:
+    """Whether there is a COB-ID for it: CiA 301 has defaults for the first four only."""
+    return place.number <= len(bases) or bool(place.cob_base)
+
+
 def _cob_base(place: PdoPlace, bases: Sequence[int]) -> int:
     """The default of CiA 301 for the first four, else the device's own."""
-    return bases[place.number - 1] if place.number <= len(bases) else place.cob_base or bases[-1]
+    return bases[place.number - 1] if place.number <= len(bases) else place.cob_base or 0
 
 
-def _fixed(device: Device, place: PdoPlace, kind: str, bases: Sequence[int]) -> PdoSpec | None:
-    """The device's own mapping; None where a word of it is no object of the device's."""
+def _fixed(
+    device: Device, place: PdoPlace, kind: str, bases: Sequence[int], fast: Collection[ObjectKey] = ()
+) -> PdoSpec | None:
+    """The device's own mapping; None where a word of it is no object of the device's.
+
+    Its transmission type is set where that can be written: to every SYNC for what is ``fast``, and for set-points.
+    """
     entries = [device.entry((word >> 16, word >> 8 & 0xFF)) for word in place.mapped]
     whole = [entry for entry in entries if entry is not None]
     if not whole or len(whole) < len(entries) or sum(entry[2] for entry in whole) > MAX_BITS:
         return None
     base = place.cob_base or _cob_base(place, bases)
-    return PdoSpec(f"{kind}{place.number}", place.number, base, lay_out(whole), place.kind or 1, place.valid)
+    every = place.kind or 1
+    if not place.kind_fixed and (every not in SYNC_TYPES or kind == "RPDO" or any(e[:2] in fast for e in whole)):
+        slow = kind == "TPDO" and not any(entry[:2] in fast for entry in whole)
+        every = SLOW_EVERY if slow else 1
+    return PdoSpec(f"{kind}{place.number}", place.number, base, lay_out(whole), every, place.valid)

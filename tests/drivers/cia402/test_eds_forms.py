@@ -1,0 +1,222 @@
+"""Every form that CiA 306 gives an EDS or DCF says the same of the device: node-IDs, compact storage, numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fdhil.drivers.cia402.abilities import abilities
+from fdhil.drivers.cia402.device import Device, PdoPlace, read_device
+from fdhil.drivers.cia402.eds import MAX_SECTIONS, parse_eds
+from fdhil.drivers.cia402.eds_numbers import read_expression
+from fdhil.drivers.cia402.profile_file import read_profile
+from fdhil.errors import EdsError
+from tests.drivers.cia402.eds_text import COMMON, CURRENT, SERVO, U16, U32, Variable, eds_text, pdos
+
+TARGETS = {0x1600: (0x60400010, 0x607A0020), 0x1A00: (0x60640020, 0x606C0020), 0x1A01: (0x60410010, 0x60780010)}
+DEFAULT_BASES = [0x200, 0x300, 0x400, 0x500], [0x180, 0x280, 0x380, 0x480]
+
+
+def device_of(text: str, folder: Path, name: str = "drive.eds") -> Device:
+    path = folder / name
+    path.write_text(text)
+    return read_device(path)
+
+
+def bases(device: Device) -> tuple[list[int | None], list[int | None]]:
+    return [place.cob_base for place in device.rpdos], [place.cob_base for place in device.tpdos]
+
+
+def answers(text: str, folder: Path, name: str) -> dict[str, str]:
+    """Return what ``fdhil eds`` says of a file, by its points."""
+    device = device_of(text, folder, name)
+    return {
+        each.what: f"{each.answer}: {each.why}" for each in abilities(device, read_profile("cia402", folder / name))
+    }
+
+
+def as_dcf(node: int, commissioning: str) -> str:
+    """Return the servo's EDS as a DCF: each PDO has the absolute COB-ID that it has on that node."""
+    lines = []
+    for line in eds_text(SERVO).splitlines():
+        lines.append(line)
+        if line.startswith("DefaultValue=$NODEID+"):
+            lines.append(f"ParameterValue={int(line.partition('+')[2], 16) + node:#x}")
+    return "\n".join([commissioning, *lines, ""])
+
+
+@pytest.mark.parametrize(
+    "commissioning",
+    [
+        "[DeviceComissioning]\nNodeID=5",
+        "[DeviceCommissioning]\nNodeID=0x05",
+        "[DEVICECOMISSIONING]\nnodeid = 5 ; of axis X",
+        "[DeviceComissioning]\nBaudrate=1000\nNode_ID=005",
+        "[Device Commissioning]\nNode-ID=5\nNodeName=X",
+    ],
+)
+def test_absolute_cob_ids_of_a_dcf_belong_to_its_own_node(commissioning: str, tmp_path: Path) -> None:
+    assert bases(device_of(as_dcf(5, commissioning), tmp_path)) == DEFAULT_BASES
+    any_node = answers(eds_text(SERVO), tmp_path, "any.eds")
+    assert answers(as_dcf(5, commissioning), tmp_path, "node5.dcf") == any_node
+
+
+@pytest.mark.parametrize("node", ["", "[DeviceComissioning]\nNodeID=\n", "[DeviceComissioning]\nNodeID=255\n"])
+def test_absolute_cob_ids_of_an_unknown_node_are_none(node: str, tmp_path: Path) -> None:
+    assert bases(device_of(as_dcf(5, node), tmp_path)) == ([None] * 4, [None] * 4)
+
+
+def test_a_dcf_of_an_impossible_node_is_refused() -> None:
+    with pytest.raises(EdsError, match="NodeID is '128', not from 1 to 127"):
+        parse_eds(as_dcf(5, "[DeviceComissioning]\nNodeID=128").encode(), "a.dcf")
+
+
+@pytest.mark.parametrize(
+    ("written", "base", "valid"),
+    [
+        ("$NODEID+0x180", 0x180, True),
+        ("0x180 + $NodeID", 0x180, True),
+        ("$NODEID + 0x40000180", 0x180, True),
+        ("0x80000000+$NODEID+384", 0x180, False),
+        ("($NODEID+0x180)", 0x180, True),
+        ("$node_id+0x00000180UL", 0x180, True),
+        ("0x180", 0x180, True),
+        ("0x80000000", None, False),
+        ("0x20000180", None, True),
+        ("", None, True),
+    ],
+)
+def test_expression_of_a_cob_id_is_evaluated(written: str, base: int | None, valid: bool, tmp_path: Path) -> None:
+    text = eds_text(SERVO).replace("DefaultValue=$NODEID+0x180", f"DefaultValue={written}")
+    place = device_of(text, tmp_path).tpdos[0]
+    assert (place.cob_base, place.valid) == (base, valid)
+
+
+@pytest.mark.parametrize(
+    ("written", "says"),
+    [
+        ("$NODEID*2", r"DefaultValue of \[1800sub1\] is '\$NODEID\*2' where a number belongs"),
+        ("0600", r"'0600': as octal 0x180, as decimal 0x258; write it"),
+        ("$NODEID+0600", r"as octal 0x180, as decimal 0x258; write it"),
+    ],
+)
+def test_cob_id_that_cannot_be_read_is_refused(written: str, says: str) -> None:
+    text = eds_text(SERVO).replace("DefaultValue=$NODEID+0x180", f"DefaultValue={written}")
+    with pytest.raises(EdsError, match=says):
+        parse_eds(text.encode(), "a.eds")
+
+
+@given(
+    st.lists(st.integers(0, 2**32), min_size=1, max_size=3), st.booleans(), st.sampled_from(("{:d}", "{:#x}", "{:#X}"))
+)
+def test_sum_of_numbers_and_node_id_is_read_in_any_order(numbers: list[int], relative: bool, form: str) -> None:
+    words = [form.format(number) for number in numbers] + ["$NODEID"] * relative
+    for order in (words, words[::-1]):
+        assert read_expression(" + ".join(order)) == (sum(numbers), relative)
+
+
+# numbers with leading zeros
+
+
+@pytest.mark.parametrize(("written", "value", "doubt"), [("0100", 100, "64 if"), ("0090", 90, ""), ("007", 7, "")])
+def test_number_with_leading_zeros_is_not_absent(written: str, value: int, doubt: str, tmp_path: Path) -> None:
+    text = eds_text(SERVO).replace("[1017]", f"[1017]\nParameterValue={written}")
+    device = device_of(text, tmp_path)
+    assert device.default(0x1017) == value
+    assert [doubt in each for each in device.doubts] == [True] * bool(doubt)
+    assert answers(text, tmp_path, "a.eds")["heartbeat"] == f"yes: 1017 is {value} ms"
+
+
+def test_heartbeat_that_the_file_does_not_give_is_not_zero(tmp_path: Path) -> None:
+    variables = [each for each in SERVO if each[0] != 0x1017] + [(0x1017, 0, U16, "rw", 0, None)]
+    assert answers(eds_text(variables), tmp_path, "a.eds")["heartbeat"] == "yes: its EDS does not say its period (1017)"
+
+
+# compact storage
+
+MAPPING = """\
+[1A00]
+ParameterName=TPDO1 mapping
+ObjectType={kind}
+DataType=0x0007
+AccessType=rw
+DefaultValue=0
+CompactSubObj=8
+[1A00Value]
+NrOfEntries=3
+1=0x60410010
+2=0x60640020
+3=0x60610008
+[1A00Name]
+NrOfEntries=2
+1=status
+3=mode
+"""
+
+
+def without(index: int) -> list[Variable]:
+    return [each for each in SERVO if each[0] != index]
+
+
+@pytest.mark.parametrize("kind", ["0x8", "0x9", "0x7"])
+def test_compact_values_are_the_mapping(kind: str, tmp_path: Path) -> None:
+    device = device_of(eds_text(without(0x1A00)) + MAPPING.format(kind=kind), tmp_path)
+    assert device.tpdos[0].mapped == (0x60410010, 0x60640020, 0x60610008)
+    assert device.tpdos[0].room == 8
+    names = [device.objects[0x1A00, sub].name for sub in (1, 2, 3)]
+    assert names == ["TPDO1 mapping: status", "TPDO1 mapping: TPDO1 mapping 2", "TPDO1 mapping: mode"]
+
+
+def test_list_of_values_overrides_written_out_sub_objects(tmp_path: Path) -> None:
+    text = eds_text(SERVO) + "[1A00Value]\nNrOfEntries=2\n0=1\n1=0x60640020\n[1800Value]\nNrOfEntries=1\n2=1\n"
+    place = device_of(text, tmp_path).tpdos[0]
+    assert (place.mapped, place.kind) == ((0x60640020,), 1)
+
+
+def test_compact_pdos_are_those_of_the_device_info(tmp_path: Path) -> None:
+    variables = [each for each in SERVO if not 0x1400 <= each[0] < 0x1C00]
+    head = "[DeviceInfo]\nCompactPDO=23\nGranularity=8\nNrOfRXPDO=2\nNrOfTXPDO=5\n"
+    text = (
+        head
+        + eds_text(variables)
+        + "[1A01Value]\nNrOfEntries=1\n1=0x60640020\n[1A01sub0]\nDataType=5\nDefaultValue=1\n"
+    )
+    device = device_of(text, tmp_path)
+    free = PdoPlace(1, 0x200, True, None, 8, (), fixed=False)
+    assert device.rpdos[0] == free
+    assert [place.cob_base for place in device.tpdos] == [0x180, 0x280, 0x380, 0x480, None]
+    assert [place.valid for place in device.tpdos] == [True, True, True, True, False]
+    assert device.tpdos[1].mapped == (0x60640020,)
+    assert sorted(sub for index, sub in device.objects if index == 0x1800) == [0, 1, 2, 3, 5]
+
+
+def test_compact_objects_beyond_the_limit_are_refused() -> None:
+    head = "[{:04X}]\nParameterName=a\nObjectType=8\nDataType=7\nAccessType=ro\nCompactSubObj=254\n"
+    text = "".join(head.format(0x2000 + k) for k in range(MAX_SECTIONS // 254 + 1))
+    with pytest.raises(EdsError, match=f"more than {MAX_SECTIONS} objects in compact form"):
+        parse_eds(text.encode(), "a.eds")
+
+
+# fixed mappings
+
+
+def fixed_mapping(kind_access: str) -> list[Variable]:
+    found = []
+    for index, sub, kind, access, mappable, default in (*COMMON, *CURRENT, *pdos(2, access="ro", mapped=TARGETS)):
+        type_of_pdo = 0x1400 <= index < 0x1C00 and sub == 2 and kind != U32
+        found.append((index, sub, kind, kind_access if type_of_pdo else access, mappable, default))
+    return found
+
+
+def test_fixed_mapping_of_writable_type_is_set_to_every_sync(tmp_path: Path) -> None:
+    found = answers(eds_text(fixed_mapping("rw")), tmp_path, "a.eds")
+    assert found["listen"].startswith("yes")
+    assert found["mapping"] == "yes: RPDO1, TPDO1, TPDO2 must be set up: the defaults are others"
+
+
+def test_fixed_mapping_of_fixed_type_is_not_listened_to(tmp_path: Path) -> None:
+    found = answers(eds_text(fixed_mapping("ro")), tmp_path, "a.eds")
+    assert found["listen"].startswith("no: no TPDO of every SYNC can carry its position")
