@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from fdhil.arming.token import given_credential
-from fdhil.cia402 import first_axis_index
+from fdhil.cia402 import COB_RPDO, first_axis_index
+from fdhil.commissioning.identifiers import require_own_identifiers, sent_pdos
 from fdhil.commissioning.record import KEY_NAME, CommissioningRecord, load_record, of_config
 from fdhil.commissioning.void import is_void
 from fdhil.config import Axis, MachineConfig, OffsetBounds, share_fault
@@ -22,6 +23,7 @@ from fdhil.guard.limits import OffsetLimits
 from fdhil.guard.settings import AxisSettings, Feedforward, Pdo, Settings
 
 SPEED_STEPS = 2.0  # times the motor's power: room for the load's own inertia and for the sensor's noise
+NOT_VALID = 1 << 31  # bit of a COB-ID
 HEARTBEATS_AWAITED = 2.0  # periods of the drive's heartbeat until it counts as lost
 
 
@@ -50,7 +52,7 @@ def corrected_bus(machine: MachineConfig, source: str) -> str:
 def settings_of(machine: MachineConfig, bus: str, run_directory: Path, token_sha256: str) -> Settings:
     """Return what the guard needs of the config and the drives' profiles.
 
-    ConfigError when a profile cannot do it, or when a drive that is not corrected has a COB-ID of the guard's.
+    ConfigError when a profile cannot do it, or when a COB-ID of the guard's is another's on that bus.
     """
     axes = [_axis(machine, name, axis) for name, axis in machine.axis.items() if axis.correction is not None]
     settings = Settings(
@@ -66,24 +68,8 @@ def settings_of(machine: MachineConfig, bus: str, run_directory: Path, token_sha
         daemon_uid=_user_id(machine.guard.daemon_user),
         watching=tuple(_known_ids((*machine.access.watch, *machine.access.operate))),
     )
-    for key, cob_id in _taken_ids(machine, bus):
-        if cob_id in settings.sent_ids:
-            text = f"COB-ID {cob_id:03X} is the guard's, which sends offsets to a corrected axis with it"
-            raise ConfigError("config", [ConfigFault(key, text, "give one of them another COB-ID")])
+    require_own_identifiers(machine, bus)
     return settings
-
-
-def _taken_ids(machine: MachineConfig, bus: str) -> Iterator[tuple[str, int]]:
-    """Yield the COB-IDs of the drives on a bus that are not corrected, and of the encoders at the tables."""
-    for name, axis in machine.axis.items():
-        if axis.drive.bus != bus:
-            continue
-        if axis.correction is None:
-            profile = load_profile(axis.drive)
-            for spec in (*profile.rpdos, *profile.tpdos):
-                yield f"axis.{name}.drive.profile", spec.cob_base + machine.node_id(name)
-        if axis.table is not None and axis.table.cob_id is not None:
-            yield f"axis.{name}.table.cob_id", axis.table.cob_id
 
 
 def _user_id(name: str | None) -> int | None:
@@ -140,8 +126,34 @@ def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
         speed_count=abs(profile.speed_rad_s_per_count(axis)) * per_rad * period_s,
         speed_step=SPEED_STEPS * _largest_acceleration_rad_s2(axis) * per_rad * period_s**2,
         travel=None if record is None else record.travel,
+        writers=_writers(machine, name, profile, record),
         **_commissioned(machine, name, record),
     )
+
+
+def _writers(
+    machine: MachineConfig, name: str, profile: DriveProfile, record: CommissioningRecord | None
+) -> tuple[int, ...]:
+    """Return the COB-IDs, but the guard's, whose frames may change an offset of the drive.
+
+    By its record those of all RPDOs that map one, valid or not. Besides what its RPDOs have by default: one of them
+    that did not exist, or was not valid, when the drive was commissioned was set up by another master since.
+    """
+    node = machine.node_id(name)
+    kept = {} if record is None else {int(key, 16): cob_id for key, cob_id in record.options.items() if key[:2] == "14"}
+    harmless = {cob_id for cob_id in kept.values() if not cob_id & NOT_VALID}
+    known = {
+        spec.cob_base + machine.node_id(other)
+        for other, axis in machine.axis.items()
+        for found in (load_profile(axis.drive),)
+        for spec in (*found.rpdos, *found.tpdos)
+        if spec.valid
+    }
+    suspect = {cob_id & ~NOT_VALID for cob_id in kept.values() if cob_id & NOT_VALID}
+    suspect |= {base + node for base in COB_RPDO} | {spec.cob_base + node for spec in profile.rpdos}
+    known |= {axis.table.cob_id or 0 for axis in machine.axis.values() if axis.table is not None}
+    sent = {spec.cob_base + node for spec in sent_pdos(machine, name, profile)}
+    return tuple(sorted(cob_id for cob_id in suspect - known - harmless - sent if 0 < cob_id <= 0x7FF))
 
 
 def _commissioned(machine: MachineConfig, name: str, record: CommissioningRecord | None) -> dict[str, Any]:

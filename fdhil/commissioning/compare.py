@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from fdhil.commissioning.bus_listener import BusListener
+from fdhil.commissioning.bus_listener import BusListener, Traffic
 from fdhil.commissioning.finding import Finding
+from fdhil.commissioning.identifiers import require_own_identifiers
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import CommissioningRecord, fingerprint, load_record
 from fdhil.commissioning.survey import Survey, survey
@@ -19,7 +20,7 @@ from fdhil.drivers.can.bus import CanBus
 from fdhil.errors import DeviceError, StoreError
 
 POINT = "commissioning record"
-LISTEN_S = 1.0
+LISTEN_S, NODES_S = 1.0, 0.3
 TURN_S = 0.1
 
 
@@ -68,10 +69,15 @@ def compare_again(config: MachineConfig, bus: str, say: Callable[[str], None]) -
     """Before a guard starts: with no NC on the bus compare every commissioned drive; what differs voids its record.
 
     Beside an NC nothing is sent, and the records hold as long as nothing against them was seen. ``say`` gets one
-    sentence per record that is void now. ConnectError when the bus cannot be opened; StoreError.
+    sentence per record that is void now. ConfigError where a COB-ID of the guard's is that of a node that is heard;
+    ConnectError when the bus cannot be opened; StoreError.
     """
     records = _records(config, bus)
-    if not records or _an_nc_runs(config, bus):
+    if not records:
+        return
+    traffic = _listen(config, bus)
+    require_own_identifiers(config, bus, traffic.ids)
+    if traffic.master is not None:
         return
     for record in records:
         mark = void_mark(config.store.directory, record.axis)
@@ -96,10 +102,11 @@ def _records(config: MachineConfig, bus: str) -> list[CommissioningRecord]:
     return records
 
 
-def _an_nc_runs(config: MachineConfig, bus: str) -> bool:
+def _listen(config: MachineConfig, bus: str) -> Traffic:
+    """Listen for a while, for less where an NC runs: then the nodes of the bus soon show themselves."""
     with BusListener(CanBus(bus, config.bus[bus])) as listener:
-        for _ in range(round(LISTEN_S / TURN_S)):
+        for turn in range(round(LISTEN_S / TURN_S)):
             listener.listen(TURN_S)
-            if listener.traffic.master is not None:
-                return True
-    return False
+            if listener.traffic.master is not None and turn * TURN_S >= NODES_S:
+                break
+        return listener.traffic

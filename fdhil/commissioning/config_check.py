@@ -13,6 +13,7 @@ import numpy as np
 from fdhil.commissioning.bus_listener import LISTEN_S, BusListener, Traffic
 from fdhil.commissioning.compare import POINT, compare_record
 from fdhil.commissioning.finding import Finding, read_optional
+from fdhil.commissioning.identifiers import compare_identifiers
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import load_record
 from fdhil.commissioning.survey import Survey, survey
@@ -49,7 +50,11 @@ def check_machine(config: MachineConfig, say: Callable[[str], None] = lambda _te
         found += [(f"bus {bus}", finding) for finding in compare_bus(traffic, config)]
         for axis in (name for name, settings in config.axis.items() if settings.drive.bus == bus):
             say(f"comparing axis {axis}")
-            compared = compare_asked(config, axis) if traffic.master is None else compare_heard(traffic, config, axis)
+            compared = (
+                compare_asked(config, axis, traffic.ids)
+                if traffic.master is None
+                else compare_heard(traffic, config, axis)
+            )
             found += [(f"axis {axis}", finding) for finding in (*compared, *compare_loops(config, axis))]
             found += [(f"axis {axis}", finding) for finding in asyncio.run(compare_sensors(config, axis))]
     return found
@@ -76,10 +81,11 @@ def compare_bus(traffic: Traffic, config: MachineConfig) -> Iterator[Finding]:
         yield judge_sync((np.diff(traffic.sync_ns) * 1e-9).tolist(), period_s, config.guard.clock == "sync")
 
 
-def compare_asked(config: MachineConfig, axis: str) -> list[Finding]:
-    """Compare the answers of the drive by SDO, with no NC on the bus."""
+def compare_asked(config: MachineConfig, axis: str, heard: Sequence[int] = ()) -> list[Finding]:
+    """Compare the answers of the drive by SDO, with no NC on the bus; ``heard`` are COB-IDs that were heard there."""
     node = f"node-ID {config.node_id(axis)}"
     with Master(config, axis) as master:
+        master.heard.ids.update(heard)
         try:
             found = survey(master)
             seen = f"{node}, serial number {found.identity.serial}"
@@ -204,6 +210,7 @@ def compare_heard(traffic: Traffic, config: MachineConfig, axis: str) -> Iterato
     table = config.axis[axis].table
     if table is not None and table.cob_id is not None:
         yield _heard_table(traffic, table.cob_id)
+    yield compare_identifiers(config, axis, traffic.ids)
     yield from _rapid(config, profile, lambda: _heard_value(traffic, profile, node_id))
     yield from _not_compared(("device", *SDO_POINTS), "SDO belongs to the NC now", NC_OFF)
 

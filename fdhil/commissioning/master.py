@@ -27,7 +27,7 @@ from fdhil.errors import DeviceTimeout
 class Heard:
     """The drive's newest: mapped objects by key, EMCY frames, its NMT state; and frames and error frames of the bus.
 
-    ``boots`` counts its boot-ups.
+    ``boots`` counts its boot-ups. ``ids`` are the COB-IDs of all frames.
     ``master`` is what shows that another master runs the bus, None while nothing does.
     """
 
@@ -39,6 +39,7 @@ class Heard:
     master: str | None = None
     frames: int = 0
     errors: int = 0
+    ids: set[int] = field(default_factory=set)
 
 
 FIRST_VALUE_S = 0.5  # an object of a TPDO that every tenth SYNC or so brings comes in this time
@@ -163,6 +164,7 @@ class Master:
         node, heard, spec = self.node_id, self.heard, self._tpdos.get(can_id)
         error = bool(can_id & ERROR_FLAG)
         heard.errors, heard.frames = heard.errors + error, heard.frames + (not error)
+        heard.ids.add(can_id)
         if spec is not None and len(data) >= spec.length:
             if can_id == self._last_answer:
                 self._take_answer()

@@ -317,7 +317,7 @@ def commission(
         **asdict(found.identity),
         config_digest=axis_digest(config, axis),
         mapping_fingerprint=found.fingerprint,
-        options={**found.options, **feeding},
+        options={**found.options, **found.rpdos, **feeding},
         following_error_window_um=found.window_um,
         offset_in_feedforward=proven["feed-forward test"]["in_feedforward"],
         sign_test_um=proven["sign test"]["moved_um"],

@@ -8,24 +8,27 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
 from fdhil.cia402 import Mode, Object, State
 from fdhil.commissioning.bus_listener import UNREADABLE
 from fdhil.commissioning.compare_scales import compare_scales
 from fdhil.commissioning.device_type import describe, is_drive
 from fdhil.commissioning.finding import Finding, has_object, lacks, read_optional
+from fdhil.commissioning.identifiers import compare_identifiers
 from fdhil.commissioning.master import Master
+from fdhil.commissioning.offset_writers import compare_writers, read_other_rpdos, record_options, unreadable
 from fdhil.commissioning.record import SOFTWARE_LIMIT_KEYS
 from fdhil.config import CorrectionLimits
 from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
-from fdhil.errors import ConnectError, DeviceTimeout, DriveFault, ProtocolError
+from fdhil.errors import ConnectError, DeviceTimeout, DriveFault, ProtocolError, SdoAbort
 
 LISTEN_S = 2.0
 INVALID_COB_ID = 1 << 31
 NO_WINDOW = 0xFFFFFFFF
 SOFTWARE_LIMIT = 0x607D
+LAST_DUMMY = 0x07FF  # below: data types that fill the bits of a PDO
 FIRST_DEVICE_TYPE = 0x67FF  # of the first of several devices behind one node
 NO_SOFTWARE_LIMIT = (-(2**31), 2**31 - 1)
 OPTIONS = (
@@ -52,7 +55,8 @@ class Identity:
 class Survey:
     """A drive as it was read: its identity, the mapping's fingerprint, its options, and every point compared.
 
-    Of a device that is no drive nothing else is read.
+    ``rpdos`` are the COB-IDs of RPDOs that the profile does not have, as a record keeps them. Of a device that is no
+    drive nothing else is read.
     """
 
     identity: Identity
@@ -61,6 +65,7 @@ class Survey:
     window_um: float
     findings: tuple[Finding, ...]
     is_drive: bool = True
+    rpdos: Mapping[str, int] = field(default_factory=dict)
 
 
 def listen(master: Master) -> None:
@@ -73,8 +78,14 @@ def listen(master: Master) -> None:
         master.check()
         time.sleep(0.01)
     require_alone(master)
+    require(master, [compare_own_identifiers(master)])
     if master.heard.frames == 0:
         _ask_alone(master)
+
+
+def compare_own_identifiers(master: Master) -> Finding:
+    """Compare the drive's COB-IDs with those that are in use, as the configuration and the bus show them."""
+    return compare_identifiers(master.config, master.axis, tuple(master.heard.ids))
 
 
 def _ask_alone(master: Master) -> None:
@@ -105,17 +116,21 @@ def survey(master: Master) -> Survey:
         return Survey(identity, "", {}, 0.0, (device,), is_drive=False)
     pdos, options = read_pdos(master), read_options(master)
     window_um = options.get("6065", 0) / master.config.axis[master.axis].scaling.increments_per_mm * 1e3
+    writers, rpdos = compare_other_rpdos(master)
     findings = (
         device,
         compare_identity(master.profile, identity),
         *(compare_pdo(spec, found, master.node_id) for spec, found in pdos),
+        compare_own_identifiers(master),
+        compare_sizes(master, pdos),
+        *writers,
         *compare_options(master, options),
         *compare_mode(master),
         *compare_scales(master),
         *compare_window(master, options, window_um),
     )
     fingerprint = hashlib.sha256(repr([found.words for _, found in pdos]).encode()).hexdigest()[:16]
-    return Survey(identity, fingerprint, options, window_um, findings)
+    return Survey(identity, fingerprint, options, window_um, findings, rpdos=rpdos)
 
 
 def require(master: Master, findings: Iterable[Finding]) -> None:
@@ -197,6 +212,46 @@ def _read_pdo(master: Master, parameter: int, mapping: int) -> PdoFound:
     count = read_optional(master, mapping, 0) or 0
     mapped = tuple(read_optional(master, mapping, sub) or 0 for sub in range(1, count + 1))
     return PdoFound(parameter, mapping, cob_id, read_optional(master, parameter, 2) or 0, mapped)
+
+
+def compare_sizes(master: Master, pdos: Sequence[tuple[PdoSpec, PdoFound]]) -> Finding:
+    """Compare the size of each mapped object, as SDO tells it, with the bits that its PDO gives it.
+
+    One that is mapped longer than it is shifts all that follows it in the frame, and the mapping looks right.
+    """
+    expected, compared = "as mapped", 0
+    for spec, found in pdos:
+        for word in found.mapped:
+            index, sub, bits = word >> 16, word >> 8 & 0xFF, word & 0xFF
+            size = _read_size(master, index, sub) if index > LAST_DUMMY else None
+            compared += size is not None
+            if size is not None and size != -(-bits // 8):
+                shown = f"{index:04X}:{sub:02X} has {8 * size} bits"
+                cause = f"{shown} (by SDO), and {spec.name} maps it with {bits}: what follows it is shifted"
+                advice = f"correct 0x{found.mapping:04X} and the profile: every value of {spec.name} would be wrong"
+                return Finding("object sizes", expected, shown, False, cause, advice)
+    if not compared:
+        cause = "it tells the size of none of its mapped objects"
+        return Finding("object sizes", expected, "not told", None, cause, "compare its mapping with its manual")
+    return Finding("object sizes", expected, f"{compared} as mapped")
+
+
+def _read_size(master: Master, index: int, sub: int) -> int | None:
+    try:
+        return master.sdo.read_size(index, sub)
+    except SdoAbort:
+        return None
+
+
+def compare_other_rpdos(master: Master) -> tuple[list[Finding], dict[str, int]]:
+    """Compare the RPDOs that the profile does not have, where it can send offsets; and what a record keeps of them."""
+    if master.profile.find_rpdo(master.profile.offset) is None:
+        return [], {}
+    try:
+        rpdos = read_other_rpdos(master)
+    except SdoAbort as abort:
+        return [unreadable(abort)], {}
+    return [compare_writers(master, rpdos)], record_options(master, rpdos)
 
 
 def compare_pdo(spec: PdoSpec, found: PdoFound, node_id: int) -> Finding:

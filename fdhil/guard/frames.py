@@ -106,6 +106,7 @@ class Listener:
         self.bus_state = "active"
         self.lost_frames = self.emergencies = 0
         self._sent_ids = settings.sent_ids
+        self._writers = {cob_id: axis.name for axis in settings.axes for cob_id in axis.writers}
         self._targets = [_PdoState(axis.target) for axis in settings.axes]
         self._tpdos = [[_PdoState(pdo) for pdo in axis.tpdos] for axis in settings.axes]
         self._carriers = list(map(_carriers, self._tpdos))
@@ -124,7 +125,7 @@ class Listener:
     def wanted_ids(self) -> tuple[int, ...]:
         """All COB-IDs that the guard must hear, for a receive filter."""
         ids = {base + node for node in self._axes_of for base in (COB_EMCY, COB_HEARTBEAT, COB_SDO_REQUEST)}
-        return tuple(sorted(ids | {COB_NMT, COB_SYNC, *self._pdos, *self._sent_ids}))
+        return tuple(sorted(ids | {COB_NMT, COB_SYNC, *self._pdos, *self._sent_ids, *self._writers}))
 
     def take(self, cob_id: int, data: bytes, now_s: float) -> None:
         """Take any frame but SYNC; ``now_s`` is monotonic time."""
@@ -134,6 +135,8 @@ class Listener:
         elif cob_id in self._sent_ids:
             code = "BusLocked" if cob_id >= COB_HEARTBEAT else "OffsetHijack"
             self._alarm(Alarm(code, detail=f"{cob_id:03X} {data.hex()}"))
+        elif cob_id in self._writers:
+            self._alarm(Alarm("OffsetHijack", self._writers[cob_id], f"{cob_id:03X} {data.hex()}"))
         elif cob_id == COB_NMT:
             self._nmt_command(data)
         else:

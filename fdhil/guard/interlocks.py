@@ -107,7 +107,7 @@ CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
     "ForeignProducer": (_R, "two nodes send as this drive or NC", "find and remove the second node"),
     "OffsetHijack": (
         _R,
-        "another node sends our offset COB-ID, or writes the offset by SDO",
+        "another node writes the offset: by our COB-ID, by another RPDO of the drive or by SDO",
         "hold the feed, find and remove that node",
     ),
     "BusLocked": (_R, "another guard's heartbeat is on the bus", "stop the other guard"),

@@ -61,6 +61,7 @@ class AxisSettings:
     speed can change in one cycle; 0: not judged.
     ``travel`` are the drive's software limits (0x607D), None: it has none.
     ``heartbeat_timeout_s`` 0: the drive has no heartbeat, and its PDOs alone show that it is Operational.
+    ``writers`` are COB-IDs, not ours, whose frames may change an offset of the drive.
     ``record`` is the fingerprint of the drive as it was commissioned, empty: it was not; ``record_void`` says that
     something against it was seen since.
     """
@@ -82,6 +83,7 @@ class AxisSettings:
     speed_count: float = 0.0
     speed_step: float = 0.0
     travel: tuple[int, int] | None = None
+    writers: tuple[int, ...] = ()
     record: str = ""
     record_void: bool = False
 
@@ -229,6 +231,7 @@ def _axis(document: dict[str, Any]) -> AxisSettings:
     target, offset = _pdo(document.pop("target")), _pdo(document.pop("offset"))
     limits, feed = OffsetLimits(**document.pop("limits")), document.pop("feedforward")
     travel = document.pop("travel")
+    document["writers"] = tuple(_whole(cob_id, 1, 0x7FF, "a writer's COB-ID") for cob_id in document["writers"])
     if travel is not None:
         low, high = (_whole(end, -(2**31), 2**31 - 1, "travel") for end in travel)
         document["travel"] = (low, high)
@@ -264,6 +267,8 @@ def _check(settings: Settings) -> None:
     heard = [pdo.cob_id for axis in settings.axes for pdo in (axis.target, *axis.tpdos)]
     if len({axis.name for axis in settings.axes}) < len(settings.axes) or len(set(heard)) < len(heard):
         raise ValueError("two axes are one")
+    if {*settings.sent_ids, *heard} & {cob_id for axis in settings.axes for cob_id in axis.writers}:
+        raise ValueError("a COB-ID that is ours, the NC's or a drive's counts as a foreign writer's")
     if settings.sent_ids & {*heard, *(COB_HEARTBEAT + axis.node_id for axis in settings.axes)}:
         raise ValueError("a COB-ID that is ours is another sender's: of the NC's set-points or a drive")
 

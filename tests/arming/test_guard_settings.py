@@ -102,5 +102,6 @@ def test_what_the_guard_sends_is_nobody_elses(tmp_path: Path, monkeypatch: pytes
     elsewhere = drives["Y"].drive.model_copy(update={"node_id": 2})
     drives["Y"] = drives["Y"].model_copy(update={"drive": elsewhere})
     monkeypatch.setattr("fdhil.arming.guard_settings.load_profile", other)
+    monkeypatch.setattr("fdhil.commissioning.identifiers.load_profile", other)
     with pytest.raises(ConfigError, match=r"axis.Y.drive.profile: COB-ID"):
         settings_of(config.model_copy(update={"axis": drives}), "can0", tmp_path, "")

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from fdhil import config as machine_config
+from fdhil.commissioning.bus_listener import Traffic
 from fdhil.commissioning.compare import compare_again, compare_record, found_fingerprint
 from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.record import CommissioningRecord, load_record, save_record
@@ -107,7 +108,7 @@ def test_before_the_guard_starts_each_record_is_compared(tmp_path: Path, monkeyp
         ok = record.axis == "Y"
         return Finding("", "", "", ok, "" if ok else "it differs", "mend it")
 
-    monkeypatch.setattr("fdhil.commissioning.compare._an_nc_runs", lambda *_: nc[0])
+    monkeypatch.setattr("fdhil.commissioning.compare._listen", lambda *_: Traffic(sync_ns=[1] * nc[0]))
     monkeypatch.setattr("fdhil.commissioning.compare.compare_drive", compare)
     compare_again(config, "can0", told.append)
     for axis in "XYZ":

@@ -28,6 +28,7 @@ DEADLINE_S = 2.0
 MAX_BYTES = 64 * 1024
 NO_OBJECT = 0x06020000
 NO_SUB_INDEX = 0x06090011
+_UPLOAD_BEGINS, _SIZE_GIVEN = 2, 1
 _DEADLINE_ABORT = 0x05040000
 _MEMORY_ABORT = 0x05040005
 
@@ -56,6 +57,7 @@ class SdoLink:
         self._client.network = self
         self._client.RESPONSE_TIMEOUT = RESPONSE_TIMEOUT_S * patience
         self._late = False
+        self._sized = True
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
         """Send for the library's client; remote frames are never sent."""
@@ -64,6 +66,8 @@ class SdoLink:
     def deliver(self, data: bytes) -> None:
         """Hand over a response frame of this node; one that is not 8 bytes long is no SDO."""
         if len(data) == 8:
+            if data[0] >> 5 == _UPLOAD_BEGINS:
+                self._sized = bool(data[0] & _SIZE_GIVEN)
             self._client.on_response(self.response_id, data, 0.0)
 
     def read(self, index: int, sub: int = 0) -> bytes:
@@ -78,6 +82,11 @@ class SdoLink:
                 text = f"{_name(index, sub)} gave two answers after a time-out; check that one master asks"
                 raise ProtocolError(self.device, text) from None
             return second
+
+    def read_size(self, index: int, sub: int = 0) -> int | None:
+        """Return how many bytes an object has; None where the drive's answer does not say it (CiA 301, 7.2.4.3.5)."""
+        data = self.read(index, sub)
+        return len(data) if self._sized else None
 
     def read_int(self, index: int, sub: int = 0, *, signed: bool = False) -> int:
         """Read an integer object, little-endian."""

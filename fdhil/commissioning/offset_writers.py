@@ -1,0 +1,130 @@
+"""Finds every RPDO of a drive by which another master could write its offsets (60B0, 60B1, 60B2), or hear our frames.
+
+The profile names the RPDOs that it needs, and no others. An NC that compensates the pitch of a screw may have set up
+one of its own: two masters that write one offset make the table step from the value of one to that of the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from fdhil.cia402 import Object
+from fdhil.commissioning.finding import Finding
+from fdhil.commissioning.master import Master
+from fdhil.drivers.can.sdo import NO_OBJECT, NO_SUB_INDEX
+from fdhil.errors import SdoAbort
+
+POINT = "offset writers"
+MOST_RPDOS = 512
+INVALID_COB_ID = 1 << 31
+COB_ID_BITS = (1 << 29) - 1
+MOST_MAPPED = 64
+MULTIPLEXED = (254, 255)
+"""Numbers of mapped objects that make a PDO a multiplexed one: its frames name the object that they write (CiA 301)."""
+
+
+@dataclass(frozen=True, slots=True)
+class OtherRpdo:
+    """An RPDO that the profile does not have: its number, the word of its COB-ID (bit 31: not valid), what it maps.
+
+    ``mapped`` is None for a multiplexed PDO, which may write any object.
+    """
+
+    number: int
+    cob_id: int
+    mapped: tuple[int, ...] | None
+
+    @property
+    def key(self) -> str:
+        """Under which a commissioning record keeps its COB-ID."""
+        return f"{Object.RPDO_PARAMETER + self.number - 1:04X}"
+
+    @property
+    def valid(self) -> bool:
+        """Whether the drive takes its frames."""
+        return not self.cob_id & INVALID_COB_ID
+
+
+def read_other_rpdos(master: Master) -> tuple[OtherRpdo, ...]:
+    """Read all RPDOs that the drive has beside the profile's; SdoAbort where one is there and cannot be read.
+
+    All 512 places are asked, for neither the drive's EDS nor the place of the last one says that there are no more.
+    """
+    own = {spec.number for spec in master.profile.rpdos}
+    found = (_read(master, number) for number in range(1, MOST_RPDOS + 1) if number not in own)
+    return tuple(rpdo for rpdo in found if rpdo is not None)
+
+
+def _read(master: Master, number: int) -> OtherRpdo | None:
+    cob_id = _number(master, Object.RPDO_PARAMETER + number - 1, 1)
+    if cob_id is None:
+        return None
+    mapping = Object.RPDO_MAPPING + number - 1
+    count = _number(master, mapping, 0) or 0
+    if count in MULTIPLEXED:
+        return OtherRpdo(number, cob_id, None)
+    words = (_number(master, mapping, sub) or 0 for sub in range(1, min(count, MOST_MAPPED) + 1))
+    return OtherRpdo(number, cob_id, tuple(words))
+
+
+def _number(master: Master, index: int, sub: int) -> int | None:
+    """Read an integer; None where the drive does not have it. Any other refusal is no answer: SdoAbort."""
+    try:
+        return master.sdo.read_int(index, sub)
+    except SdoAbort as abort:
+        if abort.code in (NO_OBJECT, NO_SUB_INDEX):
+            return None
+        raise
+
+
+def offsets_of(master: Master, rpdo: OtherRpdo) -> tuple[int, ...]:
+    """Return which of the axis' offset objects an RPDO writes."""
+    profile = master.profile
+    keys = (profile.offset, profile.speed_offset, profile.torque_offset)
+    if rpdo.mapped is None:
+        return tuple(index for index, _ in keys)
+    written = {word >> 16 for word in rpdo.mapped}
+    return tuple(index for index, _ in keys if index in written)
+
+
+def record_options(master: Master, rpdos: tuple[OtherRpdo, ...]) -> dict[str, int]:
+    """Return what a commissioning record keeps of them: the COB-IDs, for a running guard asks no drive by SDO.
+
+    Of those that are valid all, so that their frames are known to be harmless; of the others those with an offset.
+    """
+    return {rpdo.key: rpdo.cob_id for rpdo in rpdos if rpdo.valid or offsets_of(master, rpdo)}
+
+
+def compare_writers(master: Master, rpdos: tuple[OtherRpdo, ...]) -> Finding:
+    """Nobody but us may write the offsets, and our frames may write nothing else."""
+    expected = "none but the profile's RPDOs"
+    wrong = next(_wrong(master, rpdos), None)
+    if wrong is None:
+        return Finding(POINT, expected, expected)
+    rpdo, why = wrong
+    where = f"RPDO{rpdo.number} (COB-ID {rpdo.cob_id & COB_ID_BITS:03X})"
+    parameter, mapping = Object.RPDO_PARAMETER + rpdo.number - 1, Object.RPDO_MAPPING + rpdo.number - 1
+    advice = f"set bit 31 of 0x{parameter:04X}:01, or change 0x{mapping:04X}, with the NC's or the drive's own tool"
+    return Finding(POINT, expected, where, False, f"its {where} {why}", advice)
+
+
+def _wrong(master: Master, rpdos: tuple[OtherRpdo, ...]) -> Iterator[tuple[OtherRpdo, str]]:
+    ours = {spec.cob_base + master.node_id for spec in master.profile.rpdos}
+    for rpdo in rpdos:
+        written = " and ".join(f"{index:04X}" for index in offsets_of(master, rpdo))
+        if not rpdo.valid:
+            continue
+        if rpdo.mapped is None:
+            yield rpdo, f"is multiplexed and can write {written}: another master can step the table"
+        elif written:
+            yield rpdo, f"writes {written}, as fdhil does: another master that sends it steps the table"
+        elif rpdo.cob_id & COB_ID_BITS in ours and rpdo.mapped:
+            listed = ", ".join(f"{word:08X}" for word in rpdo.mapped)
+            yield rpdo, f"has the COB-ID of an RPDO of the profile and maps {listed}: our frames would write that"
+
+
+def unreadable(abort: SdoAbort) -> Finding:
+    """The finding where an RPDO of the drive is there and cannot be read."""
+    cause = f"not all of its RPDOs can be read ({abort}): one may write its offset"
+    return Finding(POINT, "none but the profile's RPDOs", "unknown", None, cause, "see in its manual which it has")
