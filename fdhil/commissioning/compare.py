@@ -12,6 +12,7 @@ from fdhil.commissioning.bus_listener import BusListener, Traffic
 from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.identifiers import require_own_identifiers
 from fdhil.commissioning.master import Master
+from fdhil.commissioning.offset_writers import compare_heard_writers
 from fdhil.commissioning.record import CommissioningRecord, fingerprint, load_record
 from fdhil.commissioning.survey import Survey, survey
 from fdhil.commissioning.void import confirm_record, void_mark, void_record
@@ -68,26 +69,28 @@ def compare_drive(config: MachineConfig, record: CommissioningRecord) -> Finding
 def compare_again(config: MachineConfig, bus: str, say: Callable[[str], None]) -> None:
     """Before a guard starts: with no NC on the bus compare every commissioned drive; what differs voids its record.
 
-    Beside an NC nothing is sent, and the records hold as long as nothing against them was seen. ``say`` gets one
-    sentence per record that is void now. ConfigError where a COB-ID of the guard's is that of a node that is heard;
-    ConnectError when the bus cannot be opened; StoreError.
+    Beside an NC nothing is sent, and the records hold as long as nothing against them is seen: a frame that carries
+    the offset of a drive and is none of its RPDOs is. ``say`` gets one sentence per record that is void now.
+    ConfigError where a COB-ID of the guard's is that of a node that is heard; ConnectError when the bus cannot be
+    opened; StoreError.
     """
     records = _records(config, bus)
     if not records:
         return
     traffic = _listen(config, bus)
     require_own_identifiers(config, bus, traffic.ids)
-    if traffic.master is not None:
-        return
     for record in records:
         mark = void_mark(config.store.directory, record.axis)
-        compared = compare_drive(config, record)
-        if compared.ok:
-            confirm_record(config.store.directory, record.axis, mark)
-            continue
-        void_record(config.store.directory, record.axis, compared.cause)
-        text = f"RecordVoid: axis {record.axis}: {compared.cause}; nothing can be armed or adopted there"
-        say(f"{text}; {compared.advice}")
+        if traffic.master is not None:
+            compared = compare_heard_writers(config, record, traffic)
+        else:
+            compared = compare_drive(config, record)
+            if compared.ok:
+                confirm_record(config.store.directory, record.axis, mark)
+        if not compared.ok:
+            void_record(config.store.directory, record.axis, compared.cause)
+            text = f"RecordVoid: axis {record.axis}: {compared.cause}; nothing can be armed or adopted there"
+            say(f"{text}; {compared.advice}")
 
 
 def _records(config: MachineConfig, bus: str) -> list[CommissioningRecord]:

@@ -9,10 +9,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from fdhil.cia402 import Object
+from fdhil.cia402 import COB_SDO_RESPONSE, Object, unpack
+from fdhil.commissioning.bus_listener import Traffic
 from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.master import Master
+from fdhil.commissioning.record import CommissioningRecord
+from fdhil.config import MachineConfig
 from fdhil.drivers.can.sdo import NO_OBJECT, NO_SUB_INDEX
+from fdhil.drivers.cia402.profile import DriveProfile
+from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.errors import SdoAbort
 
 POINT = "offset writers"
@@ -20,6 +25,7 @@ MOST_RPDOS = 512
 INVALID_COB_ID = 1 << 31
 COB_ID_BITS = (1 << 29) - 1
 MOST_MAPPED = 64
+LEAST_HELD = 8  # increments: less is found by chance in many frames
 MULTIPLEXED = (254, 255)
 """Numbers of mapped objects that make a PDO a multiplexed one: its frames name the object that they write (CiA 301)."""
 
@@ -122,6 +128,45 @@ def _wrong(master: Master, rpdos: tuple[OtherRpdo, ...]) -> Iterator[tuple[Other
         elif rpdo.cob_id & COB_ID_BITS in ours and rpdo.mapped:
             listed = ", ".join(f"{word:08X}" for word in rpdo.mapped)
             yield rpdo, f"has the COB-ID of an RPDO of the profile and maps {listed}: our frames would write that"
+
+
+def compare_heard_writers(config: MachineConfig, record: CommissioningRecord, traffic: Traffic) -> Finding:
+    """Compare what the drive shows of its offset with the frames that are none of a configured drive's PDOs.
+
+    By SDO nobody is asked where an NC runs the bus: a frame that carries what the drive holds has written it.
+    """
+    profile, axis = load_profile(config.axis[record.axis].drive), config.axis[record.axis]
+    known = {int(cob_id) for key, cob_id in record.options.items() if key.startswith("14")}
+    for name, other in config.axis.items():
+        if other.drive.bus == axis.drive.bus:
+            found = load_profile(other.drive)
+            known |= {spec.cob_base + config.node_id(name) for spec in (*found.rpdos, *found.tpdos)}
+    held, bits = _shown_offset(profile, config.node_id(record.axis), traffic)
+    expected = "written by nobody else"
+    for cob_id in sorted({*traffic.ids} - known) if abs(held) >= LEAST_HELD else ():
+        if _carries(traffic, cob_id, held, bits):
+            um = abs(held) / axis.scaling.increments_per_mm * 1e3
+            cause = f"it holds an offset of {um:.1f} um, which the frame {cob_id:03X} of another master carries"
+            advice = "find what the NC sets up there, switch it off, and run fdhil check with the NC off"
+            return Finding(POINT, expected, f"{cob_id:03X}", False, cause, advice)
+    return Finding(POINT, expected, expected)
+
+
+def _shown_offset(profile: DriveProfile, node_id: int, traffic: Traffic) -> tuple[int, int]:
+    """Return the offset that the drive's TPDO showed last, and its bits; 0 where none came."""
+    found = profile.find_tpdo(profile.offset)
+    data = None if found is None else traffic.data.get(found[0].cob_base + node_id)
+    if found is None or data is None:
+        return 0, 0
+    return unpack(found[0].entries, data.to_bytes(8, "little"))[found[0].entries.index(found[1])], found[1].bits
+
+
+def _carries(traffic: Traffic, cob_id: int, held: int, bits: int) -> bool:
+    """Whether a PDO's frame has this number at one of its bytes."""
+    if not 0x180 <= cob_id < COB_SDO_RESPONSE:
+        return False
+    frame = traffic.data[cob_id].to_bytes(8, "little")[: traffic.length[cob_id]]
+    return (held & (1 << bits) - 1).to_bytes(bits // 8, "little") in frame
 
 
 def unreadable(abort: SdoAbort) -> Finding:

@@ -20,6 +20,8 @@ from fdhil.guard.transitions import Event
 
 PERIODS_AWAITED = 2 * AGREEING
 """TPDOs in which a value must have become known: three in a row, and as many that were in doubt."""
+DISTURBED_CYCLES = 1000
+"""SYNC after another node wrote an offset, in which nothing is adopted."""
 IMPLAUSIBLE = frozenset({"StaleData", "TargetLost", "FollowingError", "Implausible", "PdoLength"})
 OF_THE_RECORD = frozenset({"NotCommissioned", "RecordVoid", "PdoMapping"})
 
@@ -90,6 +92,8 @@ def is_zero(axis: AxisState) -> bool:
 
 def adopt_refusals(state: State, request: Request, alarms: Alarms, views: Views) -> Alarms:
     refused = [alarm for alarm in alarms if alarm.reaction is Reaction.FREEZE]
+    if state.undisturbed_for < DISTURBED_CYCLES:
+        refused.append(Alarm("OffsetHijack", detail=f"{state.undisturbed_for} SYNC ago"))
     if not _nothing_held(state):
         refused += doubts(views, alarms)
     if state.mode not in AT_REST or state.feed.mode is not FeedMode.OFF:
@@ -183,6 +187,9 @@ def adopt_at_start(state: State, inputs: Inputs, alarms: Alarms, views: Views, s
         return state._replace(adopt_checked=True)
     if not is_fed(state) and not any(axis.read_back for axis in state.axes):
         return state._replace(unknown_for=0)
+    if state.undisturbed_for < DISTURBED_CYCLES:  # it is that node's: brought to zero, it would write it again
+        shows = next(axis for axis, held in zip(settings.axes, state.axes, strict=True) if held.read_back)
+        return state.after(Event.DOUBTFUL, cause=Alarm("OffsetHijack", shows.name), adopt_checked=True)
     doubtful = doubts(views, alarms)
     if doubtful and state.unknown_for < patience(settings):
         return state._replace(unknown_for=state.unknown_for + 1)

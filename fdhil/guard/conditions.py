@@ -67,6 +67,7 @@ AXIS_INTERLOCKS: tuple[tuple[str, Good], ...] = (
     ("LimitActive", lambda _own, seen, _axis: _shows(seen, STATUS_INTERNAL_LIMIT) is False),
     ("NotCsp", lambda _own, seen, _axis: seen.mode == Mode.CYCLIC_SYNC_POSITION),
     ("ReadBackStale", lambda _own, seen, _axis: seen.read_back_age <= 2),
+    ("OffsetHijack", lambda _own, _seen, axis: not axis.foreign),
     ("EchoMismatch", lambda _own, _seen, axis: axis.echo_misses < 2 and axis.feed_misses < 2),
     ("Implausible", lambda _own, _seen, axis: axis.implausible < 2),
     ("TargetLost", lambda _own, seen, _axis: seen.target is not None),

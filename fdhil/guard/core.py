@@ -43,7 +43,10 @@ def step(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outpu
     state = observe(state, inputs, settings)
     views = views_of(settings, inputs, state)
     alarms = _alarms(state, inputs, views)
-    state = state._replace(good_for=0 if alarms else state.good_for + inputs.sync)
+    undisturbed_for = (
+        0 if any(alarm.code == "OffsetHijack" for alarm in alarms) else state.undisturbed_for + inputs.sync
+    )
+    state = state._replace(good_for=0 if alarms else state.good_for + inputs.sync, undisturbed_for=undisturbed_for)
     state, refused = _request(state, inputs, alarms, views, settings)
     state = _react(state, inputs, alarms, settings)
     state = adopt_at_start(state, inputs, alarms, views, settings)
@@ -151,7 +154,7 @@ def _ramp_down(state: State, cause: Alarm, event: Event = Event.END) -> State:
 
 def _react(state: State, inputs: Inputs, alarms: Alarms, settings: Settings) -> State:
     """Freeze or ramp down, whichever the worst alarm asks for; a lost daemon is one."""
-    hijack = next((alarm for alarm in inputs.alarms if alarm.code == "OffsetHijack"), None)
+    hijack = next((alarm for alarm in alarms if alarm.code == "OffsetHijack"), None)
     if hijack is not None or any(alarm.code == "NodeRebooted" for alarm in inputs.alarms):
         state = unread(state)
     if state.mode not in SENDING:
@@ -162,6 +165,8 @@ def _react(state: State, inputs: Inputs, alarms: Alarms, settings: Settings) -> 
         return frozen(state, worst)
     if state.failed_run >= 2 * FAILED_SENDS:
         return frozen(state, Alarm("TxQueueFull"))
+    if hijack is not None and _was_ramped_before(state):
+        return frozen(state, hijack)  # two masters that write one offset step the table
     if hijack is not None:
         return _ramp_down(state, hijack, Event.HIJACK)._replace(measuring=max(1, state.measuring))
     if state.mode not in IN_CHARGE:
@@ -171,6 +176,16 @@ def _react(state: State, inputs: Inputs, alarms: Alarms, settings: Settings) -> 
     if inputs.main_alive is not True:
         return _ramp_down(state, Alarm("MainLost"))
     return _ramp_down(state, inputs.withdrawn[0]) if inputs.withdrawn else state
+
+
+def _was_ramped_before(state: State) -> bool:
+    """Whether this is a ramp from what another node wrote: one that writes again would do so for ever."""
+    return (
+        state.mode in LANDING
+        and not state.measuring
+        and state.cause is not None
+        and (state.cause.code == "OffsetHijack")
+    )
 
 
 def _reaction(alarm: Alarm, settings: Settings) -> Reaction:

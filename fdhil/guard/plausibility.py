@@ -11,6 +11,8 @@ from fdhil.guard.settings import AxisSettings, Settings
 from fdhil.guard.state import NOT_SHOWN, AxisInput, AxisState, Inputs, Shown, State
 from fdhil.guard.transitions import Event
 
+STRAY = 50  # readings: a second one within so many that is not what was sent was written by another node
+
 
 def observe(state: State, inputs: Inputs, settings: Settings) -> State:
     """Take in what was sampled: failed frames, read-backs, following errors, the targets just latched."""
@@ -26,7 +28,7 @@ def observe(state: State, inputs: Inputs, settings: Settings) -> State:
     history = (targets, *state.targets)[:depth]
     sampled = [
         _fed(
-            _believed(_sampled(axis, seen, setting, k, history), seen, setting, state.tick),
+            _believed(_sampled(axis, seen, setting, k, history, state.mode in SENDING), seen, setting, state.tick),
             seen.fed_back,
             [pairs[k] for pairs in state.feed.sent if pairs],
         )
@@ -58,13 +60,21 @@ def _not_sent(axis: AxisState) -> AxisState:
 
 
 def _sampled(
-    axis: AxisState, seen: AxisInput, setting: AxisSettings, k: int, history: tuple[tuple[int, ...] | None, ...]
+    axis: AxisState,
+    seen: AxisInput,
+    setting: AxisSettings,
+    k: int,
+    history: tuple[tuple[int, ...] | None, ...],
+    sending: bool,
 ) -> AxisState:
     """Compare what the drive showed at the SYNC before with what was in force then.
 
     ``axis.sent[0]`` left after that SYNC, ``sent[1]`` after the one before it and was latched at it. The set-point
     followed then was latched ``setpoint_delay_cycles`` earlier, together with its offset.
+    What changes while nothing is ``sending`` was written by another node; so was what is shown between readings that
+    are what was sent.
     """
+    axis = axis._replace(foreign=False) if axis.foreign else axis
     error: float = axis.following_error
     latched = history[1 + setting.setpoint_delay_cycles] if len(history) > 1 + setting.setpoint_delay_cycles else None
     if seen.following_error is not None:
@@ -78,12 +88,16 @@ def _sampled(
         return axis._replace(following_error=error, readings=readings)
     late = seen.read_back != axis.sent[1] and seen.read_back in axis.sent[2:4]
     wrong = seen.read_back != axis.sent[1] and not late
+    strays = min(axis.strays + STRAY, 2 * STRAY) if wrong else max(0, axis.strays - 1)
+    moved = not sending and seen.read_back and axis.read_back not in (None, seen.read_back)
     return axis._replace(
         following_error=error,
         read_back=seen.read_back,
         readings=axis.readings + 1 if seen.read_back == axis.read_back else 1,
         off_demand=_off_demand(seen, k, history),
         echo_misses=axis.echo_misses + 1 if wrong else 0,
+        strays=strays,
+        foreign=bool(moved) or (wrong and strays > STRAY and not axis.echo_misses),
         late_echoes=axis.late_echoes + late,
         zero_shown=axis.zero_shown or (seen.read_back == 0 and not any(axis.sent[:2])),
     )

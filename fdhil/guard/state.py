@@ -17,6 +17,7 @@ from fdhil.guard.transitions import NEXT, Event
 Shown = tuple[int | None, int | None]
 """What a drive shows of its speed and its torque offset; None where no TPDO does."""
 NOT_SHOWN: Shown = (None, None)
+UNDISTURBED = 1 << 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +101,8 @@ class AxisState(NamedTuple):
 
     ``read_back`` is what the drive last showed (None: never), in ``readings`` TPDOs in a row, by ``off_demand`` away
     from what 0x6062 says; ``zero_shown``: it showed 0 since we send 0. ``record_void``: it may not be as commissioned.
+    ``strays`` grows with readings that were not what was sent, between others that were; ``foreign``: another node
+    wrote what was shown last.
     ``fed_back`` is the same of speed and torque offset. ``believed`` are the last position, speed (increments per
     cycle) and tick that agreed with those before, ``implausible`` the samples since then that did not.
     """
@@ -115,6 +118,8 @@ class AxisState(NamedTuple):
     touched: int = 0
     echo_misses: int = 0
     late_echoes: int = 0
+    strays: int = 0
+    foreign: bool = False
     zero_shown: bool = False
     following_error: float = float("nan")
     fed_back: Shown = NOT_SHOWN
@@ -130,7 +135,8 @@ class State(NamedTuple):
     targets agreed with. ``rest`` are the last targets heard, ``rested_for`` the cycles since they came to stand there.
     ``cause`` is why the correction went off, kept until the next arming. ``measuring`` counts the cycles in which
     nothing is sent because another node changed the offset: the ramp starts from what the drives show.
-    ``unknown_for`` counts those after the start in which a drive showed an offset that could not be believed yet.
+    ``unknown_for`` counts those after the start in which a drive showed an offset that could not be believed yet,
+    ``undisturbed_for`` those since another node wrote an offset.
     """
 
     mode: Mode
@@ -149,6 +155,7 @@ class State(NamedTuple):
     zeros_sent: int = 0
     measuring: int = 0
     unknown_for: int = 0
+    undisturbed_for: int = UNDISTURBED
     adopt_checked: bool = False
     cause: Alarm | None = None
     missed: int = 0

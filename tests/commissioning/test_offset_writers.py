@@ -2,25 +2,36 @@
 
 from __future__ import annotations
 
+import struct
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from fdhil.arming.guard_settings import settings_of
+from fdhil.commissioning.bus_listener import Traffic
+from fdhil.commissioning.compare import compare_again
 from fdhil.commissioning.config_check import check_machine
 from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.master import Master
-from fdhil.commissioning.offset_writers import POINT
+from fdhil.commissioning.offset_writers import POINT, compare_heard_writers
+from fdhil.commissioning.record import CommissioningRecord, save_record
 from fdhil.commissioning.steps import check_axis, commission
 from fdhil.commissioning.survey import Survey, survey
-from fdhil.config import MachineConfig
+from fdhil.commissioning.void import is_void
+from fdhil.config import MachineConfig, parse
 from fdhil.errors import DriveFault
+from tests.bench import bench_document
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
 
 pytestmark = pytest.mark.usefixtures("quick_commissioning")
+RECORD = CommissioningRecord(
+    "X", 1, 2, 3, 4, "c0ffee", "f1f2", {}, 1e4, True, 9.8, True, "proven", "2026-01-01T00:00:00+00:00"
+)
 POSITION_OFFSET, SPEED_OFFSET, TORQUE_OFFSET, OUTPUTS = 0x60B00020, 0x60B10020, 0x60B20010, 0x60FE0120
 
 
@@ -48,6 +59,11 @@ def give_rpdo(peer: DrivePeer, number: int, cob_id: int, words: Sequence[int], c
     for sub, word in enumerate(words, 1):
         peer.drive.set_object(0x1600 + number - 1, sub, word)
     peer.drive.set_object(0x1600 + number - 1, 0, len(words) if count is None else count)
+
+
+def corrected(folder: Path) -> MachineConfig:
+    document = bench_document("X") | {"bus": {"can0": {"interface": "virtual", "channel": uuid.uuid4().hex}}}
+    return parse(document | {"guard": {"clock": "sync"}}, folder=folder)
 
 
 def surveyed(settings: MachineConfig) -> tuple[Survey, Finding]:
@@ -129,10 +145,74 @@ def test_record_keeps_the_other_rpdos(peer: tuple[DrivePeer, MachineConfig]) -> 
         assert check_axis(master).fingerprint == record.mapping_fingerprint
 
 
+def test_record_is_void_where_a_second_writer_was_set_up_since(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before the guard starts, with the NC off, by SDO."""
+    monkeypatch.setattr("fdhil.commissioning.compare.LISTEN_S", 0.2)
+    settings, told = corrected(tmp_path), list[str]()
+    with DrivePeer(settings) as drive:
+        record = commission(settings, "X")
+        save_record(record, settings.store.directory)
+        compare_again(settings, "can0", told.append)
+        assert told == []
+        assert settings_of(settings, "can0", tmp_path, "").axes[0].record_void is False
+        give_rpdo(drive, 20, 0x3F0, [POSITION_OFFSET])
+        compare_again(settings, "can0", told.append)
+    assert told[0].startswith("RecordVoid: axis X: its RPDO20 (COB-ID 3F0) writes 60B0, as fdhil does")
+    assert settings_of(settings, "can0", tmp_path, "").axes[0].record_void is True
+
+
+def test_guard_is_told_the_cob_ids_of_the_record(tmp_path: Path) -> None:
+    settings = corrected(tmp_path)
+    save_record(RECORD, settings.store.directory)
+    assert settings_of(settings, "can0", tmp_path, "").axes[0].writers == (0x401, 0x501)  # by default, not valid
+    kept = {"1403": 0x501, "1404": 0x8000_0333, "1405": 0xA001_2345, "1406": 0x8000_0000}
+    save_record(replace(RECORD, options=kept), settings.store.directory)
+    assert settings_of(settings, "can0", tmp_path, "").axes[0].writers == (0x333, 0x401)
+
+
+def heard(held: int, frames: Mapping[int, bytes]) -> Traffic:
+    """What is heard of a drive that holds an offset, beside an NC that sends these frames, too."""
+    sent = {0x381: struct.pack("<ii", held + 7, held), 0x201: struct.pack("<Hi", 15, 7), **frames}
+    data = {cob_id: int.from_bytes(frame.ljust(8, b"\0"), "little") for cob_id, frame in sent.items()}
+    return Traffic(count=dict.fromkeys(sent, 9), length={key: len(frame) for key, frame in sent.items()}, data=data)
+
+
+@pytest.mark.parametrize(
+    ("held", "frames", "found"),
+    [
+        (197, {0x3F0: struct.pack("<i", 197)}, "60.1 um, which the frame 3F0"),
+        (-197, {0x41: b"", 0x57F: struct.pack("<Hi", 0xC5C5, -197)}, "60.1 um, which the frame 57F"),
+        (197, {0x3F0: struct.pack("<i", 198), 0x3F1: b"\xc5\0\0"}, ""),
+        (197, {0x601: struct.pack("<i", 197), 0x301: struct.pack("<i", 197)}, ""),
+        (1, {0x3F0: b"\1\0\0\0"}, ""),
+        (197, {0x501: struct.pack("<i", 197)}, ""),  # by its record this one writes something else
+    ],
+)
+def test_frame_that_carries_the_offset_of_a_drive_makes_its_record_void(
+    held: int, frames: Mapping[int, bytes], found: str, tmp_path: Path
+) -> None:
+    """With the NC on nothing is asked."""
+    record = replace(RECORD, options={"1403": 0x501})
+    finding = compare_heard_writers(corrected(tmp_path), record, heard(held, frames))
+    assert (finding.ok, found in finding.cause) == (not found, True)
+
+
+def test_record_is_void_where_a_frame_beside_the_nc_carries_the_offset(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings, told = corrected(tmp_path), list[str]()
+    save_record(RECORD, settings.store.directory)
+    traffic = heard(197, {0x3F0: struct.pack("<i", 197)})
+    monkeypatch.setattr("fdhil.commissioning.compare._listen", lambda *_: traffic)
+    compare_again(settings, "can0", told.append)
+    assert "nothing can be armed or adopted there" in told[0]
+    assert is_void(settings.store.directory, "X")
+
+
 # sizes of mapped objects
 
 
-def own_profile(folder: Any, entries: str) -> dict[str, Any]:
+def own_profile(folder: Path, entries: str) -> dict[str, Any]:
     path = folder / "own.toml"
     path.write_text(
         'base = "fdhil_twin"\n'
@@ -161,7 +241,7 @@ def own_profile(folder: Any, entries: str) -> dict[str, Any]:
     ],
 )
 def test_object_that_is_mapped_in_another_size_is_found(
-    entries: str, mapped: list[tuple[int, int, int]], says: str, tmp_path: Any
+    entries: str, mapped: list[tuple[int, int, int]], says: str, tmp_path: Path
 ) -> None:
     settings = config(drive=own_profile(tmp_path, entries))
     with DrivePeer(settings) as drive, Master(settings, "X") as master:

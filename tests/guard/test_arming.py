@@ -221,6 +221,7 @@ def test_every_vector_of_an_axis_is_told_exactly() -> None:
     }
     shown |= {"ReadBackStale": {"read_back_age": 3}, "PdoLength": {"short_frames": 3}, "TargetLost": {"target": None}}
     kept: dict[str, dict[str, Any]] = {"EchoMismatch": {"echo_misses": 2}, "Implausible": {"implausible": 2}}
+    kept["OffsetHijack"] = {"foreign": True}
     feedback: list[tuple[float, set[str]]] = [(1, set()), (2, {"FeedbackGap"}), (4, {"FeedbackGap", "StaleData"})]
     names = [*bits, *shown, *kept]
     assert {*names, "FeedbackGap", "StaleData"} == {code for code, _ in AXIS_INTERLOCKS}

@@ -1,0 +1,161 @@
+"""A second master that writes the offset of a drive, by whatever COB-ID: nothing is adopted, nothing is fought over."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from fdhil.errors import ConfigError
+from fdhil.guard.protocol import Mode
+from fdhil.guard.settings import from_json, to_json
+from fdhil.guard.state import Request
+from tests.guard.machine import Bench, bench
+
+WRITER, PITCH_ERROR, PERIOD = 0x501, 197, 25
+"""An RPDO of drive X that carries 60B0; 60.1 um every 25 SYNC, as an NC that compensates a screw's pitch sends them."""
+ADOPT = Request("adopt", token_valid=True)
+
+
+def written_by(*cob_ids: int, amplitude: int = 800) -> Bench:
+    """A machine whose drive X has RPDOs with these COB-IDs that write its offset."""
+    machine = bench(amplitude=amplitude)
+    axes = machine.settings.axes
+    settings = replace(machine.settings, axes=(replace(axes[0], writers=cob_ids), *axes[1:]))
+    return Bench(settings, machine.path, machine.demand, machine.drives)
+
+
+def write(machine: Bench, value: int = PITCH_ERROR, cob_id: int = WRITER) -> None:
+    """The other master's frame, behind ours: it is what the next SYNC latches."""
+    machine.hear(cob_id, struct.pack("<i", value))
+    machine.drives[0].received_offset = value
+
+
+def run(machine: Bench, cycles: int, value: Callable[[int], int] = lambda _tick: PITCH_ERROR) -> None:
+    for _ in range(cycles):
+        machine.sync()
+        if machine.tick % PERIOD == 0:
+            write(machine, value(machine.tick))
+
+
+def cutting(machine: Bench, offset: int = 300) -> Bench:
+    machine.settle()
+    assert machine.arm() == ()
+    machine.run(30)
+    machine.play()
+    while machine.offsets[0] < offset:
+        machine.sync()
+    machine.alarms.clear()
+    return machine
+
+
+def cause(machine: Bench) -> tuple[str, str]:
+    assert machine.state.cause is not None
+    return machine.state.cause.code, machine.state.cause.axis
+
+
+def test_guard_adopts_no_offset_that_another_master_writes() -> None:
+    machine = written_by(WRITER)
+    machine.drives[0].hold(PITCH_ERROR)
+    run(machine, 600)
+    assert machine.frames == []
+    assert (machine.mode, cause(machine)) == (Mode.FROZEN, ("OffsetHijack", "X"))
+    refused = machine.sync(ADOPT).refused
+    assert refused is not None
+    assert "OffsetHijack" in {alarm.code for alarm in refused}
+    assert machine.frames == []
+
+
+def test_offset_of_another_master_can_be_adopted_once_that_is_silent() -> None:
+    machine = written_by(WRITER)
+    machine.drives[0].hold(PITCH_ERROR)
+    run(machine, 100)
+    machine.run(1100)
+    assert machine.frames == []
+    assert machine.sync(ADOPT).refused == ()
+    machine.until(Mode.OFF)
+    assert machine.held[-1] == (0, 0)
+
+
+def test_offset_that_changes_by_itself_is_not_adopted() -> None:
+    """The other master uses a COB-ID that nobody knows; what it writes varies along the axis."""
+    machine = written_by()
+    machine.drives[0].hold(PITCH_ERROR)
+    for _ in range(8):
+        machine.sync()
+    for _ in range(400):
+        machine.sync()
+        if machine.tick % PERIOD == 0:
+            machine.drives[0].hold(PITCH_ERROR + machine.tick)
+    assert machine.frames == []
+    assert (machine.mode, cause(machine)) == (Mode.FROZEN, ("OffsetHijack", "X"))
+
+
+@pytest.mark.fault("A19")
+def test_frame_of_another_rpdo_ends_the_correction_at_once() -> None:
+    machine = cutting(written_by(0x401, WRITER))
+    write(machine)
+    machine.sync()
+    frames = len(machine.frames)
+    assert (machine.mode, cause(machine)) == (Mode.RAMP_DOWN, ("OffsetHijack", "X"))
+    machine.run(15)
+    assert len(machine.frames) == frames  # until it is known what the drive holds
+
+
+@pytest.mark.parametrize(
+    ("period", "mode"),
+    [
+        pytest.param(35, Mode.FROZEN, id="before it is known what the drive holds, or in the ramp"),
+        pytest.param(100, Mode.OFF, id="after the ramp"),
+    ],
+)
+def test_master_that_writes_again_and_again_is_not_fought(period: int, mode: Mode) -> None:
+    machine = cutting(written_by(WRITER))
+    before = len(machine.frames)
+    for _ in range(30):
+        write(machine)
+        machine.run(period)
+    assert (machine.mode, cause(machine)) == (mode, ("OffsetHijack", "X"))
+    assert len(machine.frames) - before < 100  # one ramp at most
+
+
+@pytest.mark.fault("A19")
+def test_offset_that_was_not_sent_is_found_by_the_read_back() -> None:
+    """By a COB-ID that nobody knows: every other time that it is written, the drive shows it."""
+    machine = cutting(written_by(), 100)
+    for _ in range(120):
+        machine.sync()
+        if machine.tick % PERIOD == PERIOD - 1:
+            machine.drives[0].received_offset = -PITCH_ERROR
+        if machine.alarms:
+            break
+    assert machine.alarms[0].code == "OffsetHijack"
+    assert (machine.mode, machine.state.measuring > 0) == (Mode.RAMP_DOWN, True)
+
+
+def test_one_reading_that_was_not_sent_is_forgiven() -> None:
+    machine = cutting(written_by(), 100)
+    while machine.tick % 10 != 9:
+        machine.sync()
+    machine.drives[0].received_offset = -PITCH_ERROR
+    machine.run(100)
+    assert machine.alarms == []
+
+
+def test_nothing_is_armed_beside_another_master() -> None:
+    machine = written_by(WRITER)
+    machine.settle()
+    write(machine, 0)
+    machine.sync()
+    assert "NotSettled" in {alarm.code for alarm in machine.arm()}
+
+
+def test_writers_are_heard_and_none_of_ours() -> None:
+    made = written_by(0x401, WRITER).settings
+    assert from_json(to_json(made)) == made
+    for ours in (0x301, 0x201, 0x181):
+        axes = (replace(made.axes[0], writers=(ours,)), *made.axes[1:])
+        with pytest.raises(ConfigError, match="counts as a foreign writer's"):
+            from_json(to_json(replace(made, axes=axes)))
