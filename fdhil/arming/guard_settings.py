@@ -13,7 +13,7 @@ from fdhil.arming.token import given_credential
 from fdhil.cia402 import COB_RPDO, first_axis_index
 from fdhil.commissioning.identifiers import require_own_identifiers, sent_pdos
 from fdhil.commissioning.record import KEY_NAME, CommissioningRecord, load_record, of_config
-from fdhil.commissioning.void import is_void
+from fdhil.commissioning.void import is_void, void_reason
 from fdhil.config import Axis, MachineConfig, OffsetBounds, share_fault
 from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
 from fdhil.drivers.cia402.profile_file import load_profile, require_offset
@@ -160,7 +160,9 @@ def _commissioned(machine: MachineConfig, name: str, record: CommissioningRecord
     """The fingerprint of the drive as it was signed off, and whether something against that was seen since."""
     if record is None or not of_config(record, machine, name):
         return {}
-    return {"record": record.fingerprint, "record_void": is_void(machine.store.directory, name)}
+    void = is_void(machine.store.directory, name)
+    reason = void_reason(machine.store.directory, name) if void else ""
+    return {"record": record.fingerprint, "record_void": void, "void_reason": reason}
 
 
 def _largest_acceleration_rad_s2(axis: Axis) -> float:

@@ -15,6 +15,8 @@ from pathlib import Path
 from fdhil.errors import StoreError
 from fdhil.store.atomic import make_folder, sync_folder
 
+MOST_BYTES, MOST_REASON = 64 * 1024, 300
+
 
 def void_path(directory: Path, axis: str) -> Path:
     """Return where the mark of an axis is kept."""
@@ -34,6 +36,16 @@ def is_void(directory: Path, axis: str) -> bool:
     except OSError:
         return True
     return True
+
+
+def void_reason(directory: Path, axis: str) -> str:
+    """Return what was seen against the axis' record, empty where that cannot be read."""
+    try:
+        with void_path(directory, axis).open("rb") as file:
+            why = json.loads(file.read(MOST_BYTES))["why"]
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return ""
+    return " ".join(str(why).split())[:MOST_REASON]
 
 
 def void_mark(directory: Path, axis: str) -> Mark | None:

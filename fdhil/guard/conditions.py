@@ -100,7 +100,13 @@ def failing(bus: BusView, views: Views) -> Alarms:
 
 def not_ready(views: Views) -> Alarms:
     """Return an alarm for everything about the drives that forbids arming beyond ``failing``."""
-    return tuple([Alarm(code, v[0].name) for v in views for code, good in ARMING_INTERLOCKS if not good(*v)])
+    return tuple([_told(code, v) for v in views for code, good in ARMING_INTERLOCKS if not good(*v)])
+
+
+def _told(code: str, view: View) -> Alarm:
+    """An alarm; of a record that was void before the start with its reason."""
+    own, _seen, axis = view
+    return Alarm(code, own.name, own.void_reason if code == "RecordVoid" and not axis.touched else "")
 
 
 def withheld(facts: Mapping[str, object], needed: Mapping[str, str]) -> Alarms:

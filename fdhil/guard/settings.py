@@ -63,7 +63,7 @@ class AxisSettings:
     ``heartbeat_timeout_s`` 0: the drive has no heartbeat, and its PDOs alone show that it is Operational.
     ``writers`` are COB-IDs, not ours, whose frames may change an offset of the drive.
     ``record`` is the fingerprint of the drive as it was commissioned, empty: it was not; ``record_void`` says that
-    something against it was seen since.
+    something against it was seen since, ``void_reason`` what.
     """
 
     name: str
@@ -86,6 +86,7 @@ class AxisSettings:
     writers: tuple[int, ...] = ()
     record: str = ""
     record_void: bool = False
+    void_reason: str = ""
 
     @property
     def read_back_every(self) -> int:
@@ -285,6 +286,7 @@ def _check_axis(axis: AxisSettings) -> None:
     _number(axis.speed_step, 0.0, 2.0**31, where + "speed_step")
     _number(axis.speed_count, 0.0, 2.0**31, where + "speed_count")
     _word(axis.record, ".{0,200}", where + "record")
+    _word(axis.void_reason, ".{0,300}", where + "void_reason")
     if type(axis.record_void) is not bool:
         raise ValueError(f"{where}record_void is neither true nor false")
     _check_sent(axis.offset, OFFSET_LAYOUT, f"{where}the offset RPDO must map 0x60B0:00 and nothing else")

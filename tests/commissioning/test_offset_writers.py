@@ -158,7 +158,9 @@ def test_record_is_void_where_a_second_writer_was_set_up_since(tmp_path: Path, m
         give_rpdo(drive, 20, 0x3F0, [POSITION_OFFSET])
         compare_again(settings, "can0", told.append)
     assert told[0].startswith("RecordVoid: axis X: its RPDO20 (COB-ID 3F0) writes 60B0, as fdhil does")
-    assert settings_of(settings, "can0", tmp_path, "").axes[0].record_void is True
+    [axis] = settings_of(settings, "can0", tmp_path, "").axes
+    assert axis.record_void is True
+    assert axis.void_reason.startswith("its RPDO20 (COB-ID 3F0) writes 60B0")
 
 
 def test_guard_is_told_the_cob_ids_of_the_record(tmp_path: Path) -> None:

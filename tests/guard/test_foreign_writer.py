@@ -152,6 +152,20 @@ def test_nothing_is_armed_beside_another_master() -> None:
     assert "NotSettled" in {alarm.code for alarm in machine.arm()}
 
 
+def test_arming_is_refused_with_the_reason_of_a_void_record() -> None:
+    machine = bench()
+    axes = machine.settings.axes
+    why = "its RPDO4 (COB-ID 501) writes 60B0"
+    settings = replace(machine.settings, axes=(replace(axes[0], record_void=True, void_reason=why), *axes[1:]))
+    machine = Bench(from_json(to_json(settings)), machine.path, machine.demand, machine.drives)
+    machine.settle()
+    refused = {alarm.code: alarm.sentence() for alarm in machine.arm()}
+    assert f"({why}); nothing is sent; " in refused["RecordVoid"]
+    machine.reboot(0)  # a later reason is another
+    machine.settle()
+    assert why not in {alarm.code: alarm.sentence() for alarm in machine.arm()}["RecordVoid"]
+
+
 def test_writers_are_heard_and_none_of_ours() -> None:
     made = written_by(0x401, WRITER).settings
     assert from_json(to_json(made)) == made

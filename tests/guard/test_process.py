@@ -302,7 +302,8 @@ def test_killed_guard_leaves_a_value_that_the_next_one_adopts(rig: Rig) -> None:
 
 
 @pytest.mark.fault("G9", "A19", "F16")
-def test_what_is_forged_foreign_or_silent_makes_no_step(rig: Rig) -> None:
+@pytest.mark.parametrize("cob_id", [0x301, 0x501], ids=["our COB-ID", "another RPDO of the drive"])
+def test_what_is_forged_foreign_or_silent_makes_no_step(rig: Rig, cob_id: int) -> None:
     """Over the hub, as another node would do it: forged and missing read-backs, a foreign offset, a blind restart."""
     client, peer, drive = rig.connect(), rig.peer, rig.peer.drives[0]
     for value in (300, 300, 983_040, -983_040):
@@ -311,7 +312,7 @@ def test_what_is_forged_foreign_or_silent_makes_no_step(rig: Rig) -> None:
         peer.wait(lambda tick=tick: peer.tick > tick + 40, "SYNC")  # type: ignore[misc]
     assert peer.sent == []
     rig.into_the_cut()
-    peer.inject((0x301, (-819).to_bytes(4, "little", signed=True)))
+    peer.inject((cob_id, (-819).to_bytes(4, "little", signed=True)))
     drive.received_offset = -819
     peer.wait(lambda: rig.state() == "OFF", "off")
     peer.expected = False  # the guard is silent, whatever the drives hold
