@@ -82,7 +82,7 @@ def compare_again(config: MachineConfig, bus: str, say: Callable[[str], None]) -
     for record in records:
         mark = void_mark(config.store.directory, record.axis)
         if traffic.master is not None:
-            compared = compare_heard_writers(config, record, traffic)
+            compared = compare_heard_writers(config, record.axis, record, traffic)
         else:
             compared = compare_drive(config, record)
             if compared.ok:

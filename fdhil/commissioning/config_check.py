@@ -15,7 +15,8 @@ from fdhil.commissioning.compare import POINT, compare_record
 from fdhil.commissioning.finding import Finding, read_optional
 from fdhil.commissioning.identifiers import compare_identifiers
 from fdhil.commissioning.master import Master
-from fdhil.commissioning.record import load_record
+from fdhil.commissioning.offset_writers import compare_heard_writers
+from fdhil.commissioning.record import CommissioningRecord, load_record
 from fdhil.commissioning.survey import Survey, survey
 from fdhil.commissioning.timing import judge_sync
 from fdhil.config import MachineConfig
@@ -110,6 +111,13 @@ def compare_asked(config: MachineConfig, axis: str, heard: Sequence[int] = ()) -
 def _not_compared(points: Sequence[str], cause: str, advice: str) -> list[Finding]:
     """What is left to compare by SDO, and why it was not."""
     return [Finding(point, "the config's", "not asked", None, cause, advice) for point in points]
+
+
+def _record_of(config: MachineConfig, axis: str) -> CommissioningRecord | None:
+    try:
+        return load_record(config.store.directory, axis, config.store.commissioning_key, may_lack_key=True)
+    except StoreError:
+        return None
 
 
 def _record(config: MachineConfig, axis: str, found: Survey) -> Iterator[Finding]:
@@ -211,6 +219,8 @@ def compare_heard(traffic: Traffic, config: MachineConfig, axis: str) -> Iterato
     if table is not None and table.cob_id is not None:
         yield _heard_table(traffic, table.cob_id)
     yield compare_identifiers(config, axis, traffic.ids)
+    if profile.find_tpdo(profile.offset) is not None:
+        yield compare_heard_writers(config, axis, _record_of(config, axis), traffic)
     yield from _rapid(config, profile, lambda: _heard_value(traffic, profile, node_id))
     yield from _not_compared(("device", *SDO_POINTS), "SDO belongs to the NC now", NC_OFF)
 

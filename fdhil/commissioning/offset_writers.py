@@ -16,12 +16,14 @@ from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import CommissioningRecord
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.sdo import NO_OBJECT, NO_SUB_INDEX
-from fdhil.drivers.cia402.profile import DriveProfile
+from fdhil.drivers.cia402.device import read_device
+from fdhil.drivers.cia402.profile import LOGICAL_AXIS_PDOS, DriveProfile
 from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.errors import SdoAbort
 
 POINT = "offset writers"
 MOST_RPDOS = 512
+MOST_MISSING, MOST_MISSING_BEHIND = 16, 4
 INVALID_COB_ID = 1 << 31
 COB_ID_BITS = (1 << 29) - 1
 MOST_MAPPED = 64
@@ -55,11 +57,28 @@ class OtherRpdo:
 def read_other_rpdos(master: Master) -> tuple[OtherRpdo, ...]:
     """Read all RPDOs that the drive has beside the profile's; SdoAbort where one is there and cannot be read.
 
-    All 512 places are asked, for neither the drive's EDS nor the place of the last one says that there are no more.
+    Asked is from the first on, and at the first places of each further axis of a device (CiA 402-3), until so many in a
+    row do not exist; and whatever the drive's EDS has. A drive that numbers its RPDOs otherwise must have an EDS.
     """
-    own = {spec.number for spec in master.profile.rpdos}
-    found = (_read(master, number) for number in range(1, MOST_RPDOS + 1) if number not in own)
-    return tuple(rpdo for rpdo in found if rpdo is not None)
+    own, found = {spec.number for spec in master.profile.rpdos}, dict[int, OtherRpdo | None]()
+    for block in range(0, MOST_RPDOS, LOGICAL_AXIS_PDOS):
+        missing, allowed = 0, MOST_MISSING if block == 0 else MOST_MISSING_BEHIND
+        for number in range(block + 1, block + LOGICAL_AXIS_PDOS + 1):
+            if number not in own:
+                found[number] = _read(master, number)
+            exists = number in own or found[number] is not None
+            missing, allowed = 0 if exists else missing + 1, MOST_MISSING if exists else allowed
+            if missing >= allowed:
+                break
+    for number in _of_eds(master) - own - found.keys():
+        found[number] = _read(master, number)
+    return tuple(rpdo for _, rpdo in sorted(found.items()) if rpdo is not None)
+
+
+def _of_eds(master: Master) -> set[int]:
+    """Return the RPDOs that the drive's EDS has; it may have more, or fewer."""
+    eds = master.config.axis[master.axis].drive.eds
+    return set() if eds is None else {place.number for place in read_device(eds).rpdos}
 
 
 def _read(master: Master, number: int) -> OtherRpdo | None:
@@ -130,18 +149,21 @@ def _wrong(master: Master, rpdos: tuple[OtherRpdo, ...]) -> Iterator[tuple[Other
             yield rpdo, f"has the COB-ID of an RPDO of the profile and maps {listed}: our frames would write that"
 
 
-def compare_heard_writers(config: MachineConfig, record: CommissioningRecord, traffic: Traffic) -> Finding:
-    """Compare what the drive shows of its offset with the frames that are none of a configured drive's PDOs.
+def compare_heard_writers(
+    config: MachineConfig, name: str, record: CommissioningRecord | None, traffic: Traffic
+) -> Finding:
+    """Compare what an axis' drive shows of its offset with the frames that are none of a configured drive's PDOs.
 
     By SDO nobody is asked where an NC runs the bus: a frame that carries what the drive holds has written it.
     """
-    profile, axis = load_profile(config.axis[record.axis].drive), config.axis[record.axis]
-    known = {int(cob_id) for key, cob_id in record.options.items() if key.startswith("14")}
-    for name, other in config.axis.items():
+    profile, axis = load_profile(config.axis[name].drive), config.axis[name]
+    options = {} if record is None else record.options
+    known = {cob_id for key, cob_id in options.items() if key.startswith("14")}
+    for each, other in config.axis.items():
         if other.drive.bus == axis.drive.bus:
             found = load_profile(other.drive)
-            known |= {spec.cob_base + config.node_id(name) for spec in (*found.rpdos, *found.tpdos)}
-    held, bits = _shown_offset(profile, config.node_id(record.axis), traffic)
+            known |= {spec.cob_base + config.node_id(each) for spec in (*found.rpdos, *found.tpdos)}
+    held, bits = _shown_offset(profile, config.node_id(name), traffic)
     expected = "written by nobody else"
     for cob_id in sorted({*traffic.ids} - known) if abs(held) >= LEAST_HELD else ():
         if _carries(traffic, cob_id, held, bits):

@@ -13,4 +13,3 @@ def quick_commissioning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 5.0)  # it answers at once, on a host that has time
     monkeypatch.setattr("fdhil.commissioning.steps.SETTLE_CYCLES", 120)
     monkeypatch.setattr("fdhil.commissioning.steps.AVERAGE_CYCLES", 60)
-    monkeypatch.setattr("fdhil.commissioning.offset_writers.MOST_RPDOS", 32)  # it has eight at most

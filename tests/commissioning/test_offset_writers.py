@@ -14,16 +14,17 @@ import pytest
 from fdhil.arming.guard_settings import settings_of
 from fdhil.commissioning.bus_listener import Traffic
 from fdhil.commissioning.compare import compare_again
-from fdhil.commissioning.config_check import check_machine
+from fdhil.commissioning.config_check import check_machine, compare_heard
 from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.master import Master
-from fdhil.commissioning.offset_writers import POINT, compare_heard_writers
+from fdhil.commissioning.offset_writers import POINT, compare_heard_writers, read_other_rpdos
 from fdhil.commissioning.record import CommissioningRecord, save_record
 from fdhil.commissioning.steps import check_axis, commission
 from fdhil.commissioning.survey import Survey, survey
 from fdhil.commissioning.void import is_void
 from fdhil.config import MachineConfig, parse
 from fdhil.errors import DriveFault
+from fdhil.sim.drive.eds import eds_text
 from tests.bench import bench_document
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
@@ -78,8 +79,8 @@ def surveyed(settings: MachineConfig) -> tuple[Survey, Finding]:
         (4, 0x501, [POSITION_OFFSET], "RPDO4 (COB-ID 501) writes 60B0"),
         (4, 0x7, [OUTPUTS, SPEED_OFFSET], "RPDO4 (COB-ID 007) writes 60B1"),
         (17, 0x37F, [TORQUE_OFFSET, POSITION_OFFSET], "RPDO17 (COB-ID 37F) writes 60B0 and 60B2"),
-        (512, 0x2000_0000 | 0x12345, [POSITION_OFFSET], "RPDO512 (COB-ID 12345) writes 60B0"),
-        (100, 0x301, [OUTPUTS], "RPDO100 (COB-ID 301) has the COB-ID of an RPDO of the profile and maps 60FE0120"),
+        (66, 0x2000_0000 | 0x12345, [POSITION_OFFSET], "RPDO66 (COB-ID 12345) writes 60B0"),
+        (449, 0x301, [OUTPUTS], "RPDO449 (COB-ID 301) has the COB-ID of an RPDO of the profile and maps 60FE0120"),
     ],
 )
 def test_second_writer_of_an_offset_is_found(
@@ -88,14 +89,34 @@ def test_second_writer_of_an_offset_is_found(
     words: list[int],
     says: str,
     peer: tuple[DrivePeer, MachineConfig],
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     drive, settings = peer
-    monkeypatch.setattr("fdhil.commissioning.offset_writers.MOST_RPDOS", 512)
     give_rpdo(drive, number, cob_id, words)
     _, finding = surveyed(settings)
     assert (finding.ok, says in finding.cause) == (False, True), finding
     assert f"bit 31 of 0x{0x1400 + number - 1:04X}:01" in finding.advice
+
+
+def test_second_writer_that_only_the_eds_names_is_found(tmp_path: Path) -> None:
+    plain = config()
+    eds, more = tmp_path / "twin.eds", ""
+    with DrivePeer(plain) as drive:
+        for index, subs in ((0x15FF, (1, 2)), (0x17FF, (0, 1))):
+            more += f"\n[{index:04X}]\nParameterName=a\nObjectType=9\n"
+            more += "".join(f"[{index:04X}sub{sub}]\nParameterName=a\nDataType=7\nAccessType=rw\n" for sub in subs)
+        eds.write_text(eds_text(drive.drive) + more)
+    settings = config(drive={"eds": str(eds)})
+    with DrivePeer(settings) as drive:
+        give_rpdo(drive, 512, 0x7F, [POSITION_OFFSET])
+        _, finding = surveyed(settings)
+    assert "RPDO512 (COB-ID 07F) writes 60B0" in finding.cause
+
+
+def test_asking_for_rpdos_ends_where_there_are_none(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    drive, settings = peer
+    with Master(settings, "X") as master:
+        read_other_rpdos(master)
+    assert len(drive.heard) < 60
 
 
 def test_multiplexed_rpdo_is_a_writer(peer: tuple[DrivePeer, MachineConfig]) -> None:
@@ -195,8 +216,12 @@ def test_frame_that_carries_the_offset_of_a_drive_makes_its_record_void(
 ) -> None:
     """With the NC on nothing is asked."""
     record = replace(RECORD, options={"1403": 0x501})
-    finding = compare_heard_writers(corrected(tmp_path), record, heard(held, frames))
+    settings, traffic = corrected(tmp_path), heard(held, frames)
+    finding = compare_heard_writers(settings, "X", record, traffic)
     assert (finding.ok, found in finding.cause) == (not found, True)
+    save_record(record, settings.store.directory)
+    checked = {each.point: each for each in compare_heard(traffic, settings, "X")}
+    assert checked[POINT] == finding
 
 
 def test_record_is_void_where_a_frame_beside_the_nc_carries_the_offset(

@@ -28,7 +28,7 @@ DEADLINE_S = 2.0
 MAX_BYTES = 64 * 1024
 NO_OBJECT = 0x06020000
 NO_SUB_INDEX = 0x06090011
-_UPLOAD_BEGINS, _SIZE_GIVEN = 2, 1
+_UPLOAD_BEGINS, _EXPEDITED, _SIZE_GIVEN = 2, 2, 1
 _DEADLINE_ABORT = 0x05040000
 _MEMORY_ABORT = 0x05040005
 
@@ -67,7 +67,7 @@ class SdoLink:
         """Hand over a response frame of this node; one that is not 8 bytes long is no SDO."""
         if len(data) == 8:
             if data[0] >> 5 == _UPLOAD_BEGINS:
-                self._sized = bool(data[0] & _SIZE_GIVEN)
+                self._sized = bool(data[0] & _SIZE_GIVEN) or not data[0] & _EXPEDITED
             self._client.on_response(self.response_id, data, 0.0)
 
     def read(self, index: int, sub: int = 0) -> bytes:
