@@ -142,10 +142,11 @@ def _sections(raw: bytes, name: str) -> list[_Section]:
         raise EdsError(name, "line 1: it is XML (an XDD, or an ESI of EtherCAT); ask the drive's maker for its EDS")
     if not any(_OBJECT.match(title) for title in sections):
         raise EdsError(name, "line 1: it has no object at all; this is no EDS file")
-    for title, values in written_out({title: section.values for title, section in sections.items()}):
+    compact = written_out({title: section.values for title, section in sections.items()}, MAX_SECTIONS)
+    if len(sections) + len(compact) > MAX_SECTIONS:
+        raise EdsError(name, f"it has more than {MAX_SECTIONS} objects in compact form; this is no drive's EDS")
+    for title, values in compact.items():
         sections[title] = _Section(title, _line_of(title, sections), {**values})
-        if len(sections) > MAX_SECTIONS:
-            raise EdsError(name, f"it has more than {MAX_SECTIONS} objects in compact form; this is no drive's EDS")
     return _complete(sections, name)
 
 

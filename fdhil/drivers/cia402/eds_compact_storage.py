@@ -25,22 +25,25 @@ def is_list(title: str) -> bool:
     return _LIST.fullmatch(title) is not None
 
 
-def written_out(sections: Mapping[str, Keys]) -> Iterator[tuple[str, Keys]]:
-    """Yield the sections that the file leaves out, by the compact form, with their keys; and values of those it has."""
-    made: dict[str, dict[str, str]] = {}
-    for title, keys in _compact_pdos(sections):
-        made[title] = dict(keys)
+def written_out(sections: Mapping[str, Keys], most: int) -> Mapping[str, Keys]:
+    """Return the sections that the file leaves out, by the compact form, with their keys; and values of those it has.
+
+    Where there are more than ``most`` it ends with some more.
+    """
+    made: dict[str, Keys] = dict(_compact_pdos(sections))
     for title, keys in {**sections, **made}.items():
+        if len(made) > most:
+            return made
         if len(title) == 4 and (count := read_number(keys.get("CompactSubObj", ""))):
             for sub, part in _sub_objects(sections, title, keys, count):
                 made.setdefault(f"{title}sub{sub:X}", part)
     for title, keys in sections.items():
         if (found := _LIST.fullmatch(title)) and found[2].lower() == "value":
-            for sub, value in keys.items():
-                place = f"{found[1].upper()}sub{int(sub):X}" if sub.isdecimal() else ""
+            for name, value in keys.items():
+                place = f"{found[1].upper()}sub{int(name):X}" if name.isdecimal() else ""
                 if place in made or place in sections:
                     made[place] = {**sections.get(place, {}), **made.get(place, {}), "ParameterValue": value}
-    yield from made.items()
+    return made
 
 
 def _sub_objects(
