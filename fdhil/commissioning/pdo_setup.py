@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from fdhil.cia402 import NmtCommand, Object, State, state_of
 from fdhil.commissioning.finding import read_optional
 from fdhil.commissioning.master import Master
-from fdhil.commissioning.survey import INVALID_COB_ID, PdoFound, compare_pdo, listen, read_pdos
+from fdhil.commissioning.survey import INVALID_COB_ID, PdoFound, compare_pdo, listen, read_mapping, read_pdos
 from fdhil.drivers.cia402.profile import PdoSpec
 from fdhil.errors import DeviceError, DriveFault, ProtocolError, SdoAbort
 
@@ -64,7 +64,7 @@ def _write_spec(master: Master, spec: PdoSpec, found: PdoFound) -> None:
     cob_id = spec.cob_base + master.node_id | found.cob_id & NO_REMOTE_REQUEST
     wanted = cob_id if spec.valid else cob_id | INVALID_COB_ID
     try:
-        _write(master, spec, found, wanted, spec.every_sync, _words(spec))
+        _write(master, found, wanted, spec.every_sync, tuple(entry.mapping for entry in spec.entries))
     except SdoAbort as abort:
         why = {
             UNMAPPABLE: "it maps one of its objects into no such PDO",
@@ -75,21 +75,17 @@ def _write_spec(master: Master, spec: PdoSpec, found: PdoFound) -> None:
         raise DriveFault(master.device, f"it refuses {spec.name} with {listed}: {why}; {advice}") from None
 
 
-def _write(master: Master, spec: PdoSpec, found: PdoFound, cob_id: int, kind: int, words: tuple[int, ...]) -> None:
-    """Write one PDO; a mapping that was the profile's from the start is not touched: it may be fixed."""
+def _write(master: Master, found: PdoFound, cob_id: int, kind: int, words: tuple[int, ...]) -> None:
+    """Write one PDO; a mapping that is right already is not touched: it may be fixed."""
     write = master.sdo.write_int
     write(found.parameter, 1, found.cob_id | INVALID_COB_ID, 4)
-    if found.mapped != _words(spec):
+    if read_mapping(master, found.mapping) != words:
         write(found.mapping, 0, 0, 1)
         for sub, word in enumerate(words, 1):
             write(found.mapping, sub, word, 4)
         write(found.mapping, 0, len(words), 1)
     write(found.parameter, 2, kind, 1)
     write(found.parameter, 1, cob_id, 4)
-
-
-def _words(spec: PdoSpec) -> tuple[int, ...]:
-    return tuple(entry.mapping for entry in spec.entries)
 
 
 def _require_same(master: Master) -> None:
@@ -105,7 +101,7 @@ def _give_back(master: Master, begun: list[tuple[PdoSpec, PdoFound]], error: Bas
     """Write the old PDOs again, the last first; ProtocolError when that fails too."""
     for spec, found in reversed(begun):
         try:
-            _write(master, spec, found, found.cob_id, found.kind, found.mapped)
+            _write(master, found, found.cob_id, found.kind, found.mapped)
         except DeviceError as left:
             cause = str(error).removeprefix(f"{master.device}: ") or "it was interrupted"
             text = f"{cause}; {spec.name} could not be given back ({left}); power the drive off and on again"

@@ -209,9 +209,14 @@ def _read_pdo(master: Master, parameter: int, mapping: int) -> PdoFound:
     cob_id = read_optional(master, parameter, 1)
     if cob_id is None:
         return PdoFound(parameter, mapping, INVALID_COB_ID, 0, ())
-    count = read_optional(master, mapping, 0) or 0
-    mapped = tuple(read_optional(master, mapping, sub) or 0 for sub in range(1, count + 1))
+    mapped = read_mapping(master, mapping)
     return PdoFound(parameter, mapping, cob_id, read_optional(master, parameter, 2) or 0, mapped)
+
+
+def read_mapping(master: Master, mapping: int) -> tuple[int, ...]:
+    """Read the words of a mapping parameter; one that the drive does not have maps nothing."""
+    count = read_optional(master, mapping, 0) or 0
+    return tuple(read_optional(master, mapping, sub) or 0 for sub in range(1, count + 1))
 
 
 def compare_sizes(master: Master, pdos: Sequence[tuple[PdoSpec, PdoFound]]) -> Finding:

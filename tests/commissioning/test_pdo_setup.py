@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,24 @@ def test_what_differs_is_written(what: str, peer: tuple[DrivePeer, MachineConfig
         points = {finding.point: finding.ok for finding in survey(master).findings}
     assert points[name] is True
     assert not {0x080, 0x201, 0x301} & set(drive.heard)  # no SYNC, no set-point: nothing can move
+
+
+def test_type_of_a_fixed_mapping_is_set(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    """A drive that refuses every write to its mappings, as its EDS says: its transmission types can be written."""
+    drive, settings = peer
+    entries = drive.drive.dictionary.entries
+    fixed = {key: replace(entry, access="ro") for key, entry in entries.items() if 0x1600 <= key >> 8 < 0x1800}
+    fixed |= {key: replace(entry, access="ro") for key, entry in entries.items() if 0x1A00 <= key >> 8 < 0x1C00}
+    entries |= fixed
+    drive.drive.set_object(0x1800, 2, 255)
+    with Master(settings, "X") as master:
+        assert set_up_pdos(master).written == ("TPDO1",)
+        assert set_up_pdos(master) == SetUp((), None)
+        drive.drive.set_object(0x1A00, 1, 0x60620020)
+        drive.drive.set_object(0x1800, 2, 255)
+        with pytest.raises(DriveFault, match="it refuses TPDO1 with 6064:00, 606C:00"):
+            set_up_pdos(master)
+    assert drive.drive.dictionary.number(0x1800, 2) == 255
 
 
 @pytest.mark.parametrize("outfit", OUTFITS, ids=lambda outfit: outfit.name)

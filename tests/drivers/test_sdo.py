@@ -64,6 +64,19 @@ def test_an_answer_to_what_another_program_asked_is_not_taken(monkeypatch: pytes
         link.read_int(0x1018, 2)
 
 
+@pytest.mark.parametrize(
+    ("command", "size"), [(0x4B, 2), (0x43, 4), (0x4F, 1), (0x42, None)], ids=["two", "four", "one", "not told"]
+)
+def test_size_of_an_object_is_what_the_drive_says(command: int, size: int | None) -> None:
+    """CiA 301, 7.2.4.3.5: an expedited answer need not say how many of its four bytes are data."""
+
+    def send(_can_id: int, data: bytes) -> None:
+        link.deliver(bytes([command]) + data[1:4] + bytes(4))
+
+    link = SdoLink("drive X", 1, send)
+    assert link.read_size(0x6041) == size
+
+
 class SegmentedNode:
     """A node that answers an upload in segments without end, or each with a wrong toggle bit."""
 
