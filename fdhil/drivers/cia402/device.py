@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from fdhil.cia402 import LOGICAL_AXES, LOGICAL_AXIS_STEP, Object
-from fdhil.drivers.cia402.eds_numbers import octal_reading, read_number
+from fdhil.drivers.cia402.eds_numbers import octal_reading, read_expression
 from fdhil.drivers.cia402.profile import ObjectKey
 
 MOST_PDOS = 512
 COB_ID_BITS, EXTENDED = 0x7FF, 1 << 29
 DRIVE = 402
-_ANY_NODE = 1  # resolves $NODEID of a file that is of no node; taken off again
+NODE_ID = "$NODEID"
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,8 +126,6 @@ def read_device(path: Path) -> Device:
 
     dictionary = load_eds(path)
     own = dictionary.node_id  # of a DCF: its absolute COB-IDs are of this node (CiA 306)
-    if own is None:
-        dictionary = load_eds(path, _ANY_NODE)
     told = dictionary.device_information
     objects = {found.key: found for found in _objects(dictionary)}
     identity = [objects.get((int(Object.IDENTITY), sub)) for sub in (1, 2)]
@@ -154,8 +152,8 @@ def _objects(dictionary: Any) -> Iterable[DeviceObject]:
             written = getattr(variable, "value_raw", None) or getattr(variable, "default_raw", None) or ""
             value = variable.default if variable.value is None else variable.value
             octal = octal_reading(written) if bits else None
-            if octal is not None:
-                value = read_number(written)
+            if octal is not None or (value is None and NODE_ID in written):  # of no node: as of node 0
+                value = (read_expression(written) or (None, False))[0]
             shown = f"{index:04X}:{sub:02X} is written {written}"
             yield DeviceObject(
                 key=(index, sub),
@@ -165,7 +163,7 @@ def _objects(dictionary: Any) -> Iterable[DeviceObject]:
                 access=str(variable.access_type).lower(),
                 mappable=bool(variable.pdo_mappable),
                 default=value if isinstance(value, int) else None,
-                relative="$NODEID" in written,
+                relative=NODE_ID in written,
                 doubt="" if octal is None else f"{shown}: taken as {value}, it is {octal} if octal is meant",
             )
 
@@ -204,5 +202,5 @@ def _cob_base(cob: DeviceObject, own: int | None) -> int | None:
     if not number or (cob.default or 0) & EXTENDED:
         return None
     if cob.relative or own is not None:
-        return number - (own or _ANY_NODE)
+        return number - (own or 0)
     return None if number & 0x7F else number  # without a node-ID: it was left out of the file
