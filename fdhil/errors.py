@@ -82,6 +82,10 @@ class ProtocolError(DeviceError):
     """A device answered something that its protocol does not allow."""
 
 
+class ForeignMaster(ProtocolError):
+    """Another master was heard on a bus on which fdhil was about to send, or sent; it sends no more there."""
+
+
 class SdoToggle(ProtocolError):
     """A drive's segments of an SDO transfer do not alternate: one was lost, or two masters ask."""
 

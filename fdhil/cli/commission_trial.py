@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
@@ -11,7 +10,7 @@ import click
 
 from fdhil.cli.commission_guide import Asked, Guide, confirm, room_of
 from fdhil.cli.commission_steps import NOTHING, TRIAL, trial_moves
-from fdhil.cli.consent import agreed
+from fdhil.cli.consent import agreed, answered
 from fdhil.errors import DriveFault
 
 if TYPE_CHECKING:
@@ -62,13 +61,8 @@ def _asked_room(axis: str) -> Room | None:
         f"How far may axis {axis} go from here, for a jog and for rapids, in mm? Back and forward, as: -20 200; "
         "Enter: not at all"
     )
-    try:
-        said = click.prompt(question, default="", show_default=False, err=True)
-    except click.Abort:
-        if sys.stdin.isatty():
-            raise  # Ctrl-C
-        return None
-    words = str(said).split()
+    said = answered(question)
+    words = said.split()
     if not words:
         return None
     try:

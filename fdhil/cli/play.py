@@ -16,7 +16,7 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cli.audited import audited
-from fdhil.cli.consent import agreed
+from fdhil.cli.consent import agreed, listen_again
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import FILE
 from fdhil.errors import DeviceError, DriveFault
@@ -116,6 +116,7 @@ def _entered() -> bool:
         return False
     if not sys.stdin.readline():
         raise DriveFault("the bench", NOBODY)
+    listen_again()
     return True
 
 
@@ -233,7 +234,7 @@ def _tell(played: Played, plan: Plan, as_json: bool) -> None:
     _document(as_json, {"rows": played.of, "played": played.rows, "stopped": played.stopped, "sync": sync})
     if as_json:
         return
-    how = "played to its end" if played.stopped is None else f"{played.stopped}: braked, the drives are off"
+    how = ": ".join(filter(None, (played.stopped, played.left))) if played.stopped else "played to its end"
     click.echo(f"{played.rows} of {played.of} set-points, {how}")
     click.echo(
         f"SYNC left late by {sync['late_p50_us']:.0f} us (half of them), {sync['late_p99_us']:.0f} us (99 %), "

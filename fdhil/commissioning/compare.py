@@ -18,7 +18,7 @@ from fdhil.commissioning.survey import Survey, survey
 from fdhil.commissioning.void import confirm_record, void_mark, void_record
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.bus import CanBus
-from fdhil.errors import DeviceError, StoreError
+from fdhil.errors import DeviceError, ForeignMaster, StoreError
 
 POINT = "commissioning record"
 LISTEN_S, NODES_S = 1.0, 0.3
@@ -57,10 +57,12 @@ def _difference(record: CommissioningRecord, found: Survey) -> str:
 
 
 def compare_drive(config: MachineConfig, record: CommissioningRecord) -> Finding:
-    """Read the drive by SDO and compare it; one that does not answer differs."""
+    """Read the drive by SDO and compare it; one that does not answer differs. ForeignMaster beside an NC."""
     try:
         with Master(config, record.axis) as master:
             return compare_record(record, survey(master))
+    except ForeignMaster:
+        raise
     except DeviceError as error:
         cause, _, advice = str(error).partition("; ")
         return Finding(POINT, record.fingerprint, "no answer", False, cause, advice or "check its supply")
@@ -81,12 +83,15 @@ def compare_again(config: MachineConfig, bus: str, say: Callable[[str], None]) -
     require_own_identifiers(config, bus, traffic.ids)
     for record in records:
         mark = void_mark(config.store.directory, record.axis)
-        if traffic.master is not None:
-            compared = compare_heard_writers(config, record.axis, record, traffic)
-        else:
-            compared = compare_drive(config, record)
-            if compared.ok:
-                confirm_record(config.store.directory, record.axis, mark)
+        try:
+            if traffic.master is not None:
+                compared = compare_heard_writers(config, record.axis, record, traffic)
+            else:
+                compared = compare_drive(config, record)
+                if compared.ok:
+                    confirm_record(config.store.directory, record.axis, mark)
+        except ForeignMaster:  # it came meanwhile
+            return
         if not compared.ok:
             void_record(config.store.directory, record.axis, compared.cause)
             text = f"RecordVoid: axis {record.axis}: {compared.cause}; nothing can be armed or adopted there"

@@ -25,7 +25,7 @@ from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
 from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.drivers.moves import load_event_source
 from fdhil.drivers.sensor_source import Sensor, sensors_of
-from fdhil.errors import DeviceError, StoreError
+from fdhil.errors import DeviceError, ForeignMaster, StoreError
 from fdhil.identification.loops import better_loops, differences
 from fdhil.store.history import History
 
@@ -40,7 +40,10 @@ Place = tuple[str, Finding]
 
 
 def check_machine(config: MachineConfig, say: Callable[[str], None] = lambda _text: None) -> list[Place]:
-    """Compare everything; what cannot be reached is a finding. ConnectError only for a bus that cannot be opened."""
+    """Compare everything; what cannot be reached is a finding. ConnectError only for a bus that cannot be opened.
+
+    ForeignMaster when an NC comes while the drives are asked.
+    """
     found: list[Place] = []
     for bus in dict.fromkeys(axis.drive.bus for axis in config.axis.values()):
         say(f"listening on bus {bus}")
@@ -104,6 +107,8 @@ def compare_asked(config: MachineConfig, axis: str, heard: Sequence[int] = ()) -
                 *_voltage_object(config, axis, master.profile, master),
                 *_record(config, axis, found),
             ]
+        except ForeignMaster:
+            raise
         except DeviceError as error:
             return [_unreachable("drive", node, error)]
 

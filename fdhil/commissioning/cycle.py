@@ -8,15 +8,18 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from typing import Protocol, Self
 
 from fdhil import cia402
+from fdhil.commissioning.bus_watch import BusWatch
+from fdhil.commissioning.landing import Landed, land, outcome
 from fdhil.commissioning.realtime import CYCLE, prioritise
 from fdhil.commissioning.set_points import SetPoints
 from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import MachineConfig
-from fdhil.errors import DeviceError
+from fdhil.errors import DeviceError, ForeignMaster
 
 LOCKSTEP_WAIT_S = 8.0
 GUARD_WAIT_S = 2.0
@@ -24,11 +27,10 @@ MOST_CYCLE_US = 20_000
 STALL_CYCLES = 20
 
 
-class Member(Protocol):
+class Member(Landed, Protocol):
     """A drive that takes part in the cycle."""
 
     bus: TransmitBus
-    axis: str
     target: int | None
 
     @property
@@ -75,16 +77,21 @@ class Cycle:
     """The thread that runs some buses; a context manager. Nothing is sent before ``produce_sync`` or by the members.
 
     ``path`` gives the members' set-points while it is there, in their order; ``failure`` is what ended the thread.
-    ``guarded`` are the COB-IDs per bus that a guard beside it sends, and no member does; ``offsets_heard`` are those
-    that came since the last SYNC.
+    ``beside_guard``: a guard sends the offsets of all drives, and no member does; ``offsets_heard`` are those that came
+    since the last SYNC. Where another master is heard the thread brings the drives to rest, and sends no more.
     ``realtime``: it asks for a real-time priority; ``scheduling`` says what it was given.
     """
 
-    def __init__(self, config: MachineConfig, buses: Iterable[str], *, realtime: bool = False) -> None:
+    def __init__(
+        self, config: MachineConfig, buses: Iterable[str], *, realtime: bool = False, beside_guard: bool = False
+    ) -> None:
         self.config = config
         self.period_s = config.machine.sync_period_s
-        self.buses = {name: TransmitBus(name, config.bus[name]) for name in buses}
-        self.guarded: dict[str, set[int]] = {name: set() for name in self.buses}
+        self.beside_guard = beside_guard
+        self.buses = {
+            name: TransmitBus(name, config.bus[name], BusWatch.of(name, config, beside_guard=beside_guard))
+            for name in buses
+        }
         self.offsets_heard: set[int] = set()
         self.members: list[Member] = []
         self.path: SetPoints | None = None
@@ -100,7 +107,9 @@ class Cycle:
         self._sync_overflow: int | None = None
         self._sent_s = 0.0
         self._offsets_before: set[int] = set()
+        self._landing: Iterator[None] | None = None
         self._heartbeat_due = 0.0
+        self._landed = threading.Event()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fdhil-cycle", daemon=True)
 
@@ -117,18 +126,17 @@ class Cycle:
                 due = self._turn(due)
         except DeviceError as error:
             self.failure = error
+        finally:
+            self._landed.set()
 
     def _turn(self, due: float) -> float:
         """Send what is due at ``due``, take what came, and return the next deadline after having waited for it."""
         if self.lockstep:
             self._receive()
-        self._send_heartbeat()
-        if self._sync_overflow is not None and self._awaits_others():
-            self.lateness.skipped += 1
-        elif self._sync_overflow is not None:
-            self._send_sync()
-            self.lateness.add(time.monotonic() - due)
-            self._send_set_points()
+        if self.taken is None:
+            self._send_in_time(due)
+        elif self.failure is None:
+            self._land(self.taken)
         if not self.lockstep:
             self._receive()
         due += self.period_s
@@ -138,6 +146,31 @@ class Cycle:
             due = now
         time.sleep(max(0.0, due - now))
         return due
+
+    def _send_in_time(self, due: float) -> None:
+        self._send_heartbeat()
+        if self._sync_overflow is not None and self._awaits_others():
+            self.lateness.skipped += 1
+        elif self._sync_overflow is not None:
+            self._send_sync()
+            self.lateness.add(time.monotonic() - due)
+            self._send_set_points()
+
+    def _land(self, taken: TransmitBus) -> None:
+        """Send what brings the drives to rest by one SYNC more; afterwards the thread only listens."""
+        led = [member for member in self.members if member.led and self.producing]
+        if self.path is not None:
+            self.path.stop(f"another master sends {taken.watch.sign} on bus {taken.name}")
+        if self._landing is None:
+            self._landing = land(led, lambda: self.path is not None and not self.path.resting)
+        if led:
+            self._send_sync()
+        if next(self._landing, self) is self:
+            written = {each for bus in self.buses.values() for each in bus.watch.written}
+            self.failure = taken.watch.refusal(outcome(led, written))
+            self._landed.set()
+        else:
+            self._send_set_points()
 
     def _missed(self, periods: int) -> None:
         """This computer slept; drives that stand at their last set-point by now are not jerked on."""
@@ -164,7 +197,8 @@ class Cycle:
         if self.heartbeat is not None and now >= self._heartbeat_due:
             self._heartbeat_due = now + self.heartbeat_s
             for bus in self.buses.values():
-                bus.send(cia402.COB_HEARTBEAT + self.heartbeat, bytes([cia402.Nmt.OPERATIONAL]))
+                with suppress(ForeignMaster):  # heard in this very moment: the next turn lands
+                    bus.send(cia402.COB_HEARTBEAT + self.heartbeat, bytes([cia402.Nmt.OPERATIONAL]))
 
     def _send_sync(self) -> None:
         data = b""
@@ -172,7 +206,8 @@ class Cycle:
             self._sync_counter = self._sync_counter % self._sync_overflow + 1
             data = bytes([self._sync_counter])
         for bus in self.buses.values():
-            bus.send(cia402.COB_SYNC, data)
+            if not bus.watch.sync_came():  # one of another master is as good, and two are one too many
+                bus.send(cia402.COB_SYNC, data)
         self.count += 1
         self._sent_s = time.monotonic()
         self._offsets_before, self.offsets_heard = self.offsets_heard, set()
@@ -220,20 +255,31 @@ class Cycle:
         self._sync_overflow = None
 
     @property
+    def taken(self) -> TransmitBus | None:
+        """A bus on which another master was heard, None where there is none."""
+        return next((bus for bus in self.buses.values() if bus.watch.sign is not None), None)
+
+    @property
     def lost(self) -> bool:
         """Whether a bus has ended, or takes nothing more."""
         return self.failure is not None or any(bus.ended is not None for bus in self.buses.values())
 
     def check(self) -> None:
-        """Raise what ended the thread or a bus."""
+        """Raise what ended the thread or a bus; beside another master that is done when the drives are at rest."""
+        self._await_landing()
         if self.failure is not None:
             raise self.failure
         for bus in self.buses.values():
             if bus.ended is not None:
                 raise DeviceError(f"bus {bus.name}", f"{bus.ended}; start again when the bus is back")
 
+    def _await_landing(self) -> None:
+        if self.taken is not None and self._thread.is_alive():
+            self._landed.wait()
+
     def close(self) -> None:
-        """Stop sending and release the buses."""
+        """Stop sending and release the buses; where another master was heard the drives are at rest before."""
+        self._await_landing()
         self._stopping.set()
         self._thread.join(timeout=2.0)
         for bus in self.buses.values():

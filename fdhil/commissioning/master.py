@@ -8,19 +8,20 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Self
 
 from fdhil import cia402
-from fdhil.commissioning.bus_listener import shows_master
+from fdhil.commissioning.bus_watch import offset_ids
 from fdhil.commissioning.cycle import Cycle
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.frames import ERROR_FLAG
 from fdhil.drivers.can.sdo import SdoLink
 from fdhil.drivers.cia402.profile import DriveProfile
 from fdhil.drivers.cia402.profile_file import load_profile
-from fdhil.errors import DeviceTimeout
+from fdhil.errors import DeviceTimeout, ForeignMaster
 
 
 @dataclass(slots=True)
@@ -28,7 +29,6 @@ class Heard:
     """The drive's newest: mapped objects by key, EMCY frames, its NMT state; and frames and error frames of the bus.
 
     ``boots`` counts its boot-ups. ``ids`` are the COB-IDs of all frames.
-    ``master`` is what shows that another master runs the bus, None while nothing does.
     """
 
     objects: dict[tuple[int, int], int] = field(default_factory=dict)
@@ -36,7 +36,6 @@ class Heard:
     emergencies: list[bytes] = field(default_factory=list)
     nmt: int | None = None
     boots: int = 0
-    master: str | None = None
     frames: int = 0
     errors: int = 0
     ids: set[int] = field(default_factory=set)
@@ -65,12 +64,10 @@ class Master:
     """A context manager around one drive; nothing is sent before ``produce_sync`` or an SDO call.
 
     Without a ``cycle`` that is shared with other drives it runs the drive's bus itself. The offset is sent, too, but
-    where a guard does that (``beside_guard``).
+    where a guard does that.
     """
 
-    def __init__(
-        self, config: MachineConfig, axis: str, cycle: Cycle | None = None, *, beside_guard: bool = False
-    ) -> None:
+    def __init__(self, config: MachineConfig, axis: str, cycle: Cycle | None = None) -> None:
         settings = config.axis[axis]
         self.config, self.axis = config, axis
         self.node_id = config.node_id(axis)
@@ -89,9 +86,9 @@ class Master:
         self.target: int | None = None
         self.offset = 0
         self.fed: tuple[int, int] | None = None
-        self._guarded = self.loop.guarded[settings.drive.bus]
-        if beside_guard:
-            self._guarded.update(self._offset_ids())
+        self._offset_ids = set(offset_ids(self.profile, self.node_id))
+        self._sends_offset = not self.loop.beside_guard
+        self._landing = False
         self._tpdos = {spec.cob_base + self.node_id: spec for spec in self.profile.tpdos}
         # SYNC is answered by the last of them: one before it would let two SYNCs go for one
         answers = {can_id: spec.every_sync for can_id, spec in self._tpdos.items() if spec.valid}
@@ -138,8 +135,10 @@ class Master:
             values |= zip((profile.speed_offset, profile.torque_offset), fed, strict=True)
         for spec in profile.rpdos:
             cob_id = spec.cob_base + self.node_id
-            if spec.valid and cob_id not in self._guarded and all((e.index, e.sub) in values for e in spec.entries):
-                self.bus.send(cob_id, cia402.pack(spec.entries, [values[e.index, e.sub] for e in spec.entries]))
+            due = spec.valid and (self._sends_offset or cob_id not in self._offset_ids)
+            if due and all((e.index, e.sub) in values for e in spec.entries):
+                with suppress(ForeignMaster):  # it leads this drive, or sends its offset
+                    self.bus.send(cob_id, cia402.pack(spec.entries, [values[e.index, e.sub] for e in spec.entries]))
 
     def _take_answer(self) -> None:
         """Take the last TPDO that comes with every SYNC: it may answer one that was sent long before the newest."""
@@ -151,13 +150,31 @@ class Master:
     def _catching_up(self) -> bool:
         return time.monotonic() < self._caught_up_s
 
-    def _offset_ids(self) -> Iterator[int]:
-        """COB-IDs of the RPDOs that carry no target, but what a guard sends."""
-        profile = self.profile
-        for spec in profile.rpdos:
-            keys = {(entry.index, entry.sub) for entry in spec.entries}
-            if keys & {profile.offset, profile.speed_offset, profile.torque_offset} and profile.target not in keys:
-                yield spec.cob_base + self.node_id
+    @property
+    def led(self) -> bool:
+        """Whether set-points are sent to the drive."""
+        return self.target is not None
+
+    @property
+    def led_by_other(self) -> bool:
+        """Whether another master sends its set-points."""
+        return self.axis in self.bus.watch.led_by_other
+
+    @property
+    def held_offset(self) -> int:
+        """The offset of a guard that the drive shows."""
+        return self.heard.objects.get(self.profile.offset, 0) if self.loop.beside_guard else 0
+
+    def land(self, cycles: int) -> None:
+        """Take the offset to zero in so many steps and send no other one any more."""
+        with self._lock:
+            self._landing, start = True, self.offset
+            self.fed = None if self.fed is None else (0, 0)
+            self._plan = deque(round(start * left / cycles) for left in reversed(range(cycles)))
+
+    def switch_off(self, word: int) -> None:
+        """Send this controlword from now on, and no offset."""
+        self._sends_offset, self.controlword = False, word
 
     def take(self, can_id: int, data: bytes) -> None:
         """Take a frame of the bus."""
@@ -180,10 +197,8 @@ class Master:
         elif can_id == cia402.COB_HEARTBEAT + node and data:
             heard.nmt = data[0] & 0x7F
             heard.boots += heard.nmt == cia402.Nmt.BOOT_UP
-        elif can_id in self._guarded:
+        elif can_id in self._offset_ids and self.loop.beside_guard:
             self.loop.offsets_heard.add(can_id)
-        elif (sign := shows_master(can_id)) is not None:
-            heard.master = heard.master or sign
 
     # what the steps use ---------------------------------------------------------------------------------------
 
@@ -221,13 +236,15 @@ class Master:
     def play_offset(self, values: Sequence[int]) -> int:
         """Send these offsets, one per cycle; returns the cycle after whose SYNC the first one goes out."""
         with self._lock:
-            self._plan.extend(values)
+            if not self._landing:
+                self._plan.extend(values)
             return self.cycle + 1
 
     def drop_offsets(self) -> int:
         """Send none of the planned offsets any more; return the one that was sent last."""
         with self._lock:
-            self._plan.clear()
+            if not self._landing:
+                self._plan.clear()
             return self.offset
 
     @property
@@ -257,6 +274,8 @@ class Master:
     def hold_here(self) -> None:
         """Take the actual position as target, with offset 0."""
         with self._lock:
+            if self._landing:
+                return
             self._plan.clear()
             self.offset = 0
             self.target = self.heard.objects[self.profile.position]

@@ -30,14 +30,16 @@ def move(
 ) -> None:
     """Play rows of increments (one column per master) to enabled drives of one cycle, and return when they rest there.
 
-    DriveFault where a row would leave its bounds or an axis does not follow: the axes were braked then. Whatever else
-    interrupts it, Ctrl-C too, the axes are braked before it is raised. ``each_turn`` is called while it waits.
+    DriveFault where a row would leave its bounds or an axis does not follow, ForeignMaster where another master is
+    heard: the axes were braked then. Whatever else interrupts it, Ctrl-C too, the axes are braked before it is raised.
+    ``each_turn`` is called while it waits.
     """
     loop = masters[0].loop
     with following(masters, bounds) as path:
         path.play(rows.tolist())
         seconds = PATIENCE * (len(rows) + LAG_CYCLES) * loop.period_s + 5.0
         masters[0].wait(lambda: _settled(masters, path, each_turn), seconds, "the set-points were not sent; check load")
+    loop.check()
     if path.stopped is not None:
         raise DriveFault("the motion", f"was stopped: {path.stopped}; find the cause before anything moves again")
 
@@ -49,7 +51,7 @@ def _settled(masters: Sequence[Master], path: SetPoints, each_turn: Callable[[],
 
 
 def watch_power(masters: Sequence[Master], path: SetPoints) -> None:
-    """Stop all axes when one of them is not in Operation enabled any more, is silent, or another master is heard."""
+    """Stop all axes when one of them is not in Operation enabled any more, or is silent."""
     for master in masters:
         if master.behind > SILENT_CYCLES:
             path.stop(f"axis {master.axis}: nothing was heard of its drive for {SILENT_CYCLES} SYNC")
@@ -57,8 +59,6 @@ def watch_power(masters: Sequence[Master], path: SetPoints) -> None:
             told = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[-1:]]
             why = f" (EMCY {told[0]:04X})" if told and told[0] else ""
             path.stop(f"axis {master.axis}: its drive fell from Operation enabled to {master.state().value}{why}")
-        if master.heard.master is not None:
-            path.stop(f"another master sends {master.heard.master} on the bus of axis {master.axis}")
 
 
 @contextlib.contextmanager

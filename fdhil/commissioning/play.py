@@ -10,25 +10,25 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdhil import cia402
 from fdhil.cia402 import NmtCommand, Object
 from fdhil.commissioning.compare import compare_record
 from fdhil.commissioning.cycle import Cycle, Lateness
 from fdhil.commissioning.finding import read_optional
+from fdhil.commissioning.landing import OFF_WORDS
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.moving import following, undisturbed, watch_power
 from fdhil.commissioning.record import CommissioningRecord, load_record, of_config
 from fdhil.commissioning.set_points import Bounds, SetPoints, straight
 from fdhil.commissioning.steps import enable, prepare
-from fdhil.commissioning.survey import listen, require, require_alone, survey
+from fdhil.commissioning.survey import listen, require, survey
 from fdhil.commissioning.void import is_void
 from fdhil.commissioning.watchdog import watched
 from fdhil.config import MachineConfig
-from fdhil.errors import ConfigError, ConfigFault, DeviceError, DriveFault
+from fdhil.errors import ConfigError, ConfigFault, DeviceError, DriveFault, ForeignMaster
 from fdhil.records import Float, Trajectory
 
 NEAR_MM = 0.05  # a start no farther away is gone to without being asked
@@ -40,18 +40,21 @@ OFF_CYCLES = 20
 BLOCK_ROWS = 256
 Signals = Callable[[SetPoints], contextlib.AbstractContextManager[None]]
 """Has Ctrl-C and its like stop a path, instead of raising."""
-OFF_WORDS = (cia402.CONTROL_SWITCH_ON, cia402.CONTROL_SHUTDOWN, cia402.CONTROL_DISABLE_VOLTAGE)
 
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """What was played: rows of all, why it ended early (None: it did not), how late SYNC was, how it was scheduled."""
+    """What was played: rows of all, why it ended early (None: it did not), how late SYNC was, how it was scheduled.
+
+    ``left`` says how the drives were left, empty where ``stopped`` does.
+    """
 
     rows: int
     of: int
     stopped: str | None
     lateness: Lateness
     scheduling: str
+    left: str = "braked, the drives are off"
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +154,6 @@ class Bench:
             if held:
                 text = f"it holds an offset (0x60B0) of {held} increments; run fdhil adopt before anything moves"
                 raise DriveFault(master.device, text)
-            require_alone(master)
         self._require_room(records)
         self._require_one_counter()
 
@@ -213,8 +215,6 @@ class Bench:
             undo.callback(self._leave_bus, written)
             for master in self.masters:
                 undo.enter_context(self._given_back(watched(master, node_id, beat_s)))
-            for master in self.masters:
-                require_alone(master)
             undo.callback(self._switch_off)
             self._say("starting SYNC and switching the drives on, held where they stand")
             for master in self.masters:
@@ -230,7 +230,7 @@ class Bench:
         try:
             yield
         except DeviceError as error:
-            if not self.loop.lost:
+            if isinstance(error, ForeignMaster) or not self.loop.lost:
                 raise
             what = "nothing more can be sent: a drive that is on stops by itself when it misses our heartbeat (0x1016)"
             raise DeviceError(error.device, f"{str(error).removeprefix(f'{error.device}: ')}; {what}") from None
@@ -238,7 +238,7 @@ class Bench:
     def _leave_bus(self, written: Callable[[], None]) -> None:
         with undisturbed():
             self.loop.heartbeat = None
-            if self.loop.turning and all(master.heard.master is None for master in self.masters):
+            if self.loop.turning and self.loop.taken is None:
                 written()
             self.loop.stop_sync()
 
@@ -305,10 +305,16 @@ class Bench:
             if path.stopped is None:
                 self.masters[0].wait_cycles(round(SETTLE_S / loop.period_s))
                 watch_power(self.masters, path)
-        return Played(path.played, len(rows), path.stopped, loop.lateness, loop.scheduling)
+        played = Played(path.played, len(rows), path.stopped, loop.lateness, loop.scheduling)
+        try:
+            loop.check()
+        except ForeignMaster as error:
+            return replace(played, stopped=str(error), left="")
+        return played
 
     def _watch(self, path: SetPoints) -> None:
-        self.loop.check()
+        with contextlib.suppress(ForeignMaster):  # the path was stopped
+            self.loop.check()
         watch_power(self.masters, path)
         time.sleep(self.loop.period_s)
 
@@ -323,7 +329,8 @@ def _in_blocks(rows: Float) -> Iterator[list[float]]:
 def on_bench(plan: Plan, say: Callable[[str], None]) -> Iterator[Bench]:
     """Open the buses of the machine; nothing is sent yet, and at the end everything is closed."""
     config = plan.config
-    loop = Cycle(config, dict.fromkeys(axis.drive.bus for axis in config.axis.values()), realtime=True)
-    masters = [Master(config, name, loop, beside_guard=True) for name in config.axis]
+    buses = dict.fromkeys(axis.drive.bus for axis in config.axis.values())
+    loop = Cycle(config, buses, realtime=True, beside_guard=True)
+    masters = [Master(config, name, loop) for name in config.axis]
     with loop:
         yield Bench(plan, loop, masters, say)

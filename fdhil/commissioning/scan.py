@@ -21,7 +21,7 @@ from fdhil.drivers.can.frames import Frames
 from fdhil.drivers.can.node_watch import emcy_text
 from fdhil.drivers.can.sdo import SdoLink
 from fdhil.drivers.cia402.eds import load_eds
-from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, EdsError, ProtocolError
+from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, EdsError, ForeignMaster, ProtocolError
 
 ANSWER_S = 0.3
 PACE_S = 0.001
@@ -51,9 +51,10 @@ class BusScanner(BusListener):
         ConnectError when the bus takes no frame, which means that no node acknowledges one.
         """
         for node_id in range(1, 128):
-            self.require_alone()
             try:
                 self._sending.send(COB_SDO_REQUEST + node_id, _READ_DEVICE_TYPE)
+            except ForeignMaster:
+                raise
             except DeviceError as error:
                 text = f"nothing acknowledges our frames ({error}); check the drives' supply, wiring and bit rate"
                 raise ConnectError(f"bus {self.name}", text) from None
@@ -61,18 +62,13 @@ class BusScanner(BusListener):
         self.listen(ANSWER_S)
         return {can_id & 0x7F for can_id in self.traffic.ids if can_id & 0x780 == COB_SDO_RESPONSE}
 
-    def require_alone(self) -> None:
-        """ProtocolError when a master came on the bus: it alone may use SDO then."""
-        if self.traffic.master is not None:
-            text = f"an NC came on the bus ({self.traffic.master}) while drives were asked; start again"
-            raise ProtocolError(f"bus {self.name}", text)
-
     def read(self, node_id: int, index: int, sub: int = 0) -> bytes | None:
-        """Read an object, None when the node does not have it or gives no answer that can be used."""
-        self.require_alone()
+        """Read an object, None when the node does not have it or gives no answer that can be used; ForeignMaster."""
         link = self._links.setdefault(node_id, SdoLink(f"node {node_id}", node_id, self._sending.send))
         try:
             return link.read(index, sub)
+        except ForeignMaster:
+            raise
         except (ProtocolError, DeviceTimeout):
             return None
 

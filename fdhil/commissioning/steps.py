@@ -19,6 +19,7 @@ from fdhil.cia402 import Mode, NmtCommand, Object, State
 from fdhil.commissioning.compare import found_fingerprint
 from fdhil.commissioning.feedforward import feedforward_open, prove_feedforward
 from fdhil.commissioning.finding import read_optional
+from fdhil.commissioning.landing import OFF_WORDS
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.moving import held_back
 from fdhil.commissioning.progress import Found, Progress
@@ -29,14 +30,13 @@ from fdhil.commissioning.survey import (
     faulted,
     listen,
     require,
-    require_alone,
     require_enabled,
     survey,
 )
 from fdhil.commissioning.watchdog import watchdog_test
 from fdhil.config import CorrectionLimits, MachineConfig
 from fdhil.drivers.cia402.profile_file import NO_OFFSET_ADVICE, load_profile, no_offset
-from fdhil.errors import DeviceError, DriveFault, ProtocolError
+from fdhil.errors import DeviceError, DriveFault, ForeignMaster, ProtocolError
 
 SIGN_TEST_UM = 10.0
 ENABLE_TIMEOUT_S = 5.0
@@ -104,7 +104,7 @@ def disable(master: Master) -> None:
     """Take the power stage off, step by step, and leave the node pre-operational without SYNC."""
     if not master.producing:
         return
-    for word in (cia402.CONTROL_SWITCH_ON, cia402.CONTROL_SHUTDOWN, cia402.CONTROL_DISABLE_VOLTAGE):
+    for word in OFF_WORDS:
         master.controlword = word
         master.wait_cycles(20)
     if master.state() is State.FAULT:
@@ -342,7 +342,6 @@ def _proven(
     if len(proven) == len(PROOFS):
         return proven
     report("enable")
-    require_alone(master)
     with rolled_back(master):
         prepare(master)
         prove_feedforward(master)
@@ -360,7 +359,8 @@ def _proven(
 def rolled_back(master: Master) -> Iterator[None]:
     """Run steps; whatever happens, the offset goes to 0 and the drive is disabled afterwards.
 
-    What cannot be undone is told beside what went wrong.
+    What cannot be undone is told beside what went wrong. Where another master was heard the cycle has brought the drive
+    to rest, and ForeignMaster is raised.
     """
     try:
         yield
@@ -381,8 +381,12 @@ def _roll_back(master: Master, first: str = "") -> bool:
         for step in (zero_offset, disable):
             try:
                 step(master)
+            except ForeignMaster:
+                break
             except DeviceError as error:
                 faults.append(str(error))
+    if master.loop.taken is not None:
+        master.check()
     if faults:
         text = f"{first}the drive could not be left as it was ({'; '.join(faults)}); power it off and on again"
         raise ProtocolError(master.device, text)

@@ -22,7 +22,7 @@ from fdhil.commissioning.offset_writers import compare_writers, read_other_rpdos
 from fdhil.commissioning.record import SOFTWARE_LIMIT_KEYS
 from fdhil.config import CorrectionLimits
 from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
-from fdhil.errors import ConnectError, DeviceTimeout, DriveFault, ProtocolError, SdoAbort
+from fdhil.errors import ConnectError, DeviceTimeout, DriveFault, ForeignMaster, ProtocolError, SdoAbort
 
 LISTEN_S = 2.0
 INVALID_COB_ID = 1 << 31
@@ -69,15 +69,14 @@ class Survey:
 
 
 def listen(master: Master) -> None:
-    """Listen without sending, and beside an NC leave it at that: we are not the master then.
+    """Listen without sending; ForeignMaster beside an NC: we are not the master then.
 
     On a silent bus the drive is asked what it is: with the NC off, one that sends no heartbeat (0x1017 = 0) is silent.
     """
     end = time.monotonic() + LISTEN_S
-    while time.monotonic() < end and master.heard.master is None:
+    while time.monotonic() < end:
         master.check()
         time.sleep(0.01)
-    require_alone(master)
     require(master, [compare_own_identifiers(master)])
     if master.heard.frames == 0:
         _ask_alone(master)
@@ -95,18 +94,11 @@ def _ask_alone(master: Master) -> None:
         raise ConnectError(bus, UNREADABLE)
     try:
         read_optional(master, Object.DEVICE_TYPE)
+    except ForeignMaster:
+        raise
     except (DeviceTimeout, ProtocolError):
         text = f"nothing was heard on the bus and node-ID {master.node_id} did not answer"
         raise ConnectError(bus, f"{text}; check the drive's supply, wiring, bit rate and node_id") from None
-
-
-def require_alone(master: Master) -> None:
-    """ProtocolError when another master was heard; to be asked before our own SYNC starts."""
-    sign = master.heard.master
-    if sign is not None:
-        what = "SYNC or set-points" if sign in ("SYNC", "set-points") else sign
-        text = f"an NC is sending {what}; switch it off while an axis is commissioned"
-        raise ProtocolError(f"bus {master.bus.name}", text)
 
 
 def survey(master: Master) -> Survey:

@@ -8,18 +8,23 @@ from __future__ import annotations
 
 import errno
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 import can
 
 from fdhil import config
+from fdhil.commissioning.bus_watch import BusWatch, WatchedRing
 from fdhil.drivers.can.bus import CanBus
+from fdhil.drivers.can.frames import FrameRing
 from fdhil.drivers.can.port import Filter, Port
 from fdhil.drivers.can.python_can import VirtualPort
 from fdhil.drivers.can.socketcan import CAN_FRAME, SocketCanPort
 from fdhil.drivers.can.socketcand import CONNECT_TIMEOUT_S, SocketcandPort
 from fdhil.errors import ConnectError, DeviceError
+
+LOOK_S = 0.25  # a bus is listened to for so long before the first frame leaves: SYNC of any NC comes meanwhile
 
 
 class SendingPort(Port, Protocol):
@@ -76,9 +81,20 @@ SENDERS: Mapping[str, Callable[[str, config.CanBus], SendingPort]] = {
 
 
 class TransmitBus(CanBus):
-    """A bus that is listened to and sent on; answers are waited for, so it is read frame by frame."""
+    """A bus that is listened to and sent on; answers are waited for, so it is read frame by frame.
+
+    ``watch`` sees all that comes and goes; without one the identifiers of the machine's own drives are not known.
+    """
 
     batch_s = 0.0
+
+    def __init__(self, name: str, settings: config.CanBus, watch: BusWatch | None = None) -> None:
+        self.watch = watch or BusWatch(name)
+        super().__init__(name, settings)
+        self._free_from_s = time.monotonic() + LOOK_S
+
+    def _make_ring(self, frames: int) -> FrameRing:
+        return WatchedRing(frames, self.watch)
 
     def _open(self, settings: config.CanBus, filters: Sequence[Filter]) -> Port:
         if not settings.may_send:
@@ -89,6 +105,8 @@ class TransmitBus(CanBus):
         return self._sender
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send one frame; DeviceError when the bus does not take it."""
+        """Send one frame; DeviceError when the bus does not take it, ForeignMaster when another master runs it."""
+        time.sleep(max(0.0, self._free_from_s - time.monotonic()))
         with self._send_lock:
+            self.watch.admit(can_id, data)
             self._sender.send(can_id, data)

@@ -20,7 +20,7 @@ from fdhil.commissioning.record import CommissioningRecord
 from fdhil.commissioning.steps import enable, holds_for, prepare, rolled_back
 from fdhil.commissioning.strokes import Room, Stroke, plan_jog, plan_rapid
 from fdhil.commissioning.stroking import Travel, stroke, travel_of
-from fdhil.commissioning.survey import listen, require, require_alone, survey
+from fdhil.commissioning.survey import listen, require, survey
 from fdhil.commissioning.timing import judge_answers, judge_sync, measure
 from fdhil.commissioning.watchdog import watched
 from fdhil.config import MachineConfig
@@ -81,7 +81,6 @@ def try_axis(
         trial.found = {step: kept for step in STEPS[1:] if (kept := progress.kept(step, now)) is not None}
         if len(trial.found) == len(STEPS) - 1:
             return trial
-        require_alone(master)
         with rolled_back(master):
             operator.report("timing")
             prepare(master)

@@ -25,6 +25,8 @@ from tests.eds import write_eds
 
 WAITS: tuple[tuple[str, str, float], ...] = (
     ("commissioning.survey", "LISTEN_S", 0.15),
+    ("commissioning.transmit", "LOOK_S", 0.05),
+    ("cli.consent", "LOOK_S", 0.05),
     ("commissioning.steps", "SETTLE_CYCLES", 120),
     ("commissioning.steps", "AVERAGE_CYCLES", 60),
     ("commissioning.watchdog", "STARVE_TIMEOUT_S", 1.0),

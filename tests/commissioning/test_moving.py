@@ -5,7 +5,6 @@ from __future__ import annotations
 import uuid
 from collections.abc import Iterator
 
-import can
 import pytest
 
 from fdhil.cia402 import State
@@ -85,19 +84,6 @@ def test_a_drive_that_trips_ends_the_motion(enabled: Enabled) -> None:
 
     with pytest.raises(DriveFault, match="its drive fell from Operation enabled"):
         move([enabled.master], [enabled.bounds], enabled.way(40.0), trip)
-
-
-def test_another_master_ends_the_motion(enabled: Enabled) -> None:
-    channel = enabled.master.config.bus["can0"].channel
-
-    def disturb() -> None:
-        path = enabled.master.loop.path
-        if path is not None and path.cycles > 30 and path.stopped is None:
-            with can.Bus(interface="virtual", channel=channel) as nc:
-                nc.send(can.Message(arbitration_id=0x203, data=bytes(6), is_extended_id=False))
-
-    with pytest.raises(DriveFault, match="another master sends set-points"):
-        move([enabled.master], [enabled.bounds], enabled.way(40.0), disturb)
 
 
 def test_nothing_is_moved_that_is_not_held() -> None:

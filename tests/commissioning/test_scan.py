@@ -24,7 +24,7 @@ from fdhil.commissioning.survey import Identity, compare_identity
 from fdhil.config import Drive, MachineConfig
 from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, frames_of
 from fdhil.drivers.cia402.profile_file import load_profile
-from fdhil.errors import ConnectError, DriveFault, ProtocolError
+from fdhil.errors import ConnectError, DriveFault, ForeignMaster
 from fdhil.sim.drive.dictionary import AbortCode, TransferAbort
 from tests.dressed.test_set_up import until_it_answers
 from tests.drivers.peer import DrivePeer
@@ -182,9 +182,9 @@ def test_nothing_is_asked_once_a_master_is_heard(peer: tuple[DrivePeer, MachineC
         nc.send(can.Message(arbitration_id=0x80, is_extended_id=False))
         while bus.traffic.master is None:
             bus.listen(0.1)
-        with pytest.raises(ProtocolError, match=r"an NC came on the bus \(SYNC\)"):
+        with pytest.raises(ForeignMaster, match=r"an NC is sending SYNC .* nothing more was sent"):
             bus.answering()
-        with pytest.raises(ProtocolError, match="start again"):
+        with pytest.raises(ForeignMaster, match="start again"):
             bus.read(1, 0x1000)
     while not drive.heard:
         time.sleep(0.01)

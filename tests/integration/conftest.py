@@ -118,6 +118,7 @@ def transport(request: pytest.FixtureRequest) -> str:
 def settling_soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorter waits of the commissioning than on a real machine; the simulated drive settles sooner."""
     monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 0.3)
+    monkeypatch.setattr("fdhil.commissioning.transmit.LOOK_S", 0.05)
     monkeypatch.setattr("fdhil.commissioning.steps.SETTLE_CYCLES", 150)
     monkeypatch.setattr("fdhil.commissioning.steps.AVERAGE_CYCLES", 80)
     monkeypatch.setattr("fdhil.commissioning.steps.MOST_RAMPS", 1000)  # a slow host sees few of them begin

@@ -43,7 +43,7 @@ class CanBus:
         self._filters = filters
         self._port = self._open(settings, filters)
         self._ring_frames = ring_frames
-        self._ring = FrameRing(ring_frames)
+        self._ring = self._make_ring(ring_frames)
         self._stopping = threading.Event()
         self.last_frame_ns = time.monotonic_ns()
         self._thread = threading.Thread(target=self._receive, name=f"fdhil-{name}", daemon=True)
@@ -52,6 +52,9 @@ class CanBus:
     def _open(self, settings: config.CanBus, filters: Sequence[Filter]) -> Port:
         """Open the port that ``[bus.NAME]`` asks for; ConnectError with cause and next action."""
         return open_port(self.name, settings, filters)
+
+    def _make_ring(self, frames: int) -> FrameRing:
+        return FrameRing(frames)
 
     @property
     def stamps(self) -> Stamps:

@@ -1,0 +1,139 @@
+"""Notices another master on a bus that fdhil sends on, and decides what may still leave beside it.
+
+Every frame that comes passes :meth:`BusWatch.take` before anybody else reads it, and every frame that leaves passes
+:meth:`BusWatch.admit`: no step of a commissioning, of what is played or of a check has to look for another master.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from fdhil import cia402
+from fdhil.commissioning.bus_listener import shows_master
+from fdhil.config import MachineConfig
+from fdhil.drivers.can.frames import FrameRing
+from fdhil.drivers.cia402.profile import DriveProfile
+from fdhil.drivers.cia402.profile_file import load_profile
+from fdhil.errors import ConfigError, EdsError, ForeignMaster
+
+_DOWNLOAD = 1  # command specifier of an SDO request that writes (CiA 301, 7.2.4.3.3)
+
+
+class BusWatch:
+    """``sign`` is what another master was first heard to send, None while none was heard; it is never taken back.
+
+    ``led_by_other`` are the axes whose set-points another master sends, ``written`` are the objects that fdhil wrote,
+    by node-ID and index. One thread takes frames, any may send.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.sign: str | None = None
+        self.led_by_other: set[str] = set()
+        self.written: set[tuple[int, int]] = set()
+        self._first_id = self._syncs = self._syncs_before = 0
+        self._others: set[int] = set()
+        self._sent: set[int] = set()
+        self._harmless: set[int] = set()
+        self._own: set[int] = set()
+        self._axis_of: dict[int, str] = {}
+        self._offsets: set[int] = set()
+
+    @classmethod
+    def of(cls, name: str, config: MachineConfig, *, beside_guard: bool = False) -> BusWatch:
+        """Return the watch of a bus whose drives the configuration names; a guard beside may send their offsets."""
+        watch = cls(name)
+        for axis, settings in config.axis.items():
+            if settings.drive.bus != name:
+                continue
+            try:
+                profile = load_profile(settings.drive)
+            except (ConfigError, EdsError):  # it cannot be led; its node is watched by the standard's identifiers
+                continue
+            watch._add_drive(axis, profile, config.node_id(axis), beside_guard=beside_guard)
+            if settings.table is not None and settings.table.cob_id is not None:
+                watch._own.add(settings.table.cob_id)
+        return watch
+
+    def _add_drive(self, axis: str, profile: DriveProfile, node_id: int, *, beside_guard: bool) -> None:
+        self._own |= {spec.cob_base + node_id for spec in profile.tpdos}
+        offsets = set(offset_ids(profile, node_id))
+        if beside_guard:
+            self._own |= offsets
+        self._offsets |= offsets
+        self._axis_of |= dict.fromkeys({spec.cob_base + node_id for spec in profile.rpdos} - offsets, axis)
+
+    def take(self, can_id: int) -> None:
+        """Take a frame that came, with the flags of its identifier."""
+        if can_id in self._harmless and can_id not in self._sent:
+            return
+        sign = self._sign_of(can_id)
+        if sign is None:
+            if can_id <= 0x7FF:
+                self._harmless.add(can_id)
+            return
+        self._syncs += can_id == cia402.COB_SYNC
+        self._others.add(can_id)
+        if can_id in self._axis_of:
+            self.led_by_other.add(self._axis_of[can_id])
+        if self.sign is None:
+            self._first_id, self.sign = can_id, sign
+
+    def _sign_of(self, can_id: int) -> str | None:
+        if can_id in self._own:
+            return None
+        if can_id in self._offsets:
+            return "offsets"
+        if can_id in self._axis_of:
+            return "set-points"
+        return shows_master(can_id) or ("what fdhil sends" if can_id in self._sent else None)
+
+    def sync_came(self) -> bool:
+        """Whether another master sent SYNC since this was asked last."""
+        before, self._syncs_before = self._syncs_before, self._syncs
+        return self._syncs_before > before
+
+    def admit(self, can_id: int, data: bytes) -> None:
+        """Let a frame leave; ForeignMaster for one that may not leave beside another master."""
+        if not self.may_send(can_id):
+            raise self.refusal("nothing more was sent")
+        self._sent.add(can_id)
+        if can_id & ~0x7F == cia402.COB_SDO_REQUEST and data[0] >> 5 == _DOWNLOAD:
+            self.written.add((can_id & 0x7F, int.from_bytes(data[1:3], "little")))
+
+    def may_send(self, can_id: int) -> bool:
+        """Whether a frame may leave: beside another master only what brings a drive to rest that it does not lead."""
+        if self.sign is None or can_id == cia402.COB_SYNC:
+            return True
+        axis = self._axis_of.get(can_id)
+        return axis not in self.led_by_other if axis else can_id in self._offsets - self._others
+
+    def refusal(self, outcome: str) -> ForeignMaster:
+        """Return what to raise; ``outcome`` says how the drives were left."""
+        sends = "SYNC or set-points" if self.sign in ("SYNC", "set-points") else self.sign
+        text = f"an NC is sending {sends}; switch it off while fdhil acts on the bus, then start again"
+        return ForeignMaster(
+            f"bus {self.name}", f"{text}: {outcome} (first heard: COB-ID {self._first_id & 0x7FF:03X})"
+        )
+
+
+def offset_ids(profile: DriveProfile, node_id: int) -> Iterator[int]:
+    """Yield the COB-IDs of the RPDOs that carry no target, but what a guard sends."""
+    offsets = {profile.offset, profile.speed_offset, profile.torque_offset}
+    for spec in profile.rpdos:
+        keys = {(entry.index, entry.sub) for entry in spec.entries}
+        if keys & offsets and profile.target not in keys:
+            yield spec.cob_base + node_id
+
+
+class WatchedRing(FrameRing):
+    """A ring whose frames a watch takes before they can be read."""
+
+    def __init__(self, capacity: int, watch: BusWatch) -> None:
+        super().__init__(capacity)
+        self._watch = watch
+
+    def append(self, t_ns: int, can_id: int, data: bytes) -> None:
+        """Store one frame (writer's side only)."""
+        self._watch.take(can_id)
+        super().append(t_ns, can_id, data)

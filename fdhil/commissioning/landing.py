@@ -1,0 +1,74 @@
+"""Brings the drives to rest when another master is heard beside the cycle: the only thing that still leaves then."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Protocol
+
+from fdhil import cia402
+
+OFFSET_CYCLES = 3  # in so many steps an offset goes to zero, whatever its limits: the other master does not know of it
+WORD_CYCLES = 2
+GUARD_LANDING_CYCLES = 500  # so long a guard's offset is waited for; the drive holds it when SYNC ends
+OFF_WORDS = (cia402.CONTROL_SWITCH_ON, cia402.CONTROL_SHUTDOWN, cia402.CONTROL_DISABLE_VOLTAGE)
+"""Takes the power off, step by step."""
+
+
+class Landed(Protocol):
+    """A drive that is brought to rest."""
+
+    axis: str
+
+    @property
+    def led(self) -> bool:
+        """Whether set-points are sent to it."""
+
+    @property
+    def led_by_other(self) -> bool:
+        """Whether another master sends its set-points."""
+
+    @property
+    def playing(self) -> bool:
+        """Whether planned offsets still wait to be sent."""
+
+    @property
+    def held_offset(self) -> int:
+        """The offset that it shows."""
+
+    def land(self, cycles: int) -> None:
+        """Take the offset to zero in so many steps and send no other one any more."""
+
+    def switch_off(self, word: int) -> None:
+        """Send this controlword from now on, and no offset."""
+
+
+def land(drives: Sequence[Landed], braking: Callable[[], bool]) -> Iterator[None]:
+    """Yield before each SYNC that is still needed: the axes brake, offsets go to zero, the drives are switched off.
+
+    A drive whose set-points another master sends is left to it, its offset at zero.
+    """
+    for drive in drives:
+        drive.land(OFFSET_CYCLES)
+    while braking() or any(drive.playing for drive in drives):
+        yield
+    own = [drive for drive in drives if not drive.led_by_other]
+    for _ in range(GUARD_LANDING_CYCLES):
+        if not any(drive.held_offset for drive in own):
+            break
+        yield
+    for word in OFF_WORDS if own else ():
+        for _ in range(WORD_CYCLES):
+            for drive in drives:
+                drive.switch_off(word)
+            yield
+
+
+def outcome(drives: Sequence[Landed], written: set[tuple[int, int]]) -> str:
+    """Return how the drives were left, as a part of a sentence; the mode is never given back, and is no news."""
+    left = ", ".join(drive.axis for drive in drives if drive.led_by_other)
+    off = ", ".join(drive.axis for drive in drives if not drive.led_by_other)
+    told = [f"axis {off} was stopped, its offset taken to zero and its drive switched off"] if off else []
+    told += [f"axis {left} was left to it, its offset taken to zero"] if left else []
+    if objects := ", ".join(sorted({f"0x{index:04X}" for _, index in written if index != cia402.Object.MODE})):
+        told.append(f"{objects} may be as fdhil wrote them: power the drives off and on again")
+    return ", and ".join(told) or "nothing more was sent"

@@ -1,0 +1,251 @@
+"""Another master in the middle of what fdhil does on a bus: noticed within a few SYNC, and the drives are at rest."""
+
+from __future__ import annotations
+
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+
+from fdhil.commissioning import config_check, pdo_setup, steps
+from fdhil.commissioning.compare import compare_again
+from fdhil.commissioning.master import Master
+from fdhil.commissioning.moving import move
+from fdhil.commissioning.set_points import Bounds, straight
+from fdhil.commissioning.trial import guarded
+from fdhil.commissioning.watchdog import watchdog_test
+from fdhil.config import MachineConfig
+from fdhil.errors import ForeignMaster
+from tests.drivers.peer import DrivePeer
+from tests.drivers.wire import machine
+from tests.integration.conftest import sign_off
+
+pytestmark = pytest.mark.usefixtures("quick_commissioning")
+
+Frame = tuple[int, bytes]
+SYNC, NMT, TARGET, OFFSET, SDO, HEARTBEAT = 0x080, 0x000, 0x201, 0x301, 0x601, 0x764
+A_FEW = 20  # SYNC: it is noticed, the offset goes to zero, the drive is switched off: 11, and what a busy host adds
+FOREIGN: dict[str, Frame] = {
+    "SYNC": (SYNC, b""),
+    "NMT": (NMT, b"\x01\x00"),
+    "target": (TARGET, b"\x0f\x00" + (100).to_bytes(4, "little")),
+    "offset": (OFFSET, (7).to_bytes(4, "little")),
+    "set-points of another drive": (0x205, bytes(6)),
+    "SDO request": (SDO, b"\x40\x41\x60\0\0\0\0\0"),
+}
+LEFT_TO_IT = {"target": TARGET, "offset": OFFSET}
+"""What fdhil does not send any more, since another master does."""
+
+
+@dataclass
+class ForeignNc:
+    """Hears a bus, and is switched on by a frame; ``sent`` are the frames of fdhil from then on."""
+
+    channel: str
+    frame: Frame
+    when: Callable[[Frame], bool]
+    often: bool = True
+    sent: list[Frame] = field(default_factory=list)
+    on: bool = False
+
+    def __post_init__(self) -> None:
+        self._bus = can.Bus(interface="virtual", channel=self.channel)
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def _run(self) -> None:
+        due = 0.0
+        while not self._stopping.is_set():
+            message = self._bus.recv(0.001)
+            if message is not None and message.arbitration_id in (SYNC, NMT, TARGET, OFFSET, SDO, HEARTBEAT, 0x765):
+                heard = (message.arbitration_id, bytes(message.data))
+                self.sent += [heard] if self.on else []
+                self.on = self.on or self.when(heard)
+            if self.on and time.monotonic() >= due:
+                due = time.monotonic() + 0.002 if self.often else float("inf")
+                self._bus.send(can.Message(arbitration_id=self.frame[0], data=self.frame[1], is_extended_id=False))
+
+    def __enter__(self) -> ForeignNc:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._stopping.set()
+        self._thread.join()
+        self._bus.shutdown()
+
+    def count(self, can_id: int) -> int:
+        return [sent for sent, _ in self.sent].count(can_id)
+
+
+def offset_of(frame: Frame) -> int:
+    return int.from_bytes(frame[1][:4], "little", signed=True) if frame[0] == OFFSET else 0
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A simulated drive on a bus of this process, and its configuration."""
+
+    peer: DrivePeer
+    config: MachineConfig
+
+    def nc(self, what: str, when: Callable[[Frame], bool], *, often: bool = True) -> ForeignNc:
+        return ForeignNc(self.config.bus["can0"].channel, FOREIGN[what], when, often)
+
+    def require_left_alone(self, nc: ForeignNc, what: str, braking: int = 0) -> None:
+        """What fdhil sent beside the other master: a few SYNC, and the drive at rest or left to it."""
+        assert nc.on
+        assert nc.count(OFFSET) <= A_FEW + braking
+        assert nc.count(SYNC) <= A_FEW + braking
+        assert nc.count(TARGET) <= A_FEW + braking
+        assert nc.count(NMT) == 0
+        assert nc.count(SDO) <= 1  # it was under way
+        assert nc.count(HEARTBEAT) <= 2
+        for left in {LEFT_TO_IT.get(what)} - {None}:
+            assert nc.count(left) <= 5  # what left before it was heard
+        if what != "offset":
+            assert [offset_of(frame) for frame in nc.sent if frame[0] == OFFSET][-1:] in ([], [0])
+            assert self.holds(lambda: self.peer.drive.dictionary.number(0x60B0) == 0)
+        if what != "target":
+            off = ("SWITCH_ON_DISABLED", "FAULT", "FAULT_REACTION_ACTIVE")
+            assert self.holds(lambda: self.peer.drive.power.state.name in off)
+
+    def holds(self, condition: Callable[[], bool]) -> bool:
+        """Whether it becomes true: the simulated drive takes its frames a little later."""
+        deadline = time.monotonic() + 60
+        while not condition() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        return condition()
+
+
+@pytest.fixture
+def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Rig]:
+    sections: dict[str, Any] = {"guard": {"clock": "sync", "heartbeat_s": 0.1}, "play": {"heartbeat_s": 0.5}}
+    sections |= getattr(request, "param", {})
+    bus: dict[str, object] = {"interface": "virtual", "channel": uuid.uuid4().hex}
+    config = machine(tmp_path, bus=bus, **sections)
+    with DrivePeer(config) as peer:
+        yield Rig(peer, config)
+
+
+def sign_test(master: Master) -> None:
+    steps.sign_test(master)
+
+
+def feedforward_test(master: Master) -> None:
+    steps.feedforward_test(master)
+
+
+def proved_watchdog(master: Master) -> None:
+    watchdog_test(master, steps.enable)
+
+
+def rapid(master: Master) -> None:
+    bounds = Bounds.of("X", master.config.axis["X"], master.period_s, (-50.0, 50.0), 100.0)
+    assert master.target is not None
+    with guarded(master):
+        goal = master.target + 65536
+        move([master], [bounds], straight((master.target,), (goal,), (bounds.speed,), (bounds.acceleration,), 20))
+
+
+def held_while_asked(master: Master) -> None:
+    """The operator looks at the axis, and thinks about it."""
+    time.sleep(0.3)
+    steps.ramp(master, 33, 1)
+
+
+def is_offset(frame: Frame) -> bool:
+    return offset_of(frame) > 5
+
+
+def is_heartbeat(frame: Frame) -> bool:
+    return frame[0] == HEARTBEAT
+
+
+def moves(frame: Frame) -> bool:
+    return frame[0] == TARGET and int.from_bytes(frame[1][2:6], "little", signed=True) > 3000
+
+
+def is_held(frame: Frame) -> bool:
+    return frame[0] == TARGET and frame[1][:2] == b"\x0f\x00"
+
+
+STEPS: dict[str, tuple[Callable[[Master], None], Callable[[Frame], bool], int]] = {
+    "sign test": (sign_test, is_offset, 0),
+    "feed-forward test": (feedforward_test, is_offset, 0),
+    "watchdog test": (proved_watchdog, is_heartbeat, 0),
+    "question": (held_while_asked, is_held, 0),
+    "rapid": (rapid, moves, 200),  # it brakes first
+}
+
+
+def led_through(config: MachineConfig, step: Callable[[Master], None]) -> None:
+    """A step as a commissioning runs it."""
+    with Master(config, "X") as master, steps.rolled_back(master):
+        steps.prepare(master)
+        steps.enable(master)
+        step(master)
+
+
+@pytest.mark.parametrize("what", FOREIGN)
+@pytest.mark.parametrize("step", STEPS)
+def test_another_master_ends_a_step_within_a_few_sync(step: str, what: str, rig: Rig) -> None:
+    done, when, braking = STEPS[step]
+    with rig.nc(what, when) as nc:
+        with pytest.raises(ForeignMaster, match=r"an NC is sending .*; switch it off") as told:
+            led_through(rig.config, done)
+        rig.require_left_alone(nc, what, braking)
+    left = "axis X was left to it" if what == "target" else "axis X was stopped, its offset taken to zero"
+    assert left in str(told.value)
+    assert ("0x1016 may be as fdhil wrote" in str(told.value)) is (step in ("watchdog test", "rapid"))
+
+
+@pytest.mark.parametrize("what", FOREIGN)
+def test_a_single_frame_of_another_master_is_enough(what: str, rig: Rig) -> None:
+    with rig.nc(what, is_offset, often=False) as nc:
+        with pytest.raises(ForeignMaster):
+            steps.commission(rig.config, "X")
+        rig.require_left_alone(nc, what)
+
+
+def set_pdos(config: MachineConfig) -> None:
+    with Master(config, "X") as master:
+        pdo_setup.set_up_pdos(master)
+
+
+@pytest.mark.parametrize("what", FOREIGN)
+@pytest.mark.parametrize("ask", [config_check.check_machine, set_pdos])
+def test_a_drive_is_asked_no_more_once_another_master_is_heard(
+    ask: Callable[[MachineConfig], object], what: str, rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(config_check, "LISTEN_S", 0.1)
+    with rig.nc(what, lambda frame: frame[0] == SDO) as nc:
+        with pytest.raises(ForeignMaster, match="nothing more was sent"):
+            ask(rig.config)
+        assert {can_id for can_id, _ in nc.sent} <= {SDO}
+        assert nc.count(SDO) <= 5  # those that were under way while it was switched on
+
+
+def test_a_record_holds_where_an_nc_comes_while_a_guard_starts(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fdhil.commissioning.compare.LISTEN_S", 0.1)
+    sign_off(rig.config)
+    said: list[str] = []
+    with rig.nc("SYNC", lambda frame: frame[0] == SDO) as nc:
+        compare_again(rig.config, "can0", said.append)
+        assert nc.count(SDO) <= 5
+    assert said == []
+
+
+def test_no_frame_leaves_before_the_bus_was_listened_to(rig: Rig) -> None:
+    """Where a connection is opened beside an NC nothing has been heard yet."""
+    with rig.nc("SYNC", lambda _frame: True) as nc:
+        nc.on = True
+        with Master(rig.config, "X") as master, pytest.raises(ForeignMaster):
+            master.sdo.read(0x1000)
+        assert nc.sent == []
