@@ -90,7 +90,7 @@ def _play(machine: MachineConfig, plan: Plan, program: Path, go_to_start: bool, 
         for name in dict.fromkeys(axis.drive.bus for axis in machine.axis.values()):
             held.enter_context(lock_place(machine.bus[name], "set-points"))
         held.enter_context(before_other_work())
-        bench = held.enter_context(on_bench(plan, _say))
+        bench = held.enter_context(on_bench(plan, _say, (machine.guard_directory / SOCKET_NAME).exists))
         bench.compare(records)
         here = bench.here()
         bench.require_start(here, go_to_start)

@@ -6,7 +6,7 @@ Every frame that comes passes :meth:`BusWatch.take` before anybody else reads it
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from fdhil import cia402
 from fdhil.commissioning.bus_listener import shows_master
@@ -22,17 +22,18 @@ _DOWNLOAD = 1  # command specifier of an SDO request that writes (CiA 301, 7.2.4
 class BusWatch:
     """``sign`` is what another master was first heard to send, None while none was heard; it is never taken back.
 
-    ``led_by_other`` are the axes whose set-points another master sends, ``written`` are the objects that fdhil wrote,
-    by node-ID and index. One thread takes frames, any may send.
+    ``sent_by_other`` are its COB-IDs, ``led_by_other`` the axes whose set-points it sends, ``written`` the objects that
+    fdhil wrote, by node-ID and index. One thread takes frames, any may send.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, guard_runs: Callable[[], bool] = lambda: False) -> None:
         self.name = name
+        self._guard_runs = guard_runs
         self.sign: str | None = None
         self.led_by_other: set[str] = set()
         self.written: set[tuple[int, int]] = set()
         self._first_id = self._syncs = self._syncs_before = 0
-        self._others: set[int] = set()
+        self.sent_by_other: set[int] = set()
         self._sent: set[int] = set()
         self._harmless: set[int] = set()
         self._own: set[int] = set()
@@ -40,9 +41,9 @@ class BusWatch:
         self._offsets: set[int] = set()
 
     @classmethod
-    def of(cls, name: str, config: MachineConfig, *, beside_guard: bool = False) -> BusWatch:
-        """Return the watch of a bus whose drives the configuration names; a guard beside may send their offsets."""
-        watch = cls(name)
+    def of(cls, name: str, config: MachineConfig, guard_runs: Callable[[], bool] = lambda: False) -> BusWatch:
+        """Return the watch of a bus whose drives the configuration names; a guard that runs may send their offsets."""
+        watch = cls(name, guard_runs)
         for axis, settings in config.axis.items():
             if settings.drive.bus != name:
                 continue
@@ -50,16 +51,14 @@ class BusWatch:
                 profile = load_profile(settings.drive)
             except (ConfigError, EdsError):  # it cannot be led; its node is watched by the standard's identifiers
                 continue
-            watch._add_drive(axis, profile, config.node_id(axis), beside_guard=beside_guard)
+            watch._add_drive(axis, profile, config.node_id(axis))
             if settings.table is not None and settings.table.cob_id is not None:
                 watch._own.add(settings.table.cob_id)
         return watch
 
-    def _add_drive(self, axis: str, profile: DriveProfile, node_id: int, *, beside_guard: bool) -> None:
+    def _add_drive(self, axis: str, profile: DriveProfile, node_id: int) -> None:
         self._own |= {spec.cob_base + node_id for spec in profile.tpdos}
         offsets = set(offset_ids(profile, node_id))
-        if beside_guard:
-            self._own |= offsets
         self._offsets |= offsets
         self._axis_of |= dict.fromkeys({spec.cob_base + node_id for spec in profile.rpdos} - offsets, axis)
 
@@ -69,11 +68,11 @@ class BusWatch:
             return
         sign = self._sign_of(can_id)
         if sign is None:
-            if can_id <= 0x7FF:
+            if can_id <= 0x7FF and can_id not in self._offsets:
                 self._harmless.add(can_id)
             return
         self._syncs += can_id == cia402.COB_SYNC
-        self._others.add(can_id)
+        self.sent_by_other.add(can_id)
         if can_id in self._axis_of:
             self.led_by_other.add(self._axis_of[can_id])
         if self.sign is None:
@@ -83,7 +82,7 @@ class BusWatch:
         if can_id in self._own:
             return None
         if can_id in self._offsets:
-            return "offsets"
+            return None if self._guard_runs() else "offsets"
         if can_id in self._axis_of:
             return "set-points"
         return shows_master(can_id) or ("what fdhil sends" if can_id in self._sent else None)
@@ -106,7 +105,7 @@ class BusWatch:
         if self.sign is None or can_id == cia402.COB_SYNC:
             return True
         axis = self._axis_of.get(can_id)
-        return axis not in self.led_by_other if axis else can_id in self._offsets - self._others
+        return axis not in self.led_by_other if axis else can_id in self._offsets - self.sent_by_other
 
     def refusal(self, outcome: str) -> ForeignMaster:
         """Return what to raise; ``outcome`` says how the drives were left."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from typing import Protocol, Self
 
@@ -77,21 +77,26 @@ class Cycle:
     """The thread that runs some buses; a context manager. Nothing is sent before ``produce_sync`` or by the members.
 
     ``path`` gives the members' set-points while it is there, in their order; ``failure`` is what ended the thread.
-    ``beside_guard``: a guard sends the offsets of all drives, and no member does; ``offsets_heard`` are those that came
-    since the last SYNC. Where another master is heard the thread brings the drives to rest, and sends no more.
+    ``guard_runs``: where it is given a guard alone sends offsets, and no member does; it tells whether one is there.
+    ``offsets_heard`` are those that came since the last SYNC. Where another master is heard the thread brings the
+    drives to rest, and sends no more.
     ``realtime``: it asks for a real-time priority; ``scheduling`` says what it was given.
     """
 
     def __init__(
-        self, config: MachineConfig, buses: Iterable[str], *, realtime: bool = False, beside_guard: bool = False
+        self,
+        config: MachineConfig,
+        buses: Iterable[str],
+        *,
+        realtime: bool = False,
+        guard_runs: Callable[[], bool] | None = None,
     ) -> None:
         self.config = config
         self.period_s = config.machine.sync_period_s
-        self.beside_guard = beside_guard
-        self.buses = {
-            name: TransmitBus(name, config.bus[name], BusWatch.of(name, config, beside_guard=beside_guard))
-            for name in buses
-        }
+        self.beside_guard = guard_runs is not None
+        self.guard_runs = guard_runs or (lambda: False)
+        watches = [BusWatch.of(name, config, self.guard_runs) for name in buses]
+        self.buses = {watch.name: TransmitBus(watch.name, config.bus[watch.name], watch) for watch in watches}
         self.offsets_heard: set[int] = set()
         self.members: list[Member] = []
         self.path: SetPoints | None = None

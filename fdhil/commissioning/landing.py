@@ -32,8 +32,12 @@ class Landed(Protocol):
         """Whether planned offsets still wait to be sent."""
 
     @property
+    def zeroes_offset(self) -> bool:
+        """Whether its offset is fdhil's to take to zero."""
+
+    @property
     def held_offset(self) -> int:
-        """The offset that it shows."""
+        """The offset of a guard that it shows."""
 
     def land(self, cycles: int) -> None:
         """Take the offset to zero in so many steps and send no other one any more."""
@@ -65,10 +69,14 @@ def land(drives: Sequence[Landed], braking: Callable[[], bool]) -> Iterator[None
 
 def outcome(drives: Sequence[Landed], written: set[tuple[int, int]]) -> str:
     """Return how the drives were left, as a part of a sentence; the mode is never given back, and is no news."""
-    left = ", ".join(drive.axis for drive in drives if drive.led_by_other)
-    off = ", ".join(drive.axis for drive in drives if not drive.led_by_other)
-    told = [f"axis {off} was stopped, its offset taken to zero and its drive switched off"] if off else []
-    told += [f"axis {left} was left to it, its offset taken to zero"] if left else []
+    told = [_left(drive) for drive in drives]
     if objects := ", ".join(sorted({f"0x{index:04X}" for _, index in written if index != cia402.Object.MODE})):
         told.append(f"{objects} may be as fdhil wrote them: power the drives off and on again")
     return ", and ".join(told) or "nothing more was sent"
+
+
+def _left(drive: Landed) -> str:
+    zero = ", its offset taken to zero" if drive.zeroes_offset else ""
+    if drive.led_by_other:
+        return f"axis {drive.axis} was left to it{zero}"
+    return f"axis {drive.axis} was stopped{zero} and its drive switched off"

@@ -161,9 +161,14 @@ class Master:
         return self.axis in self.bus.watch.led_by_other
 
     @property
+    def zeroes_offset(self) -> bool:
+        """Whether its offset is ours: neither a guard nor another master sends it."""
+        return not self.loop.beside_guard and not self._offset_ids & self.bus.watch.sent_by_other
+
+    @property
     def held_offset(self) -> int:
         """The offset of a guard that the drive shows."""
-        return self.heard.objects.get(self.profile.offset, 0) if self.loop.beside_guard else 0
+        return self.heard.objects.get(self.profile.offset, 0) if self.loop.guard_runs() else 0
 
     def land(self, cycles: int) -> None:
         """Take the offset to zero in so many steps and send no other one any more."""

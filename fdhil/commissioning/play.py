@@ -326,11 +326,14 @@ def _in_blocks(rows: Float) -> Iterator[list[float]]:
 
 
 @contextlib.contextmanager
-def on_bench(plan: Plan, say: Callable[[str], None]) -> Iterator[Bench]:
-    """Open the buses of the machine; nothing is sent yet, and at the end everything is closed."""
+def on_bench(plan: Plan, say: Callable[[str], None], guard_runs: Callable[[], bool]) -> Iterator[Bench]:
+    """Open the buses of the machine; nothing is sent yet, and at the end everything is closed.
+
+    Offsets are those of another master where no guard runs.
+    """
     config = plan.config
     buses = dict.fromkeys(axis.drive.bus for axis in config.axis.values())
-    loop = Cycle(config, buses, realtime=True, beside_guard=True)
+    loop = Cycle(config, buses, realtime=True, guard_runs=guard_runs)
     masters = [Master(config, name, loop) for name in config.axis]
     with loop:
         yield Bench(plan, loop, masters, say)

@@ -20,6 +20,7 @@ from fdhil.errors import DriveFault
 from fdhil.store import audit
 from fdhil.store.history import History
 from tests.bench import bench_toml
+from tests.commissioning.foreign_nc import A_FEW, FOREIGN, NMT, OFFSET, SDO, SYNC, ForeignNc, LateOperator, is_offset
 from tests.drivers.peer import DrivePeer
 from tests.eds import write_eds
 
@@ -49,9 +50,9 @@ class Bench:
     file: Path
     capsys: pytest.CaptureFixture[str]
 
-    def commission(self, *arguments: str, said: str = "") -> tuple[int, str, str]:
+    def commission(self, *arguments: str, said: str | io.StringIO = "") -> tuple[int, str, str]:
         """Run the command, whose operator says these lines; return exit code, stdout and stderr."""
-        sys.stdin = io.StringIO(said)
+        sys.stdin = said if isinstance(said, io.StringIO) else io.StringIO(said)
         sys.argv[1:] = ["commission", str(self.file), *arguments]
         code = run_safely(cli)
         heard = self.capsys.readouterr()
@@ -292,3 +293,45 @@ def test_a_wrong_set_up_is_refused(what: str, bench: Bench) -> None:
     assert bench.peer.drive.power.state.name == "SWITCH_ON_DISABLED"
     assert bench.peer.drive.dictionary.number(0x60B0) == 0
     assert load_record(bench.store, "X") is None
+
+
+@pytest.mark.parametrize("what", FOREIGN)
+def test_an_nc_that_is_switched_on_in_the_sign_test_leaves_no_record(what: str, bench: Bench) -> None:
+    config = machine_config.load(bench.file)
+    with ForeignNc(config.bus["can0"].channel, FOREIGN[what], is_offset) as nc:
+        code, out, err = bench.commission("--yes", "--json")
+        assert nc.on
+        assert max(nc.count(OFFSET), nc.count(SYNC)) <= A_FEW
+        assert nc.count(NMT) == 0
+    assert code == 3, err
+    error = json.loads(out)["error"]
+    assert error["class"] == "ForeignMaster"
+    assert "an NC is sending" in error["text"]
+    assert "switch it off while fdhil acts on the bus, then start again" in error["text"]
+    assert load_record(bench.store, "X") is None
+    assert not list(bench.store.glob("commissioning-X.json*"))
+    assert in_the_audit(bench)[-1] == ("commission", "X", "ForeignMaster")
+
+
+@pytest.mark.parametrize("what", ["SYNC", "SDO request"])
+@pytest.mark.parametrize(
+    ("question", "sync"),
+    [
+        (1, 0),  # before the drive is switched on
+        (2, 0),  # how far the axis may go
+        (3, A_FEW),  # before it jogs: our SYNC runs, the drive is off
+        (4, A_FEW),  # whether the table moved: the drive is on
+    ],
+)
+def test_nothing_begins_where_an_nc_came_while_a_question_stood(
+    question: int, sync: int, what: str, bench: Bench
+) -> None:
+    config = machine_config.load(bench.file)
+    with ForeignNc(config.bus["can0"].channel, FOREIGN[what], lambda _: False) as nc:
+        code, _, err = bench.commission(said=LateOperator(nc, "y\n-2 130\ny\ny\n", question))
+        assert nc.on
+        assert nc.count(SYNC) <= sync
+        assert nc.count(NMT) == nc.count(SDO) == 0
+        assert sync or nc.sent == []
+    assert code == 3, err
+    assert (load_record(bench.store, "X") is None) is (question == 1)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import can
 import pytest
 
 from fdhil.commissioning import config_check, pdo_setup, steps
@@ -22,70 +20,27 @@ from fdhil.commissioning.trial import guarded
 from fdhil.commissioning.watchdog import watchdog_test
 from fdhil.config import MachineConfig
 from fdhil.errors import ForeignMaster
+from tests.commissioning.foreign_nc import (
+    A_FEW,
+    FOREIGN,
+    HEARTBEAT,
+    LEFT_TO_IT,
+    NMT,
+    OFFSET,
+    SDO,
+    SYNC,
+    TARGET,
+    ForeignNc,
+    Frame,
+    is_offset,
+    moves,
+    offset_of,
+)
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
 from tests.integration.conftest import sign_off
 
 pytestmark = pytest.mark.usefixtures("quick_commissioning")
-
-Frame = tuple[int, bytes]
-SYNC, NMT, TARGET, OFFSET, SDO, HEARTBEAT = 0x080, 0x000, 0x201, 0x301, 0x601, 0x764
-A_FEW = 20  # SYNC: it is noticed, the offset goes to zero, the drive is switched off: 11, and what a busy host adds
-FOREIGN: dict[str, Frame] = {
-    "SYNC": (SYNC, b""),
-    "NMT": (NMT, b"\x01\x00"),
-    "target": (TARGET, b"\x0f\x00" + (100).to_bytes(4, "little")),
-    "offset": (OFFSET, (7).to_bytes(4, "little")),
-    "set-points of another drive": (0x205, bytes(6)),
-    "SDO request": (SDO, b"\x40\x41\x60\0\0\0\0\0"),
-}
-LEFT_TO_IT = {"target": TARGET, "offset": OFFSET}
-"""What fdhil does not send any more, since another master does."""
-
-
-@dataclass
-class ForeignNc:
-    """Hears a bus, and is switched on by a frame; ``sent`` are the frames of fdhil from then on."""
-
-    channel: str
-    frame: Frame
-    when: Callable[[Frame], bool]
-    often: bool = True
-    sent: list[Frame] = field(default_factory=list)
-    on: bool = False
-
-    def __post_init__(self) -> None:
-        self._bus = can.Bus(interface="virtual", channel=self.channel)
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-
-    def _run(self) -> None:
-        due = 0.0
-        while not self._stopping.is_set():
-            message = self._bus.recv(0.001)
-            if message is not None and message.arbitration_id in (SYNC, NMT, TARGET, OFFSET, SDO, HEARTBEAT, 0x765):
-                heard = (message.arbitration_id, bytes(message.data))
-                self.sent += [heard] if self.on else []
-                self.on = self.on or self.when(heard)
-            if self.on and time.monotonic() >= due:
-                due = time.monotonic() + 0.002 if self.often else float("inf")
-                self._bus.send(can.Message(arbitration_id=self.frame[0], data=self.frame[1], is_extended_id=False))
-
-    def __enter__(self) -> ForeignNc:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self._stopping.set()
-        self._thread.join()
-        self._bus.shutdown()
-
-    def count(self, can_id: int) -> int:
-        return [sent for sent, _ in self.sent].count(can_id)
-
-
-def offset_of(frame: Frame) -> int:
-    return int.from_bytes(frame[1][:4], "little", signed=True) if frame[0] == OFFSET else 0
 
 
 @dataclass(frozen=True)
@@ -107,8 +62,8 @@ class Rig:
         assert nc.count(NMT) == 0
         assert nc.count(SDO) <= 1  # it was under way
         assert nc.count(HEARTBEAT) <= 2
-        for left in {LEFT_TO_IT.get(what)} - {None}:
-            assert nc.count(left) <= 5  # what left before it was heard
+        if what in LEFT_TO_IT:
+            assert nc.count(LEFT_TO_IT[what]) <= 5  # what left before it was heard
         if what != "offset":
             assert [offset_of(frame) for frame in nc.sent if frame[0] == OFFSET][-1:] in ([], [0])
             assert self.holds(lambda: self.peer.drive.dictionary.number(0x60B0) == 0)
@@ -160,16 +115,8 @@ def held_while_asked(master: Master) -> None:
     steps.ramp(master, 33, 1)
 
 
-def is_offset(frame: Frame) -> bool:
-    return offset_of(frame) > 5
-
-
 def is_heartbeat(frame: Frame) -> bool:
     return frame[0] == HEARTBEAT
-
-
-def moves(frame: Frame) -> bool:
-    return frame[0] == TARGET and int.from_bytes(frame[1][2:6], "little", signed=True) > 3000
 
 
 def is_held(frame: Frame) -> bool:
@@ -201,8 +148,11 @@ def test_another_master_ends_a_step_within_a_few_sync(step: str, what: str, rig:
         with pytest.raises(ForeignMaster, match=r"an NC is sending .*; switch it off") as told:
             led_through(rig.config, done)
         rig.require_left_alone(nc, what, braking)
-    left = "axis X was left to it" if what == "target" else "axis X was stopped, its offset taken to zero"
-    assert left in str(told.value)
+    left = {
+        "target": "axis X was left to it, its offset taken to zero",
+        "offset": "X was stopped and its drive switched",
+    }
+    assert left.get(what, "X was stopped, its offset taken to zero and its drive switched off") in str(told.value)
     assert ("0x1016 may be as fdhil wrote" in str(told.value)) is (step in ("watchdog test", "rapid"))
 
 

@@ -22,6 +22,7 @@ from fdhil.commissioning.void import is_void, void_record
 from fdhil.config import MachineConfig, load
 from tests.arming.guard_peer import Guard
 from tests.bench import axis_toml, bench_toml
+from tests.commissioning.foreign_nc import A_FEW, FOREIGN, NMT, SDO, SYNC, TARGET, ForeignNc, LateOperator, moves
 from tests.daemon.shop import fdhil
 from tests.drivers.peer import DrivePeer
 from tests.integration.conftest import sign_off
@@ -210,3 +211,30 @@ def test_what_leaves_the_travel_is_refused_before_a_bus_is_opened(floor: Floor) 
     assert code == 2
     assert "axis.Y.setpoints: fdhil may send this axis no set-points" in err
     assert floor.sent() <= DRIVES
+
+
+@pytest.mark.parametrize("what", ["SYNC", "NMT", "target", "set-points of another drive"])
+def test_another_master_ends_what_is_played(what: str, floor: Floor) -> None:
+    with ForeignNc(floor.config.bus["can0"].channel, FOREIGN[what], moves) as nc:
+        code, document, _ = floor.play(STROKE, "--yes")
+        assert nc.on
+        assert nc.count(SYNC) <= A_FEW + 100  # it brakes first
+        assert nc.count(NMT) == 0
+        assert nc.count(SDO) <= 1
+        assert what != "target" or nc.count(TARGET) <= 5  # what left before it was heard
+    assert code == 1
+    left = "axis X was left to it, and axis Y was stopped and its drive switched off"
+    assert "bus can0: an NC is sending" in document["stopped"]
+    assert (left in document["stopped"]) is (what == "target")
+    assert "0x1016 may be as fdhil wrote" in document["stopped"]
+
+
+@pytest.mark.parametrize("what", FOREIGN)
+def test_nothing_leaves_where_an_nc_came_while_the_question_stood(
+    what: str, floor: Floor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ForeignNc(floor.config.bus["can0"].channel, FOREIGN[what], lambda _: False) as nc:
+        monkeypatch.setattr("sys.stdin", LateOperator(nc))
+        code, _, err = floor.play(STROKE)
+        assert (nc.on, nc.sent) == (True, [])
+    assert code == 3, err

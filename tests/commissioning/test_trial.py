@@ -14,7 +14,8 @@ from fdhil.commissioning.record import CommissioningRecord, load_record
 from fdhil.commissioning.strokes import Room
 from fdhil.commissioning.trial import Operator, Trial, try_axis
 from fdhil.config import MachineConfig
-from fdhil.errors import DeviceError, DriveFault
+from fdhil.errors import DeviceError, DriveFault, ForeignMaster
+from tests.commissioning.foreign_nc import A_FEW, FOREIGN, NMT, SDO, SYNC, TARGET, ForeignNc, Frame, moves
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
 from tests.integration.conftest import sign_off
@@ -116,3 +117,23 @@ def test_a_drive_that_was_set_up_anew_is_not_moved(bench: Bench) -> None:
     with pytest.raises(DeviceError, match="following-error window"):
         bench.tried()
     assert not {0x000, 0x080, 0x201} & set(bench.peer.heard)
+
+
+@pytest.mark.parametrize("what", ["SYNC", "NMT", "target", "offset"])
+@pytest.mark.parametrize(("step", "braking"), [("jog", 50), ("test rapids", 200)])
+def test_another_master_ends_the_trial(step: str, braking: int, what: str, bench: Bench) -> None:
+    """Braked within its acceleration, switched off or left to the other master; nothing is kept of the step."""
+
+    def begins(frame: Frame) -> bool:
+        return bench.steps[-1:] == [step] and moves(frame)
+
+    bench.saw = True
+    progress = Progress(bench.config.store.directory, "X")
+    with ForeignNc(bench.config.bus["can0"].channel, FOREIGN[what], begins) as nc:
+        with pytest.raises(ForeignMaster, match="an NC is sending"):
+            try_axis(bench.config, bench.record, ROOM, Operator(bench.report, bench.look), progress)
+        assert nc.on
+        assert nc.count(SYNC) <= A_FEW + braking
+        assert nc.count(NMT) == nc.count(SDO) == 0
+        assert what != "target" or nc.count(TARGET) <= 5  # what left before it was heard
+    assert step not in progress.done()
