@@ -22,15 +22,17 @@ _DOWNLOAD = 1  # command specifier of an SDO request that writes (CiA 301, 7.2.4
 class BusWatch:
     """``sign`` is what another master was first heard to send, None while none was heard; it is never taken back.
 
-    ``sent_by_other`` are its COB-IDs, ``led_by_other`` the axes whose set-points it sends, ``written`` the objects that
-    fdhil wrote, by node-ID and index. One thread takes frames, any may send.
+    ``sent_by_other`` are its COB-IDs, ``led_by_other`` the axes whose set-points it sends or whose node it stopped by
+    NMT; ``stopped`` are those that it has not started since. ``written`` are the objects that fdhil wrote, by node-ID
+    and index. One thread takes frames, any may send.
     """
 
     def __init__(self, name: str, guard_runs: Callable[[], bool] = lambda: False) -> None:
         self.name = name
         self._guard_runs = guard_runs
         self.sign: str | None = None
-        self.led_by_other: set[str] = set()
+        self.led_by_other: frozenset[str] = frozenset()
+        self.stopped: frozenset[str] = frozenset()
         self.written: set[tuple[int, int]] = set()
         self._first_id = self._syncs = self._syncs_before = 0
         self.sent_by_other: set[int] = set()
@@ -38,6 +40,7 @@ class BusWatch:
         self._harmless: set[int] = set()
         self._own: set[int] = set()
         self._axis_of: dict[int, str] = {}
+        self._node_of: dict[str, int] = {}
         self._offsets: set[int] = set()
 
     @classmethod
@@ -57,12 +60,13 @@ class BusWatch:
         return watch
 
     def _add_drive(self, axis: str, profile: DriveProfile, node_id: int) -> None:
+        self._node_of[axis] = node_id
         self._own |= {spec.cob_base + node_id for spec in profile.tpdos}
         offsets = set(offset_ids(profile, node_id))
         self._offsets |= offsets
         self._axis_of |= dict.fromkeys({spec.cob_base + node_id for spec in profile.rpdos} - offsets, axis)
 
-    def take(self, can_id: int) -> None:
+    def take(self, can_id: int, data: bytes) -> None:
         """Take a frame that came, with the flags of its identifier."""
         if can_id in self._harmless and can_id not in self._sent:
             return
@@ -74,9 +78,19 @@ class BusWatch:
         self._syncs += can_id == cia402.COB_SYNC
         self.sent_by_other.add(can_id)
         if can_id in self._axis_of:
-            self.led_by_other.add(self._axis_of[can_id])
+            self.led_by_other |= {self._axis_of[can_id]}
+        elif can_id == cia402.COB_NMT and len(data) > 1:
+            self._take_nmt(data[0], data[1])
         if self.sign is None:
             self._first_id, self.sign = can_id, sign
+
+    def _take_nmt(self, command: int, node_id: int) -> None:
+        axes = {axis for axis, node in self._node_of.items() if node_id in (0, node)}
+        if command == cia402.NmtCommand.START:
+            self.stopped -= axes
+        elif command in tuple(cia402.NmtCommand):  # a node that is not operational takes no PDO
+            self.stopped |= axes
+            self.led_by_other |= axes
 
     def _sign_of(self, can_id: int) -> str | None:
         if can_id in self._own:
@@ -102,7 +116,7 @@ class BusWatch:
 
     def may_send(self, can_id: int) -> bool:
         """Whether a frame may leave: beside another master only what brings a drive to rest that it does not lead."""
-        if self.sign is None or can_id == cia402.COB_SYNC:
+        if self.sign is None or can_id == cia402.COB_SYNC or can_id & ~0x7F == cia402.COB_HEARTBEAT:
             return True
         axis = self._axis_of.get(can_id)
         return axis not in self.led_by_other if axis else can_id in self._offsets - self.sent_by_other
@@ -134,5 +148,5 @@ class WatchedRing(FrameRing):
 
     def append(self, t_ns: int, can_id: int, data: bytes) -> None:
         """Store one frame (writer's side only)."""
-        self._watch.take(can_id)
+        self._watch.take(can_id, data)
         super().append(t_ns, can_id, data)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
 from typing import Protocol, Self
 
 from fdhil import cia402
@@ -19,7 +18,7 @@ from fdhil.commissioning.realtime import CYCLE, prioritise
 from fdhil.commissioning.set_points import SetPoints
 from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import MachineConfig
-from fdhil.errors import DeviceError, ForeignMaster
+from fdhil.errors import DeviceError
 
 LOCKSTEP_WAIT_S = 8.0
 GUARD_WAIT_S = 2.0
@@ -112,7 +111,8 @@ class Cycle:
         self._sync_overflow: int | None = None
         self._sent_s = 0.0
         self._offsets_before: set[int] = set()
-        self._landing: Iterator[None] | None = None
+        self._landing: Iterator[bool] | None = None
+        self._sync_lands: bool | None = True
         self._heartbeat_due = 0.0
         self._landed = threading.Event()
         self._stopping = threading.Event()
@@ -168,14 +168,16 @@ class Cycle:
             self.path.stop(f"another master sends {taken.watch.sign} on bus {taken.name}")
         if self._landing is None:
             self._landing = land(led, lambda: self.path is not None and not self.path.resting)
-        if led:
+        if led and self._sync_lands:
+            self._send_heartbeat()  # a drive that misses it while it brakes stops by itself
             self._send_sync()
-        if next(self._landing, self) is self:
+        self._sync_lands = next(self._landing, None)
+        if self._sync_lands:
+            self._send_set_points()
+        elif self._sync_lands is None:
             written = {each for bus in self.buses.values() for each in bus.watch.written}
             self.failure = taken.watch.refusal(outcome(led, written))
             self._landed.set()
-        else:
-            self._send_set_points()
 
     def _missed(self, periods: int) -> None:
         """This computer slept; drives that stand at their last set-point by now are not jerked on."""
@@ -202,8 +204,7 @@ class Cycle:
         if self.heartbeat is not None and now >= self._heartbeat_due:
             self._heartbeat_due = now + self.heartbeat_s
             for bus in self.buses.values():
-                with suppress(ForeignMaster):  # heard in this very moment: the next turn lands
-                    bus.send(cia402.COB_HEARTBEAT + self.heartbeat, bytes([cia402.Nmt.OPERATIONAL]))
+                bus.send(cia402.COB_HEARTBEAT + self.heartbeat, bytes([cia402.Nmt.OPERATIONAL]))
 
     def _send_sync(self) -> None:
         data = b""

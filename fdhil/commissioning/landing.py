@@ -10,6 +10,7 @@ from fdhil import cia402
 OFFSET_CYCLES = 3  # in so many steps an offset goes to zero, whatever its limits: the other master does not know of it
 WORD_CYCLES = 2
 GUARD_LANDING_CYCLES = 500  # so long a guard's offset is waited for; the drive holds it when SYNC ends
+START_CYCLES = 3000  # so long a node that the other master stopped is waited for
 OFF_WORDS = (cia402.CONTROL_SWITCH_ON, cia402.CONTROL_SHUTDOWN, cia402.CONTROL_DISABLE_VOLTAGE)
 """Takes the power off, step by step."""
 
@@ -25,7 +26,11 @@ class Landed(Protocol):
 
     @property
     def led_by_other(self) -> bool:
-        """Whether another master sends its set-points."""
+        """Whether another master sends its set-points, or stopped its node."""
+
+    @property
+    def stopped_by_other(self) -> bool:
+        """Whether another master stopped its node and has not started it again."""
 
     @property
     def playing(self) -> bool:
@@ -45,26 +50,42 @@ class Landed(Protocol):
     def switch_off(self, word: int) -> None:
         """Send this controlword from now on, and no offset."""
 
+    def send_zero_offset(self) -> None:
+        """Send an offset of zero once, at once."""
 
-def land(drives: Sequence[Landed], braking: Callable[[], bool]) -> Iterator[None]:
-    """Yield before each SYNC that is still needed: the axes brake, offsets go to zero, the drives are switched off.
 
-    A drive whose set-points another master sends is left to it, its offset at zero.
+def land(drives: Sequence[Landed], braking: Callable[[], bool]) -> Iterator[bool]:
+    """Yield once per cycle, whether SYNC and set-points are still needed.
+
+    The axes brake, offsets go to zero, the drives are switched off. A drive that another master leads is left to it,
+    its offset at zero: where its node was stopped it hears that when it is started again.
     """
     for drive in drives:
         drive.land(OFFSET_CYCLES)
     while braking() or any(drive.playing for drive in drives):
-        yield
+        yield True
     own = [drive for drive in drives if not drive.led_by_other]
     for _ in range(GUARD_LANDING_CYCLES):
         if not any(drive.held_offset for drive in own):
             break
-        yield
+        yield True
     for word in OFF_WORDS if own else ():
         for _ in range(WORD_CYCLES):
             for drive in drives:
                 drive.switch_off(word)
-            yield
+            yield True
+    yield from _zero_when_started([drive for drive in drives if drive.led_by_other and drive.zeroes_offset])
+
+
+def _zero_when_started(drives: Sequence[Landed]) -> Iterator[bool]:
+    for _ in range(START_CYCLES):
+        if not any(drive.stopped_by_other for drive in drives):
+            break
+        yield False
+    for _ in range(OFFSET_CYCLES if drives else 0):
+        for drive in drives:
+            drive.send_zero_offset()
+        yield False
 
 
 def outcome(drives: Sequence[Landed], written: set[tuple[int, int]]) -> str:
@@ -77,6 +98,9 @@ def outcome(drives: Sequence[Landed], written: set[tuple[int, int]]) -> str:
 
 def _left(drive: Landed) -> str:
     zero = ", its offset taken to zero" if drive.zeroes_offset else ""
+    if drive.stopped_by_other:
+        unknown = ", and may hold an offset: power it off and on again" if drive.zeroes_offset else ""
+        return f"axis {drive.axis} was left to it, which stopped its node{unknown}"
     if drive.led_by_other:
         return f"axis {drive.axis} was left to it{zero}"
     return f"axis {drive.axis} was stopped{zero} and its drive switched off"

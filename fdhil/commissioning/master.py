@@ -157,8 +157,13 @@ class Master:
 
     @property
     def led_by_other(self) -> bool:
-        """Whether another master sends its set-points."""
+        """Whether another master sends its set-points, or stopped its node."""
         return self.axis in self.bus.watch.led_by_other
+
+    @property
+    def stopped_by_other(self) -> bool:
+        """Whether another master stopped its node and has not started it again."""
+        return self.axis in self.bus.watch.stopped
 
     @property
     def zeroes_offset(self) -> bool:
@@ -180,6 +185,13 @@ class Master:
     def switch_off(self, word: int) -> None:
         """Send this controlword from now on, and no offset."""
         self._sends_offset, self.controlword = False, word
+
+    def send_zero_offset(self) -> None:
+        """Send an offset of zero once, at once."""
+        for spec in self.profile.rpdos:
+            if spec.valid and spec.cob_base + self.node_id in self._offset_ids:
+                with suppress(ForeignMaster):  # it sends the offset
+                    self.bus.send(spec.cob_base + self.node_id, bytes(spec.length))
 
     def take(self, can_id: int, data: bytes) -> None:
         """Take a frame of the bus."""

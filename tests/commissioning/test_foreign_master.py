@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator
@@ -9,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import can
 import pytest
 
 from fdhil.commissioning import config_check, pdo_setup, steps
@@ -190,6 +192,45 @@ def test_a_record_holds_where_an_nc_comes_while_a_guard_starts(rig: Rig, monkeyp
         compare_again(rig.config, "can0", said.append)
         assert nc.count(SDO) <= 5
     assert said == []
+
+
+def test_a_drive_that_an_nc_stops_and_starts_is_left_without_an_offset(rig: Rig) -> None:
+    """An NC stops the nodes first, sets them up, and starts them: what is sent meanwhile no drive takes."""
+    channel = rig.config.bus["can0"].channel
+
+    def stop_and_start() -> None:
+        with can.Bus(interface="virtual", channel=channel) as nc:
+            nc.send(can.Message(arbitration_id=NMT, data=b"\x80\x01", is_extended_id=False))
+            time.sleep(0.2)
+            nc.send(can.Message(arbitration_id=NMT, data=b"\x01\x01", is_extended_id=False))
+            while not zeroed.wait(0.002):
+                nc.send(can.Message(arbitration_id=SYNC, is_extended_id=False))
+
+    def hold(master: Master) -> None:
+        steps.ramp(master, 33, 1)
+        master.wait_cycles(20)
+        thread.start()
+        master.wait_cycles(10_000)
+
+    zeroed, thread = threading.Event(), threading.Thread(target=stop_and_start)
+    with pytest.raises(ForeignMaster, match=r"NMT commands; .* axis X was left to it, its offset taken to zero"):
+        led_through(rig.config, hold)
+    assert rig.holds(lambda: rig.peer.drive.dictionary.number(0x60B0) == 0)
+    zeroed.set()
+    thread.join()
+    assert rig.peer.heard.count(NMT) == 3  # our start, then the NC's own two
+
+
+def test_a_drive_that_an_nc_stops_for_good_may_hold_an_offset_and_that_is_reported(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fdhil.commissioning.landing.START_CYCLES", 50)
+    monkeypatch.setitem(FOREIGN, "stop", (NMT, b"\x02\x00"))
+    with rig.nc("stop", is_offset, often=False) as nc:
+        with pytest.raises(ForeignMaster, match="which stopped its node, and may hold an offset: power it off and on"):
+            led_through(rig.config, sign_test)
+        assert nc.count(TARGET) <= 5
+        assert nc.count(SYNC) <= A_FEW
 
 
 def test_no_frame_leaves_before_the_bus_was_listened_to(rig: Rig) -> None:
