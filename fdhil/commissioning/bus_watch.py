@@ -99,7 +99,7 @@ class BusWatch:
             return None if self._guard_runs() else "offsets"
         if can_id in self._axis_of:
             return "set-points"
-        return shows_master(can_id) or ("what fdhil sends" if can_id in self._sent else None)
+        return shows_master(can_id) or ("with identifiers of fdhil" if can_id in self._sent else None)
 
     def sync_came(self) -> bool:
         """Whether another master sent SYNC since this was asked last."""

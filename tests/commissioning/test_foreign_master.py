@@ -194,6 +194,15 @@ def test_a_record_holds_where_an_nc_comes_while_a_guard_starts(rig: Rig, monkeyp
     assert said == []
 
 
+def test_a_heartbeat_like_ours_ends_the_watchdog_test(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another fdhil, on another computer: the drive would not notice that ours has stopped."""
+    monkeypatch.setitem(FOREIGN, "heartbeat", (HEARTBEAT, b"\x05"))
+    with rig.nc("heartbeat", is_heartbeat) as nc:
+        with pytest.raises(ForeignMaster, match=r"an NC is sending with identifiers of fdhil; .* COB-ID 764"):
+            led_through(rig.config, proved_watchdog)
+        rig.require_left_alone(nc, "heartbeat")
+
+
 def test_a_drive_that_an_nc_stops_and_starts_is_left_without_an_offset(rig: Rig) -> None:
     """An NC stops the nodes first, sets them up, and starts them: what is sent meanwhile no drive takes."""
     channel = rig.config.bus["can0"].channel
