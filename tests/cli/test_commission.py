@@ -313,7 +313,6 @@ def test_an_nc_that_is_switched_on_in_the_sign_test_leaves_no_record(what: str, 
     assert in_the_audit(bench)[-1] == ("commission", "X", "ForeignMaster")
 
 
-@pytest.mark.parametrize("what", ["SYNC", "SDO request"])
 @pytest.mark.parametrize(
     ("question", "sync"),
     [
@@ -323,11 +322,9 @@ def test_an_nc_that_is_switched_on_in_the_sign_test_leaves_no_record(what: str, 
         (4, A_FEW),  # whether the table moved: the drive is on
     ],
 )
-def test_nothing_begins_where_an_nc_came_while_a_question_stood(
-    question: int, sync: int, what: str, bench: Bench
-) -> None:
+def test_nothing_begins_where_an_nc_came_while_a_question_stood(question: int, sync: int, bench: Bench) -> None:
     config = machine_config.load(bench.file)
-    with ForeignNc(config.bus["can0"].channel, FOREIGN[what], lambda _: False) as nc:
+    with ForeignNc(config.bus["can0"].channel, FOREIGN["SYNC"], lambda _: False) as nc:
         code, _, err = bench.commission(said=LateOperator(nc, "y\n-2 130\ny\ny\n", question))
         assert nc.on
         assert nc.count(SYNC) <= sync

@@ -213,7 +213,7 @@ def test_what_leaves_the_travel_is_refused_before_a_bus_is_opened(floor: Floor) 
     assert floor.sent() <= DRIVES
 
 
-@pytest.mark.parametrize("what", ["SYNC", "NMT", "target", "set-points of another drive"])
+@pytest.mark.parametrize("what", ["SYNC", "target"])
 def test_another_master_ends_what_is_played(what: str, floor: Floor) -> None:
     with ForeignNc(floor.config.bus["can0"].channel, FOREIGN[what], moves) as nc:
         code, document, _ = floor.play(STROKE, "--yes")

@@ -119,8 +119,10 @@ def test_a_drive_that_was_set_up_anew_is_not_moved(bench: Bench) -> None:
     assert not {0x000, 0x080, 0x201} & set(bench.peer.heard)
 
 
-@pytest.mark.parametrize("what", ["SYNC", "NMT", "target", "offset"])
-@pytest.mark.parametrize(("step", "braking"), [("jog", 50), ("test rapids", 200)])
+@pytest.mark.parametrize(
+    ("step", "braking", "what"),
+    [("jog", 50, "target"), ("jog", 50, "offset"), ("test rapids", 200, "SYNC"), ("test rapids", 200, "target")],
+)
 def test_another_master_ends_the_trial(step: str, braking: int, what: str, bench: Bench) -> None:
     """Braked within its acceleration, switched off or left to the other master; nothing is kept of the step."""
 
