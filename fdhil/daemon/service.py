@@ -12,8 +12,7 @@ import signal
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractAsyncContextManager
-from typing import Any, Protocol
+from typing import Any
 
 from fdhil.arming.answers import Answer, refusal
 from fdhil.arming.desk import ArmingDesk
@@ -22,6 +21,7 @@ from fdhil.arming.standing import ADOPT, START_AND_ADOPT, Standing
 from fdhil.commissioning.void import void_record
 from fdhil.config import MachineConfig, unlikely
 from fdhil.daemon import blackbox, heap, journal
+from fdhil.daemon.acquisition import Acquisition, OpenSource
 from fdhil.daemon.audited import Audited
 from fdhil.daemon.clock import ClockWatch, newest_record_s
 from fdhil.daemon.control import SOCKET_NAME, ControlServer
@@ -33,35 +33,18 @@ from fdhil.daemon.offer_watch import OfferWatch
 from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.daemon.record_queue import RecordQueue
 from fdhil.daemon.resources import ResourceWatch, Use, uses
+from fdhil.daemon.shutdown import Budgets, Shutdown
 from fdhil.daemon.status import Watch
-from fdhil.errors import DeviceError, FdhilError, StoreError
+from fdhil.errors import FdhilError, StoreError
 from fdhil.pipeline import AxisPipeline, Record
 from fdhil.records import AxisSamples, NcState, Notice, Outcome, Temperature, TickTimes
 
 NOTICE_QUEUE = 200
-FIRST_RETRY_S = 0.1
-LAST_RETRY_S = 5.0
 WATCHDOG_S = 2.0
 LISTEN_S = 0.25
 RESOURCES_S = 10.0
 STOPPING = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 STUCK_S = 60.0  # a batch that is digested for so long hangs
-
-
-class Source(Protocol):
-    """A machine as the daemon needs it: its records in blocks, and counts of what was received and lost."""
-
-    async def run(self, take: Callable[[Record | NcState | Notice], None]) -> None:
-        """Hand records over as they come, until the source ends; DeviceError when a device fails for good."""
-
-    def counters(self) -> Mapping[str, Any]:
-        """Return frames received, lost and the like."""
-
-    def black_box(self) -> Mapping[str, str]:
-        """Return the frames of the last seconds of each bus, as the lines of a log."""
-
-
-OpenSource = Callable[[MachineConfig], AbstractAsyncContextManager[Source]]
 
 
 class InternalError(FdhilError):
@@ -71,9 +54,15 @@ class InternalError(FdhilError):
 class Service:
     """One running daemon of one machine."""
 
-    def __init__(self, config: MachineConfig, open_source: OpenSource, method: str | None = None) -> None:
+    def __init__(
+        self,
+        config: MachineConfig,
+        open_source: OpenSource,
+        method: str | None = None,
+        budgets: Budgets | None = None,
+        leave: Callable[[int], object] | None = None,
+    ) -> None:
         self._config = config
-        self._open_source = open_source
         self._method = method
         self._run_directory = config.run_directory
         self._store = OutcomeStore(config)
@@ -90,12 +79,12 @@ class Service:
         self._audit = Audited(self._handle, config.store.directory)
         desk, access = self._desk, config.access
         self._control = ControlServer(self._audit.of, lambda: desk.checking, desk.abandon, access, self._live.serve)
-        self._opened = asyncio.Event()
+        self._acquisition = Acquisition(config, open_source, self._watch.hearing, self._tell)
         self._stop = asyncio.Event()
-        self._source: Source | None = None
+        self._budgets = budgets or Budgets()
+        self.shutdown = Shutdown(self._budgets.total_s, leave)
         self._resources: tuple[Use, ...] = ()
         self._frames_seen = -1
-        self._delay_s = FIRST_RETRY_S
 
     async def run(self) -> Standing:
         """Serve until a signal asks to stop; return what may still be applied. BusLocked when another one serves it."""
@@ -103,17 +92,22 @@ class Service:
         with sole_owner(self._run_directory, self._config.store.directory):
             stopping = [number for number in STOPPING if signal.getsignal(number) is not signal.SIG_IGN]  # as by nohup
             for number in stopping:
-                loop.add_signal_handler(number, self._stop.set)
+                loop.add_signal_handler(number, self._begin_to_stop)
             try:
                 await self._serve()
             finally:
                 notify("STOPPING=1")
-                stands = await self._desk.stand_down()
-                await self._audit.written()
-                await asyncio.to_thread(self._store.close)
+                self.shutdown.begin()
+                await self._ramp_to_zero()
+                stop, budgets, stands = self.shutdown, self._budgets, self._desk.guard.standing
+                await stop.step("the audit log", self._audit.written(), budgets.audit_s, "its last lines are lost")
+                closing = asyncio.to_thread(self._store.close)
+                await stop.step("closing the store", closing, budgets.store_s, "its last records may be lost")
                 for number in stopping:
                     loop.remove_signal_handler(number)
-                if self._opened.is_set() or not stands.nothing:  # else it never ran, and the error alone is told
+                if (
+                    self._acquisition.opened.is_set() or not stands.nothing
+                ):  # else it never ran, and the error alone is told
                     self._say_stopped(stands)
         return stands
 
@@ -135,7 +129,9 @@ class Service:
         self._say([Notice("ConfigUnlikely", "minor", text) for text in unlikely(self._config)])
         await asyncio.to_thread(self._prepare)
         async with self._control.serving(self._run_directory / SOCKET_NAME), asyncio.TaskGroup() as tasks:
-            acquiring = tasks.create_task(self._acquire(), name="acquire")
+            stop, budgets = self.shutdown, self._budgets
+            closing_s = budgets.source_s + 1.0  # reported before it is given up
+            acquiring = tasks.create_task(self._acquisition.run(self._take, closing_s), name="acquire")
             others = [tasks.create_task(self._work(axis), name=f"axis {axis}") for axis in self._config.axis]
             others.append(tasks.create_task(self._keep_notices(), name="notices"))
             others.append(tasks.create_task(self._void_records(), name="void"))
@@ -147,13 +143,26 @@ class Service:
             others.append(tasks.create_task(self._say_ready(), name="ready"))
             await self._stop.wait()
             notify("STOPPING=1")
-            await self._desk.stand_down()
+            await self._ramp_to_zero()
             acquiring.cancel()
-            await asyncio.wait([acquiring])
-            axes = (queue.join() for queue in self._queues.values())
-            await asyncio.gather(*axes, self._notices.join(), self._void_axes.join())
+            closing = asyncio.wait([acquiring])
+            await stop.step("closing buses and sensors", closing, budgets.source_s, "the kernel closes them")
+            analysing = self._analysed()
+            await stop.step("the analysis of what was received", analysing, budgets.analysis_s, "the rest is lost")
             for task in others:
                 task.cancel()
+
+    def _begin_to_stop(self) -> None:
+        self.shutdown.begin()
+        self._stop.set()
+
+    async def _ramp_to_zero(self) -> None:
+        effect = "the guard ramps to zero when this process has ended; see fdhil-guard's journal"
+        await self.shutdown.step("the ramp to zero", self._desk.stand_down(), self._budgets.zero_s, effect)
+
+    async def _analysed(self) -> None:
+        axes = (queue.join() for queue in self._queues.values())
+        await asyncio.gather(*axes, self._notices.join(), self._void_axes.join())
 
     def _prepare(self) -> None:
         """Begin each axis with what the history knows, and compile the kernels."""
@@ -165,40 +174,15 @@ class Service:
         warm(self._config, self._method)
 
     async def _say_ready(self) -> None:
-        await self._opened.wait()
+        await self._acquisition.opened.wait()
         axes = ", ".join(self._config.axis)
         journal.write_line(f"ready: {self._config.machine.name}, axes {axes}; listening, sending nothing")
         notify("READY=1\nSTATUS=listening, sending nothing")
 
     # from the machine to the pipelines -------------------------------------------------------------------------
 
-    async def _acquire(self) -> None:
-        """Read the machine's records for ever; a source that fails is opened again, later and later.
-
-        What cannot be opened at the start ends the daemon with the reason: it is a fault of the set-up.
-        """
-        self._delay_s = FIRST_RETRY_S
-        while True:
-            try:
-                async with self._open_source(self._config) as source:
-                    self._source = source
-                    self._watch.hearing.source_opened(time.monotonic())
-                    self._opened.set()
-                    await source.run(self._take)
-                cause = "the source ended"
-            except (DeviceError, OSError) as error:
-                if not self._opened.is_set():
-                    raise
-                cause = str(error)
-            self._source = None
-            self._watch.hearing.source_lost(time.monotonic())
-            text = f"{cause}; it is opened again in {self._delay_s:.1f} s, what was learnt is kept."
-            self._tell([Notice("SourceLost", "MAJOR", text)])
-            await asyncio.sleep(self._delay_s)
-            self._delay_s = min(LAST_RETRY_S, 2 * self._delay_s)
-
     def _take(self, record: Record | NcState | Notice) -> None:
-        self._delay_s = FIRST_RETRY_S
+        self._acquisition.received()
         if isinstance(record, NcState):
             self._desk.hear_nc(record)
             self._tell(self._watch.nc.note(record, time.monotonic()))
@@ -254,9 +238,9 @@ class Service:
         while True:
             notice = await self._notices.get()
             self._say(await asyncio.to_thread(self._store.keep, [notice]))
-            if notice.code == TRIPPED and self._source is not None:
+            if notice.code == TRIPPED and self._acquisition.source is not None:
                 code, store = notice.text.partition(":")[0], self._config.store.directory
-                self._tell([await asyncio.to_thread(blackbox.dump, store, code, self._source.black_box)])
+                self._tell([await asyncio.to_thread(blackbox.dump, store, code, self._acquisition.source.black_box)])
             self._notices.task_done()
 
     async def _void_records(self) -> None:
@@ -293,7 +277,7 @@ class Service:
         now_s = time.monotonic()
         if any(now_s - since_s > STUCK_S for since_s in self._busy_since_s.values()):
             return False
-        counters = self._source.counters() if self._source is not None else {}
+        counters = self._acquisition.source.counters() if self._acquisition.source is not None else {}
         frames = int(counters.get("frames", 0))
         moved, self._frames_seen = frames != self._frames_seen, frames
         return moved or self._watch.hearing.alive(now_s, period_s)
@@ -303,8 +287,8 @@ class Service:
         while True:
             await asyncio.sleep(LISTEN_S)
             now_s = time.monotonic()
-            if self._source is not None:
-                self._watch.hearing.counted(self._source.counters(), now_s)
+            if self._acquisition.source is not None:
+                self._watch.hearing.counted(self._acquisition.source.counters(), now_s)
             self._tell(self._watch.troubles(now_s))
 
     async def _watch_resources(self, clock: ClockWatch) -> None:
@@ -333,13 +317,13 @@ class Service:
         if request["request"] == "acknowledge":
             return await asyncio.to_thread(self._store.acknowledge, request)
         if request["request"] == "stop":
-            self._stop.set()
+            self._begin_to_stop()
             return {"ok": True, "text": "stopping"}
         text = f"{request['request']!r} is no request"
         return refusal("BadRequest", text, "send status, live, arm, disarm, acknowledge or stop")
 
     def _status(self) -> Answer:
-        counters = dict(self._source.counters()) if self._source is not None else {}
+        counters = dict(self._acquisition.source.counters()) if self._acquisition.source is not None else {}
         dropped = {axis: queue.dropped for axis, queue in self._queues.items()}
         counters["records_dropped"] = sum(dropped.values())
         store = {
@@ -382,9 +366,9 @@ def run(config: MachineConfig, open_source: OpenSource, method: str | None = Non
     FdhilError when it cannot start or meets what it must not survive.
     """
     heap.keep_small()
-    service = Service(config, open_source, method)
+    service = Service(config, open_source, method, leave=os._exit)
     try:
-        return asyncio.run(service.run())
+        return asyncio.run(_served(service))
     except ExceptionGroup as group:
         first = _first(group)
         if isinstance(first, FdhilError):
@@ -393,6 +377,14 @@ def run(config: MachineConfig, open_source: OpenSource, method: str | None = Non
             journal.write_line(line, "MAJOR")
         text = f"InternalError: {first!r} ended the daemon; {service.standing}; report the lines above"
         raise InternalError(text) from None
+    finally:
+        service.shutdown.end()
+
+
+async def _served(service: Service) -> Standing:
+    stands = await service.run()
+    service.shutdown.leave_overrun()
+    return stands
 
 
 def _first(error: BaseException) -> BaseException:

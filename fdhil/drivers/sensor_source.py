@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from fdhil import tables
+from fdhil.cancellation import run_attempt
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.link import Link
@@ -74,9 +75,7 @@ class SensorSource:
         while True:
             begun = time.monotonic()
             try:
-                if not self.sensor.link.connected:
-                    await self.sensor.link.connect()
-                for record in await self.sensor.poll(self._ticks):
+                for record in await run_attempt(self.sensor.name, self._poll()):
                     take(record)
             except DeviceError as error:
                 self._failed(error, take)
@@ -88,6 +87,11 @@ class SensorSource:
                 take(Notice(code, "info", f"The {self.sensor.name} answers again.", self.sensor.axis))
             self._told.clear()
             await asyncio.sleep(max(0.0, POLL_S - (time.monotonic() - begun)))
+
+    async def _poll(self) -> Sequence[Record]:
+        if not self.sensor.link.connected:
+            await self.sensor.link.connect()
+        return await self.sensor.poll(self._ticks)
 
     def _failed(self, error: DeviceError, take: Take) -> None:
         self._failures += 1

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import binascii
 import re
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from typing import Any, NoReturn
 
@@ -20,6 +20,7 @@ from nats.aio.client import Client, RawCredentials
 from nats.js import JetStreamContext
 from nats.js.api import AckPolicy, ConsumerConfig, DiscardPolicy, RetentionPolicy, StorageType, StreamConfig
 
+from fdhil.cancellation import GivenUp, run_attempt
 from fdhil.config.credentials import password_of, secret_in, tls_of
 from fdhil.config.fleet import Stream
 from fdhil.config.uplink import NatsServer
@@ -36,7 +37,9 @@ _SEED = re.compile(r"^SU[A-Z2-7]{56}\s*$", re.MULTILINE)
 ERRORS = (nats.errors.Error, OSError, TimeoutError)  # of a server that is not there, or does not do what it is asked
 
 
-async def try_for_good(attempt: Callable[[], Awaitable[str]], done: Callable[[], int], complaint: str) -> NoReturn:
+async def try_for_good(
+    attempt: Callable[[], Coroutine[Any, Any, str]], done: Callable[[], int], complaint: str
+) -> NoReturn:
     """Attempt until it is cancelled, later and later while nothing gets ``done``; a new cause of a failure is told.
 
     ``attempt`` returns the cause, ``complaint`` has a place for it.
@@ -44,7 +47,10 @@ async def try_for_good(attempt: Callable[[], Awaitable[str]], done: Callable[[],
     delay_s, told = FIRST_RETRY_S, ""
     while True:
         before = done()
-        cause = await attempt()
+        try:
+            cause = await run_attempt("server", attempt())
+        except GivenUp as error:
+            cause = str(error)
         if done() > before:
             delay_s, told = FIRST_RETRY_S, ""
         if cause != told:

@@ -19,6 +19,7 @@ from typing import NoReturn
 import aiomqtt
 from aiomqtt.exceptions import MqttConnectError
 
+from fdhil.cancellation import GivenUp, end_tasks, run_attempt
 from fdhil.config import MachineConfig
 from fdhil.config.publish import MqttBroker
 from fdhil.daemon import journal
@@ -41,6 +42,7 @@ from fdhil.shopfloor.sparkplug import (
 )
 
 FIRST_RETRY_S, LAST_RETRY_S = 1.0, 60.0
+END_S = 10.0
 DEATH_S = 2.0  # a broker that does not take our death certificate sends the one it has
 REBIRTH_S = 1.0  # births are sent no more often
 WAITING = 32  # messages of the broker that wait to be looked at
@@ -69,16 +71,7 @@ async def publish(config: MachineConfig) -> None:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         done.pop().result()
     finally:
-        await _end(tasks)
-
-
-async def _end(tasks: Iterable[asyncio.Task[None]]) -> None:
-    """Cancel until they have ended: Python 3.11 loses a cancellation that comes as a connection breaks."""
-    left = set(tasks)
-    while left:
-        for task in left:
-            task.cancel()
-        _, left = await asyncio.wait(left, timeout=DEATH_S + 1.0)
+        await end_tasks(tasks, END_S, DEATH_S + 1.0)
 
 
 async def _hear(config: MachineConfig, session: Session) -> None:
@@ -92,10 +85,8 @@ async def _stay_connected(session: Session, settings: MqttBroker) -> NoReturn:
     while True:
         began_s = time.monotonic()
         try:
-            async with _client(settings, session) as broker:
-                journal.write_line(f"the broker {where} is there")
-                await session.run(broker)
-        except* aiomqtt.MqttError as errors:
+            await run_attempt(f"broker {where}", _serve_connection(session, settings, where))
+        except* (aiomqtt.MqttError, GivenUp) as errors:
             cause = _cause(_first(errors))
             if cause != told:
                 journal.write_line(f"the broker {where} is not told anything: {cause}; it is tried again", "minor")
@@ -106,6 +97,12 @@ async def _stay_connected(session: Session, settings: MqttBroker) -> NoReturn:
             delay_s, told = FIRST_RETRY_S, ""
         await asyncio.sleep(delay_s)
         delay_s = min(LAST_RETRY_S, 2 * delay_s)
+
+
+async def _serve_connection(session: Session, settings: MqttBroker, where: str) -> None:
+    async with _client(settings, session) as broker:
+        journal.write_line(f"the broker {where} is there")
+        await session.run(broker)
 
 
 def _first(error: BaseException) -> BaseException:

@@ -3,29 +3,43 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
+import os
 import signal
-from collections.abc import Awaitable, Callable
-from typing import TypeVar
+from collections.abc import Callable, Coroutine
+from typing import Any, TypeVar
 
+from fdhil.cancellation import end_tasks
 from fdhil.daemon import heap, journal
 from fdhil.daemon.notify import notify
+from fdhil.daemon.shutdown import Shutdown
 
 C = TypeVar("C")
+PUBLISHER_S = 12.0  # a broker, server or database that takes no farewell
+STOP_S = 18.0  # below the TimeoutStopSec of the units
 
 
-def run(publisher: Callable[[C], Awaitable[None]], config: C) -> None:
+def run(publisher: Callable[[C], Coroutine[Any, Any, None]], config: C) -> None:
     """Publish until it is told to stop. FdhilError when it cannot start."""
     heap.keep_small()
-    asyncio.run(_until_told_to_stop(publisher, config))
+    shutdown = Shutdown(STOP_S, os._exit)
+    try:
+        asyncio.run(_until_told_to_stop(publisher(config), shutdown))
+    finally:
+        shutdown.end()
 
 
-async def _until_told_to_stop(publisher: Callable[[C], Awaitable[None]], config: C) -> None:
-    publishing = asyncio.ensure_future(publisher(config))
+async def _until_told_to_stop(publisher: Coroutine[Any, Any, None], shutdown: Shutdown) -> None:
+    stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
-        asyncio.get_running_loop().add_signal_handler(number, publishing.cancel)
-    with contextlib.suppress(asyncio.CancelledError):
-        await publishing
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    publishing, told = asyncio.create_task(publisher), asyncio.create_task(stop.wait())
+    await asyncio.wait([publishing, told], return_when=asyncio.FIRST_COMPLETED)
+    shutdown.begin()
+    if publishing.done():
+        told.cancel()
+        publishing.result()
+    elif await end_tasks([publishing], PUBLISHER_S):
+        journal.write_line(f"stopping: the connection is not closed after {PUBLISHER_S:g} s; it is left", "minor")
 
 
 def say_ready(text: str) -> None:

@@ -17,8 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from fdhil.cancellation import run_attempt
 from fdhil.daemon.live import SIGNALS, unpacked
-from fdhil.errors import ConnectError
+from fdhil.errors import ConnectError, DeviceError
 from fdhil.web.live_ring import Ring
 
 KEPT_S = 300.0
@@ -59,10 +60,10 @@ class LiveFeed:
         while True:
             await self._wanted.wait()
             try:
-                await self._read()
+                await run_attempt("daemon", self._read())
                 self._wanted.clear()
                 self.trouble = "the daemon is being asked"
-            except (OSError, TimeoutError, ConnectError, *NONSENSE) as error:
+            except (OSError, TimeoutError, DeviceError, *NONSENSE) as error:
                 self.trouble = _cause(error)
                 await asyncio.sleep(RETRY_S)
                 if not self.viewers:
@@ -146,7 +147,7 @@ async def _line_of(reader: asyncio.StreamReader) -> dict[str, Any]:
 
 
 def _cause(error: Exception) -> str:
-    if isinstance(error, ConnectError):
+    if isinstance(error, DeviceError):
         return str(error)
     if isinstance(error, TimeoutError):
         return f"the daemon has said nothing for {SILENT_S:.0f} s; see its log"

@@ -5,14 +5,18 @@ from __future__ import annotations
 import asyncio
 import time
 import uuid
+from typing import Any
 
 import can
 import pytest
 
 from fdhil.drivers.bus_source import BusSource
+from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.machine import MachineSource, open_machine
-from fdhil.drivers.sensor_source import Record, Take
-from fdhil.records import Notice
+from fdhil.drivers.nc.listener import NcListener
+from fdhil.drivers.sensor_source import Record, SensorSource, Take
+from fdhil.errors import ConnectError
+from fdhil.records import NcState, Notice
 from tests.drivers.wire import machine
 
 
@@ -85,3 +89,48 @@ def test_silence_from_the_start_is_told_and_so_is_its_end() -> None:
         assert (back.code, back.severity) == ("BusSilent", "info")
     finally:
         bus.close()
+
+
+class FailingAtTheEnd:
+    """An NC, and a sensor, whose connection fails while the cancellation closes it."""
+
+    name, axis, samples, lost, connected = "peer", "X", 0, 0, True
+
+    def __init__(self) -> None:
+        self.asked = 0
+        self.waiting = asyncio.Event()
+
+    async def __aenter__(self) -> FailingAtTheEnd:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        raise ConnectError(self.name, "went away")
+
+    async def read(self) -> list[NcState]:
+        self.asked += 1
+        self.waiting.set()
+        await asyncio.Event().wait()
+        return []
+
+    async def poll(self, _: object) -> list[Record]:
+        async with self:
+            return [*await self.read()]
+
+    @property
+    def link(self) -> FailingAtTheEnd:
+        return self
+
+    def fault_code(self, _: object) -> None:
+        """Nothing that anybody is told."""
+
+
+@pytest.mark.parametrize("what", ["nc", "sensor"])
+async def test_source_stops_while_its_connection_fails(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    peer: Any = FailingAtTheEnd()
+    monkeypatch.setattr("fdhil.drivers.nc.listener.load_nc_source", lambda name: lambda config: peer)
+    source = NcListener(machine()) if what == "nc" else SensorSource(peer, TickClock(0.001))
+    running = asyncio.create_task(source.run(lambda record: None))
+    await peer.waiting.wait()
+    running.cancel()
+    await asyncio.wait([running])
+    assert (running.cancelled(), peer.asked) == (True, 1)

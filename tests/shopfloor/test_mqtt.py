@@ -289,20 +289,3 @@ def test_settings_that_would_not_do_are_refused(settings: dict[str, Any], words:
 def test_the_machines_name_is_the_node_without_what_a_topic_cannot_have() -> None:
     assert MqttBroker().node_name("mill #3 / hall +1") == "mill _3 _ hall _1"
     assert MqttBroker(node="m3").node_name("mill") == "m3"
-
-
-async def test_a_task_that_loses_a_cancellation_is_cancelled_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mqtt, "DEATH_S", -0.99)
-    lost = []
-
-    async def deaf_once() -> None:
-        try:
-            await asyncio.Event().wait()
-        except asyncio.CancelledError:
-            lost.append(True)
-        await asyncio.Event().wait()
-
-    task = asyncio.create_task(deaf_once())
-    await asyncio.sleep(0)
-    await mqtt._end([task])
-    assert (task.cancelled(), lost) == (True, [True])

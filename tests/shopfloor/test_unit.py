@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from fdhil.shopfloor.news import ANSWER_S
+from fdhil.shopfloor.process import STOP_S
 
 UNIT = Path(__file__).parents[2] / "systemd" / "fdhil-publish@.service"
 
@@ -16,4 +17,4 @@ def test_the_unit_says_what_the_publishers_rely_on() -> None:
     assert (settings["Type"], settings["User"], settings["IPAddressAllow"]) == ("notify", "fdhil-publish", "localhost")
     assert not {"BindsTo", "Requires", "PartOf"} & settings.keys()
     assert settings["RestartPreventExitStatus"] == "2"
-    assert float(settings["TimeoutStopSec"]) > ANSWER_S  # a question that waits for its answer is not cut off
+    assert float(settings["TimeoutStopSec"]) > STOP_S > ANSWER_S  # a question that waits for its answer is not cut off

@@ -6,6 +6,7 @@ import asyncio
 import time
 from collections.abc import Callable
 
+from fdhil.cancellation import run_attempt
 from fdhil.config import MachineConfig
 from fdhil.drivers.nc import load_nc_source
 from fdhil.errors import DeviceError, DeviceTimeout
@@ -31,7 +32,7 @@ class NcListener:
         while True:
             before = self._states
             try:
-                await self._hear(take)
+                await run_attempt(self._source.name, self._hear(take))
             except DeviceError as error:
                 self._lost(error, take)
             pause_s = BACK_OFF_S[0] if self._states > before else min(2 * pause_s, BACK_OFF_S[1])

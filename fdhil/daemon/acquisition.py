@@ -1,0 +1,81 @@
+"""Reads the machine's records until it is told to stop; a source that fails is opened again, later and later."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractAsyncContextManager
+from typing import Any, Protocol
+
+from fdhil.cancellation import run_attempt
+from fdhil.config import MachineConfig
+from fdhil.daemon.hearing import Hearing
+from fdhil.errors import DeviceError
+from fdhil.pipeline import Record
+from fdhil.records import NcState, Notice
+
+FIRST_RETRY_S = 0.1
+LAST_RETRY_S = 5.0
+
+Take = Callable[[Record | NcState | Notice], None]
+
+
+class Source(Protocol):
+    """A machine as the daemon needs it: its records in blocks, and counts of what was received and lost."""
+
+    async def run(self, take: Take) -> None:
+        """Hand records over as they come, until the source ends; DeviceError when a device fails for good."""
+
+    def counters(self) -> Mapping[str, Any]:
+        """Return frames received, lost and the like."""
+
+    def black_box(self) -> Mapping[str, str]:
+        """Return the frames of the last seconds of each bus, as the lines of a log."""
+
+
+OpenSource = Callable[[MachineConfig], AbstractAsyncContextManager[Source]]
+
+
+class Acquisition:
+    """One machine's source, over one opening after another; ``source`` is None while none is open."""
+
+    def __init__(
+        self, config: MachineConfig, open_source: OpenSource, hearing: Hearing, tell: Callable[[Sequence[Notice]], None]
+    ) -> None:
+        self.source: Source | None = None
+        self.opened = asyncio.Event()
+        self._config, self._open_source = config, open_source
+        self._hearing, self._tell = hearing, tell
+        self._delay_s = FIRST_RETRY_S
+
+    async def run(self, take: Take, end_s: float) -> None:
+        """Hand records over until this is cancelled; closing the source then has ``end_s``.
+
+        What cannot be opened at the start ends the daemon with the reason: it is a fault of the set-up.
+        """
+        while True:
+            try:
+                await run_attempt("machine", self._run_source(take), end_s)
+                cause = "the source ended"
+            except (DeviceError, OSError) as error:
+                if not self.opened.is_set():
+                    raise
+                cause = str(error)
+            self.source = None
+            self._hearing.source_lost(time.monotonic())
+            text = f"{cause}; it is opened again in {self._delay_s:.1f} s, what was learnt is kept."
+            self._tell([Notice("SourceLost", "MAJOR", text)])
+            await asyncio.sleep(self._delay_s)
+            self._delay_s = min(LAST_RETRY_S, 2 * self._delay_s)
+
+    async def _run_source(self, take: Take) -> None:
+        async with self._open_source(self._config) as source:
+            self.source = source
+            self._hearing.source_opened(time.monotonic())
+            self.opened.set()
+            await source.run(take)
+
+    def received(self) -> None:
+        """Note that records came: a source that fails now is opened again soon."""
+        self._delay_s = FIRST_RETRY_S

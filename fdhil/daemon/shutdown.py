@@ -1,0 +1,87 @@
+"""Ends a process step by step: each step has its time, what takes longer is reported and left, the whole is bounded.
+
+Nothing waits for ever: a device that does not let go, a disk that does not answer or a library that swallows its
+cancellation delay the end, and do not prevent it. What the guard then has applied it ramps to zero by itself.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Coroutine
+from dataclasses import dataclass, fields
+from typing import Any
+
+from fdhil.daemon import journal
+
+EXIT_CODE = 3
+TEARDOWN_S = 2.0  # of the event loop, after the last step
+
+
+@dataclass(frozen=True, slots=True)
+class Budgets:
+    """How long each step may take, in s; systemd's TimeoutStopSec is above ``total_s``."""
+
+    zero_s: float = 20.0  # the guard answers at a SYNC, or when it has missed it for 10 s; then it ramps
+    source_s: float = 6.0
+    analysis_s: float = 8.0
+    audit_s: float = 3.0
+    store_s: float = 5.0
+
+    @property
+    def total_s(self) -> float:
+        """After how long the process ends, whatever has not."""
+        return sum(getattr(self, each.name) for each in fields(self)) + TEARDOWN_S
+
+
+class Shutdown:
+    """The end of one process, after ``total_s`` at the latest.
+
+    ``leave`` ends it at once (``os._exit``); without it, what takes longer is only reported.
+    """
+
+    def __init__(self, total_s: float, leave: Callable[[int], object] | None = None) -> None:
+        self.total_s = total_s
+        self.overrun: list[str] = []
+        self._leave = leave
+        self._deadlines_s: dict[str, float] = {}
+        self._limit: threading.Timer | None = None
+
+    def begin(self) -> None:
+        """Have the process end after ``total_s``, whatever still runs then."""
+        if self._limit is None and self._leave is not None:
+            self._limit = threading.Timer(self.total_s, self._give_up)
+            self._limit.daemon = True
+            self._limit.start()
+
+    async def step(self, what: str, work: Coroutine[Any, Any, Any], within_s: float, effect: str) -> None:
+        """Do one step within its time, which counts from its first begin; else report it with its ``effect``."""
+        deadline_s = self._deadlines_s.setdefault(what, time.monotonic() + within_s)
+        task = asyncio.create_task(work, name=what)
+        try:
+            done, _ = await asyncio.wait([task], timeout=max(0.0, deadline_s - time.monotonic()))
+        finally:
+            task.cancel()
+        if done:
+            task.result()
+        elif what not in self.overrun:
+            self.overrun.append(what)
+            journal.write_line(f"stopping: {what} is not done after {within_s:g} s and is left; {effect}", "MAJOR")
+
+    def leave_overrun(self) -> None:
+        """End the process now where a step was left: its thread or task would hold the end of the event loop."""
+        if self.overrun and self._leave is not None:
+            self._leave(EXIT_CODE)
+
+    def end(self) -> None:
+        """Forget the limit: all has ended."""
+        if self._limit is not None:
+            self._limit.cancel()
+
+    def _give_up(self) -> None:
+        with contextlib.suppress(Exception):  # nothing may keep it from leaving
+            journal.write_line(f"not stopped after {self.total_s:g} s: the process ends now", "MAJOR")
+        assert self._leave is not None
+        self._leave(EXIT_CODE)

@@ -1,0 +1,132 @@
+"""A loop that tries again ends when it is told to, whatever its attempt does with the cancellation."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+import pytest
+
+from fdhil.cancellation import GivenUp, end_tasks, run_attempt
+from fdhil.errors import ConnectError, DeviceError
+
+
+class Attempt:
+    """Something that waits until it is cancelled, and then does as ``ends`` says."""
+
+    def __init__(self, ends: str) -> None:
+        self.ends, self.begun, self.release = ends, asyncio.Event(), asyncio.Event()
+        self.cancellations = 0
+
+    async def __call__(self) -> None:
+        self.begun.set()
+        try:
+            async with asyncio.TaskGroup() as group:
+                group.create_task(asyncio.Event().wait())
+        except asyncio.CancelledError:
+            self.cancellations += 1
+            if self.ends == "raises":
+                raise ConnectError("can0", "went away") from None
+            if self.ends == "os error":
+                raise OSError("bad descriptor") from None
+            if self.ends == "deaf once":
+                await asyncio.shield(asyncio.Event().wait())
+            while self.ends == "deaf" and not self.release.is_set():
+                try:
+                    await self.release.wait()
+                except asyncio.CancelledError:
+                    self.cancellations += 1
+        if self.ends == "orderly":
+            raise asyncio.CancelledError
+
+
+async def tried_again(attempt: Callable[[], Coroutine[Any, Any, None]], end_s: float) -> None:
+    while True:
+        try:
+            await run_attempt("can0", attempt(), end_s)
+        except (DeviceError, OSError):
+            await asyncio.sleep(0)
+
+
+@pytest.mark.parametrize("ends", ["orderly", "raises", "os error", "returns"])
+async def test_loop_ends_at_the_first_cancellation_whatever_its_attempt_raises(ends: str) -> None:
+    attempt = Attempt(ends)
+    loop = asyncio.create_task(tried_again(attempt, 60.0))
+    await attempt.begun.wait()
+    loop.cancel()
+    await asyncio.wait([loop])
+    assert (loop.cancelled(), attempt.cancellations) == (True, 1)
+
+
+@pytest.mark.parametrize("ends", ["deaf once", "deaf"])
+async def test_loop_ends_although_its_attempt_swallows_the_cancellation(ends: str) -> None:
+    attempt = Attempt(ends)
+    loop = asyncio.create_task(tried_again(attempt, 0.02))
+    await attempt.begun.wait()
+    loop.cancel()
+    await asyncio.wait([loop])
+    assert loop.cancelled()
+    attempt.release.set()
+
+
+async def test_failure_of_a_task_group_is_no_cancellation() -> None:
+    async def fail() -> None:
+        raise ConnectError("can0", "went away")
+
+    async def group() -> None:
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(fail())
+
+    for _ in range(2):  # the first leaves the count of cancellations raised in Python 3.11
+        with pytest.raises(ExceptionGroup):
+            await run_attempt("can0", group())
+
+
+async def test_attempt_that_its_library_cancels_is_a_failure_to_be_tried_again() -> None:
+    async def given_up() -> None:
+        raise asyncio.CancelledError
+
+    with pytest.raises(GivenUp, match="given up by its library"):
+        await run_attempt("can0", given_up())
+
+
+async def test_result_is_returned_and_errors_are_raised_as_they_are() -> None:
+    async def result(error: Exception | None = None) -> int:
+        if error:
+            raise error
+        return 7
+
+    assert await run_attempt("can0", result()) == 7
+    with pytest.raises(ConnectError):
+        await run_attempt("can0", result(ConnectError("can0", "went away")))
+
+
+async def test_task_that_loses_a_cancellation_is_cancelled_again() -> None:
+    attempt = Attempt("deaf once")
+    task = asyncio.create_task(attempt())
+    await attempt.begun.wait()
+    assert await end_tasks([task], 60.0, 0.01) == set()
+    assert task.cancelled()
+
+
+async def test_tasks_that_do_not_end_in_time_are_returned() -> None:
+    attempt = Attempt("deaf")
+    task = asyncio.create_task(attempt())
+    await attempt.begun.wait()
+    assert await end_tasks([task], 0.02, 0.01) == {task}
+    attempt.release.set()
+    await asyncio.wait([task])
+
+
+async def test_second_cancellation_does_not_end_the_wait_for_the_first() -> None:
+    attempt = Attempt("deaf")
+    loop = asyncio.create_task(tried_again(attempt, 60.0))
+    await attempt.begun.wait()
+    for _ in range(2):
+        loop.cancel()
+        await asyncio.sleep(0.01)
+    assert not loop.done()
+    attempt.release.set()
+    await asyncio.wait([loop])
+    assert loop.cancelled()
