@@ -95,7 +95,11 @@ class FeedDriveBench:
         self._service = service
         self._thread = threading.Thread(target=service.run, name="feed drive bench")
         self._thread.start()
-        self.ready = self.wait_for("ready")
+        try:
+            self.ready = self.wait_for("ready")
+        except BaseException:
+            self.__exit__()
+            raise
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -17,6 +17,8 @@ from fdhil.guard.signals import KEPT
 pytest_plugins = ["tests.tiers"]
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported; as the command line does
 gc.disable()  # until all tests are collected
+# in the background of a shell it is ignored, by all that tests start too: but they send it
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # the same examples in every run; --hypothesis-profile=thorough looks for others, and for more of them;
 # quick (make mutants) does not ask which is the smallest example that fails

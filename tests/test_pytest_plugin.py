@@ -87,3 +87,18 @@ def test_the_package_tells_pytest_of_it() -> None:
 
     document = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text("utf-8"))
     assert document["project"]["entry-points"]["pytest11"] == {"fdhil": "fdhil.pytest_plugin"}
+
+
+def test_machine_that_does_not_get_ready_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The thread that serves it would keep the test run from ending."""
+    from fdhil.pytest_plugin import FeedDriveBench
+
+    def interrupted(_: FeedDriveBench, event: str) -> None:
+        raise KeyboardInterrupt(event)
+
+    monkeypatch.setattr(FeedDriveBench, "wait_for", interrupted)
+    bench = FeedDriveBench(tmp_path)
+    with pytest.raises(KeyboardInterrupt, match="ready"):
+        bench.__enter__()
+    assert bench._thread is not None
+    assert not bench._thread.is_alive()

@@ -12,8 +12,14 @@ import click
 from fdhil.cli.options import FILE, OutputFile, Writing
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from fdhil.config import MachineConfig
     from fdhil.records import Trajectory
+    from fdhil.sim.service import SimService
+
+LINGER_S = 10.0
+LOOK_S = 0.1
 
 
 @click.command(cls=Writing)
@@ -45,6 +51,7 @@ def sim(
 
     With --demand - the same lines may stand among the rows; the NC takes the bus with the first of them, and holds
     still while none comes. It ends on quit, Ctrl-C or SIGTERM; the end of standard input does not end it.
+    On SIGUSR1 it ends as soon as nobody is on its buses, after 10 s at the latest.
     """
     if demand is not None and program is not None:
         raise click.UsageError("give --demand or --program, not both")
@@ -71,9 +78,26 @@ def _serve(path: Path, as_json: bool, script: Path | None, play: Path | None, tr
 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, stop)
+    signal.signal(signal.SIGUSR1, lambda *_: _stop_when_left(service, stop))
     sys.setswitchinterval(0.0005)  # the SYNC must not wait 5 ms for the thread that serves the sensors
     gc.freeze()  # what is there now stays; the collector need not look at it between two SYNCs
     service.run(play, trace)
+
+
+def _stop_when_left(service: SimService, stop: Callable[[], None]) -> None:
+    """Serve on until nobody is on the buses any more: who corrects comes to zero first; LINGER_S at the most."""
+    import signal
+    import time
+
+    end_s = time.monotonic() + LINGER_S
+
+    def look(*_: object) -> None:
+        if not service.is_joined or time.monotonic() > end_s:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            stop()
+
+    signal.signal(signal.SIGALRM, look)
+    signal.setitimer(signal.ITIMER_REAL, LOOK_S, LOOK_S)
 
 
 def _load(path: Path, machine: MachineConfig) -> Trajectory:

@@ -11,7 +11,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Coroutine
-from dataclasses import dataclass, fields
+from dataclasses import astuple, dataclass
 from typing import Any
 
 from fdhil.daemon import journal
@@ -33,7 +33,7 @@ class Budgets:
     @property
     def total_s(self) -> float:
         """After how long the process ends, whatever has not."""
-        return sum(getattr(self, each.name) for each in fields(self)) + TEARDOWN_S
+        return sum(astuple(self)) + TEARDOWN_S
 
 
 class Shutdown:

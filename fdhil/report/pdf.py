@@ -9,6 +9,7 @@ import tempfile
 from pathlib import Path
 from typing import IO
 
+from fdhil.child import ending_with_parent
 from fdhil.errors import FdhilError
 from fdhil.report.page import Page, html, write
 from fdhil.store.output import open_output
@@ -65,7 +66,7 @@ def run_browser(browser: str, folder: Path, *arguments: str, output: IO[str] | N
     command = [browser, *SWITCHES, *sandbox, f"--user-data-dir={folder / 'profile'}", *arguments]
     try:
         ended = subprocess.run(
-            command,
+            ending_with_parent(command),
             stdout=output or subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,

@@ -226,6 +226,11 @@ class SimService:
         self._ending = True
         self._pipe.wake()
 
+    @property
+    def is_joined(self) -> bool:
+        """Whether anybody is on its buses, as far as that shows."""
+        return any(bus.is_joined for bus in self._buses.values())
+
     def run(self, play: Path | None = None, trace: Path | None = None) -> None:
         """Say that it is ready and serve until stopped. ``play`` is played at once, recorded to ``trace``.
 

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import select
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from fdhil import config as machine_config
 from fdhil.cli.demo import _realistic, realistic_page
@@ -76,3 +82,32 @@ def test_what_was_believed_stands_beside_the_truth() -> None:
     told = _realistic(believed)
     assert told["axes"]["X"]["terms"] == {"load": 2.5}
     assert [cut["label"] for cut in told["cuts"]] == ["uncorrected", "inverse"]
+
+
+RUNNING = """
+import sys
+from pathlib import Path
+from fdhil.child import stopping_in_order
+from fdhil.cli.demo import loop
+from fdhil.cli.demo.machines import machine_document
+loop._commission = lambda stage: None  # nothing is armed here
+with stopping_in_order(), loop.running(Path(sys.argv[1]), False, lambda text: None, machine_document()) as stage:
+    loop._await(lambda: stage.ask("status")["may_stand"]["nothing"], "the guard did not read the drives", stage)
+    print(stage.twin.pid, *(process.pid for process in stage.others), flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_machine_guard_and_daemon_end_with_the_demonstration(number: signal.Signals, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", RUNNING, str(tmp_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as demo:
+        assert demo.stdout is not None
+        children = [os.pidfd_open(int(pid)) for pid in demo.stdout.readline().split()]
+        assert len(children) == 3
+        demo.send_signal(number)
+        for child in children:
+            select.select([child], (), ())
+            os.close(child)
+        demo.communicate()
+    assert (tmp_path / "daemon.log").read_text().splitlines()[-1].endswith("stopped, offset 0")

@@ -112,7 +112,12 @@ async def test_disk_that_does_not_answer_is_reported_and_left(
 
 def test_process_that_has_not_stopped_in_time_is_ended() -> None:
     left, ended = list[int](), threading.Event()
-    shutdown = Shutdown(0.0, lambda code: (left.append(code), ended.set()))
+
+    def leave(code: int) -> None:
+        left.append(code)
+        ended.set()
+
+    shutdown = Shutdown(0.0, leave)
     shutdown.begin()
     shutdown.begin()
     ended.wait()

@@ -17,6 +17,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, Self
 
+from fdhil.child import ending_with_parent
 from tests.program.linuxcnc_machine import AXIS, MACHINE, NOBODY
 from tests.sim.twin_process import TwinProcess
 
@@ -66,9 +67,16 @@ class LinuxCnc:
     ) -> subprocess.Popen[bytes]:
         """Start a command in a group of its own, as somebody else if this is root: LinuxCNC refuses to run as root."""
         if os.geteuid() == 0:
-            command = ("setpriv", f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups", *command)
+            command = (
+                "setpriv",
+                "--pdeathsig=TERM",
+                f"--reuid={NOBODY}",
+                f"--regid={NOBODY}",
+                "--clear-groups",
+                *command,
+            )
         return subprocess.Popen(
-            command,
+            ending_with_parent(command),
             cwd=self.folder,
             env=environment,
             stdin=subprocess.DEVNULL,

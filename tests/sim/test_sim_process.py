@@ -203,6 +203,16 @@ def test_lockstep_waits_for_a_client_that_answers_every_sync(tmp_path: Path) -> 
     assert first["X_offset_um"][3:] == pytest.approx(expected[3:], abs=1e-5)
 
 
+def test_machine_whose_operator_has_died_serves_until_its_bus_is_left(tmp_path: Path) -> None:
+    with TwinProcess(write_config(tmp_path)) as twin:
+        with twin.join() as bus:
+            twin.send_signal(signal.SIGUSR1)
+            for _ in range(3):
+                while frames_of(bus, 1)[0][0] != 0x701:  # it lives on, and its heartbeat with it
+                    pass
+        assert twin.wait() == (0, "")
+
+
 def test_lockstep_waits_for_a_client_whose_offset_is_zero_while_a_program_runs(tmp_path: Path) -> None:
     """A guard is held up while the offset that it sends is still 0: the program does not run on without it."""
     path = write_config(tmp_path, 'pace = "lockstep"\nlockstep_rpdo = ["X:2"]')

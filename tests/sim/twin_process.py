@@ -15,6 +15,7 @@ from typing import Any
 
 import can
 
+from fdhil.child import ending_with_parent
 from tests.bench import axis_toml, bench_toml
 
 COMMAND = [sys.executable, "-m", "fdhil.cli.main", "sim"]
@@ -36,7 +37,7 @@ class TwinProcess:
 
     def __init__(self, *arguments: object) -> None:
         self._process = subprocess.Popen(
-            [*COMMAND, *map(str, arguments), "--json"],
+            ending_with_parent([*COMMAND, *map(str, arguments), "--json"], signal.SIGUSR1),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -59,8 +60,12 @@ class TwinProcess:
     def end(self, number: int = signal.SIGTERM) -> tuple[int, str]:
         """Send a signal unless it has ended; return the exit code and what it said on standard error."""
         if self._process.poll() is None:
-            self._process.send_signal(number)
+            self.send_signal(number)
         return self.wait()
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal."""
+        self._process.send_signal(number)
 
     def wait(self) -> tuple[int, str]:
         """Wait for the end; return the exit code and what was said on standard error."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fdhil.child import stopping_in_order
 from fdhil.cli.options import FOLDER
 
 if TYPE_CHECKING:
@@ -44,8 +45,9 @@ def demo(out: Path, realtime: bool, pdf: bool, as_json: bool) -> None:
 
     if pdf:
         find_browser()  # said before the work, not after it
-    loop = run_loop(out, realtime, say)
-    realistic = run_realistic(out / "realistic", realtime, say)
+    with stopping_in_order():
+        loop = run_loop(out, realtime, say)
+        realistic = run_realistic(out / "realistic", realtime, say)
     report = out / "report.html"
     laid_out = page(loop, [realistic_page.headline(realistic)], [realistic_page.section(realistic)])
     deliver(laid_out, report, report.with_suffix(".pdf") if pdf else None)

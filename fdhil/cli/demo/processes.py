@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import queue
+import signal
 import subprocess
 import sys
 import threading
@@ -13,6 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from fdhil.child import ending_with_parent
 from fdhil.errors import ConnectError, DeviceTimeout
 
 PATIENCE_S = 900.0  # a process that ended is told at once; this only ends what hangs, on however busy a host
@@ -24,16 +26,20 @@ class Process:
     ConnectError when it ends before it is ready, DeviceTimeout when an awaited event does not come.
     """
 
-    def __init__(self, name: str, arguments: list[str], log: Path) -> None:
+    def __init__(
+        self, name: str, arguments: list[str], log: Path, death_signal: signal.Signals = signal.SIGTERM
+    ) -> None:
+        """Start it; it gets ``death_signal`` when this process ends without stopping it."""
         self.name = name
         self._log = log
         with log.open("ab") as errors:
             self._child = subprocess.Popen(
-                [sys.executable, "-m", *arguments],
+                ending_with_parent([sys.executable, "-m", *arguments], death_signal),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 text=True,
+                start_new_session=True,  # Ctrl-C is for this process, which stops the others in their order
             )
         self._lines: queue.Queue[str | None] = queue.Queue()
         self._reader = threading.Thread(target=self._read, name=f"{name} events", daemon=True)
@@ -112,7 +118,8 @@ class Twin(Process):
     """The simulated machine with its operator's panel; ``ready`` is its first event."""
 
     def __init__(self, config: Path, log: Path) -> None:
-        super().__init__("simulated machine", ["fdhil", "sim", str(config), "--json"], log)
+        # where this process is killed it serves until guard and daemon have left the bus
+        super().__init__("simulated machine", ["fdhil", "sim", str(config), "--json"], log, signal.SIGUSR1)
         try:
             self.ready: Mapping[str, Any] = self.event("ready")
         except BaseException:

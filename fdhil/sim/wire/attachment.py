@@ -39,6 +39,11 @@ class Attachment(ABC):
         """Whether the bus takes no more for the moment."""
         return False
 
+    @property
+    def is_joined(self) -> bool:
+        """Whether anybody else is on the bus; True where that does not show."""
+        return True
+
     @abstractmethod
     def readers(self) -> Sequence[Selectable]:
         """Return those to select for reading."""

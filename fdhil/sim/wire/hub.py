@@ -107,6 +107,10 @@ class Hub(Attachment):
         return any(len(client.outbox) > self._queue_bytes for client in self._clients)
 
     @property
+    def is_joined(self) -> bool:
+        return bool(self._clients)
+
+    @property
     def clients(self) -> int:
         """How many clients hear the bus."""
         return sum(client.raw for client in self._clients)

@@ -1,0 +1,60 @@
+"""Starts child processes that end with the process that started them, also when that one is killed.
+
+As a script (``python child.py PARENT SIGNAL COMMAND...``) it has the kernel send it a signal at its parent's death and
+becomes the command. That signal comes when the thread that started the child ends: start children from a thread that
+lives as long as they do. What changes its user (setpriv, sudo) loses it.
+"""
+
+import ctypes
+import os
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+PR_SET_PDEATHSIG = 1  # linux/prctl.h
+ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+def ending_with_parent(command: Sequence[str], number: signal.Signals = signal.SIGTERM) -> list[str]:
+    """Return the command that runs ``command`` and gets the signal when this process ends, however it ends."""
+    return [sys.executable, "-I", "-S", __file__, str(os.getpid()), str(int(number)), *command]
+
+
+@contextmanager
+def stopping_in_order() -> Iterator[None]:
+    """Raise KeyboardInterrupt once for SIGTERM, SIGHUP or Ctrl-C, so that with blocks end the children in their order.
+
+    A second signal does not disturb that; what is ignored (nohup) stays so. Of the main thread alone.
+    """
+    caught = [number for number in ENDING_SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+
+    def stop(*_: object) -> None:
+        for number in caught:
+            signal.signal(number, lambda *_: None)
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, stop) for number in caught}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def main(parent: str, number: str, *command: str) -> None:
+    """Become the command, unless the parent has ended already."""
+    for each in (int(number), signal.SIGPIPE, signal.SIGXFSZ):  # Python ignores the last two; the command must not
+        signal.signal(each, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [int(number)])
+    ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, int(number), 0, 0, 0)
+    if os.getppid() != int(parent):  # it ended before it could be noticed
+        sys.exit(1)
+    try:
+        os.execvp(command[0], command)
+    except OSError as error:
+        sys.exit(f"{command[0]} cannot be started: {error.strerror}")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

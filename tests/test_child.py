@@ -1,0 +1,99 @@
+"""A child process ends with the process that started it, however that one ends."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fdhil import child
+from fdhil.child import ending_with_parent, stopping_in_order
+
+ENDED = [sys.executable, "-c", "import sys; sys.stdin.read()"]
+PARENT = """
+import os, subprocess, sys
+from fdhil.child import ending_with_parent
+code = "import signal, sys; print('up', flush=True); signal.pause()"
+subprocess.Popen(ending_with_parent([sys.executable, "-c", code]), stdin=subprocess.DEVNULL)
+sys.stdin.read()
+"""
+
+
+@pytest.fixture(autouse=True)
+def _hang_up_is_not_ignored() -> Iterator[None]:
+    """Undo what nohup has done, also for what is started here."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, None])
+def test_child_ends_when_its_parent_ends(number: signal.Signals | None) -> None:
+    parent = subprocess.Popen([sys.executable, "-c", PARENT], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert parent.stdin is not None
+    assert parent.stdout is not None
+    assert parent.stdout.readline() == b"up\n"
+    if number is None:
+        parent.stdin.close()
+    else:
+        parent.send_signal(number)
+    assert parent.stdout.read() == b""  # the end: neither has it open any more
+    parent.stdin.close()
+    parent.stdout.close()
+    parent.wait()
+
+
+def test_child_of_a_parent_that_has_ended_already_is_not_started(tmp_path: Path) -> None:
+    with subprocess.Popen(ENDED, stdin=subprocess.PIPE) as ended:
+        ended.communicate()
+    command = [*ending_with_parent([])[:4], str(ended.pid), "15", "touch", str(tmp_path / "started")]
+    assert subprocess.run(command).returncode == 1
+    assert not [*tmp_path.iterdir()]
+
+
+def test_child_has_the_defaults_of_a_pipe_and_of_the_signal_that_ends_it() -> None:
+    before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    try:
+        status = subprocess.check_output(ending_with_parent(["cat", "/proc/self/status"]), text=True)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    ignored = int(next(line.split()[1] for line in status.splitlines() if line.startswith("SigIgn")), 16)
+    assert not ignored & (1 << (signal.SIGPIPE - 1) | 1 << (signal.SIGTERM - 1))
+
+
+def test_command_that_is_not_there_is_named() -> None:
+    done = subprocess.run(ending_with_parent(["/nowhere/tool"]), capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (1, "/nowhere/tool cannot be started: No such file or directory\n")
+
+
+@pytest.mark.parametrize("number", child.ENDING_SIGNALS)
+def test_first_signal_is_raised_and_a_second_does_not_disturb_what_ends(number: signal.Signals) -> None:
+    before = {each: signal.getsignal(each) for each in child.ENDING_SIGNALS}
+    ended = []
+
+    def interrupted() -> None:
+        try:
+            os.kill(os.getpid(), number)
+        finally:
+            for each in child.ENDING_SIGNALS:
+                os.kill(os.getpid(), each)
+            ended.append(True)
+
+    with pytest.raises(KeyboardInterrupt), stopping_in_order():
+        interrupted()
+    assert ended
+    assert {each: signal.getsignal(each) for each in child.ENDING_SIGNALS} == before
+
+
+def test_signal_that_is_ignored_stays_so() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with stopping_in_order():
+            os.kill(os.getpid(), signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, before)
