@@ -33,7 +33,7 @@ class Budgets:
     @property
     def total_s(self) -> float:
         """After how long the process ends, whatever has not."""
-        return sum(astuple(self)) + TEARDOWN_S
+        return float(sum(astuple(self))) + TEARDOWN_S
 
 
 class Shutdown:
