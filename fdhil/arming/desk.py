@@ -82,6 +82,10 @@ class ArmingDesk:
         self._token = ensure_token(self._run_directory)
         self.knowledge.begin(newest, skills)
 
+    def restore_token(self) -> None:
+        """Write the token again where it was cleaned away (blocking). DeviceError when it cannot be kept secret."""
+        ensure_token(self._run_directory, self._token)
+
     def hear(self, samples: AxisSamples) -> None:
         """Take samples: those of a pass of the armed program are compared with what was predicted."""
         self._passes.take(samples)

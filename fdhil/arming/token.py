@@ -53,26 +53,27 @@ def check_rights(run_directory: Path) -> None:
             raise DeviceError(str(run_directory), text)
 
 
-def ensure_token(run_directory: Path) -> str:
+def ensure_token(run_directory: Path, lost: str = "") -> str:
     """Return the token of a run directory; make one where there is none. DeviceError when it cannot be kept secret.
 
+    ``lost`` is the token that was there, which the guard knows: it is written again.
     It is there whole or not at all, whatever ends this process; of two who make one at once the first one's is taken.
     """
     path = run_directory / TOKEN_NAME
     try:
         if not path.is_symlink() and not path.exists():
-            _make_token(path)
+            _make_token(path, lost or secrets.token_hex(32))
     except OSError as error:
         raise DeviceError(str(path), f"cannot be written: {error.strerror}; check [store] run_directory") from None
     return read_token(run_directory)
 
 
-def _make_token(path: Path) -> None:
+def _make_token(path: Path, token: str) -> None:
     descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)  # mode 0600
     made = Path(name)
     try:
         try:
-            write_all(descriptor, secrets.token_hex(32).encode())
+            write_all(descriptor, token.encode())
             os.fsync(descriptor)
         finally:
             os.close(descriptor)

@@ -22,9 +22,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from fdhil.arming.answers import ABANDONED, Answer, refusal
+from fdhil.arming.token import make_directory
+from fdhil.cancellation import END_S, end_tasks
 from fdhil.config import Access
 from fdhil.daemon.peers import Peer, listen, peer_of
-from fdhil.errors import ConnectError, DeviceTimeout, FdhilError
+from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, FdhilError
 from fdhil.guard.peers import Role
 
 SOCKET_NAME = "daemon.sock"
@@ -33,11 +35,13 @@ MAX_CLIENTS = 16
 RESERVE = 4  # more, for who must be heard while all others wait for their answers
 ALWAYS_HEARD = ("disarm", "status")
 IDLE_S = 60.0
+LOOK_S = 1.0  # for the name of the socket
 PROGRESS_S = 0.5
 
 Handler = Callable[[Mapping[str, Any], Peer], Awaitable[Answer]]
 Progress = Callable[[], Mapping[str, Any] | None]
 Stream = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
+FileId = tuple[int, int]
 Done = TypeVar("Done")
 
 
@@ -51,13 +55,16 @@ class ControlServer:
         abandon: Callable[[], object],
         access: Access,
         live: Stream | None = None,
+        lost: Callable[[str], Awaitable[object]] | None = None,
     ) -> None:
         """``progress`` tells how far what takes long is, ``abandon`` ends it; ``access`` says who may come.
+
+        ``lost`` is called when the socket's name has gone: with "" where it was made again, else with why it cannot be.
 
         ``live`` serves a connection after the answer that opens it as a stream.
         """
         self._handle, self._progress, self._abandon, self._access = handle, progress, abandon, access
-        self._live = live
+        self._live, self._lost = live, lost
         # the clients in the order of their last answers, the longest idle first, and those that wait for one
         self._clients: dict[asyncio.Task[None], None] = {}
         self._busy: set[asyncio.Task[None]] = set()
@@ -76,16 +83,49 @@ class ControlServer:
         except OSError as error:
             text = f"cannot be opened: {error.strerror or error}; set another [store] run_directory"
             raise ConnectError(str(path), text) from None
-        server = await asyncio.start_unix_server(self._accept, sock=listener, limit=MAX_LINE)
+        self._server = await self._served(listener)
+        keeping = asyncio.create_task(self._keep_name(path, _name_of(path)), name="control socket")
         try:
             yield
         finally:
-            server.close()
+            await end_tasks([keeping], END_S)
+            self._server.close()
             for task in list(self._clients):
                 task.cancel()
             await asyncio.gather(*self._clients, return_exceptions=True)
             with contextlib.suppress(OSError):  # the next daemon takes the place of one that stays
                 path.unlink()
+
+    async def _served(self, listener: socket.socket) -> asyncio.Server:
+        return await asyncio.start_unix_server(self._accept, sock=listener, limit=MAX_LINE)
+
+    async def _keep_name(self, path: Path, name: FileId | None) -> None:
+        """Make the socket again where its name leads elsewhere, as in a run directory that was cleaned."""
+        while True:
+            listener = await self._renewed(path, name)
+            before, self._server = self._server, await self._served(listener)
+            before.close()
+            name = await asyncio.to_thread(_name_of, path)
+            await self._tell_lost("")
+
+    async def _renewed(self, path: Path, name: FileId | None) -> socket.socket:
+        """Wait until the name is gone, and return the listener that takes its place as soon as there can be one."""
+        trouble = ""
+        while True:
+            await asyncio.sleep(LOOK_S)
+            if name is not None and await asyncio.to_thread(_name_of, path) == name:
+                continue
+            try:
+                await asyncio.to_thread(make_directory, path.parent)
+                return await asyncio.to_thread(listen, path, self._access)
+            except (DeviceError, OSError) as error:
+                if not trouble:
+                    trouble = str(error)
+                    await self._tell_lost(trouble)
+
+    async def _tell_lost(self, trouble: str) -> None:
+        if self._lost is not None:
+            await self._lost(trouble)
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
@@ -171,6 +211,15 @@ class ControlServer:
         except FdhilError as error:
             text, _, advice = str(error).partition("; ")
             return refusal(type(error).__name__, text, advice) | {"exit_code": error.exit_code}
+
+
+def _name_of(path: Path) -> FileId | None:
+    """Return what identifies the file at a path, None where there is none."""
+    try:
+        found = path.lstat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
 
 
 def _hung_up(writer: asyncio.StreamWriter) -> bool:

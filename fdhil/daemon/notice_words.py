@@ -30,6 +30,10 @@ WORDS: Mapping[str, tuple[str, str]] = {
     "StreamRefused": ("the correction ends early, ramped to zero", "see the refusal in the text, then arm again"),
     "PassMeasured": ("the pass has been cut as it was", "where it was worse than predicted, identify again"),
     "GuardTripped": ("the correction was ended by the guard", "see the cause, then arm again when it is wanted"),
+    "SocketLost": (
+        "a running correction is ramped to zero where nobody could ask for that any more",
+        "keep the run directory from being cleaned (tmpfiles.d); where it could not be made again, see its rights",
+    ),
     "BlackBox": ("none: the frames around a stop are kept", "look at it on the page events, or with candump's tools"),
     # what is heard of the machine
     "SourceLost": ("nothing is heard, so nothing is identified meanwhile", "see the cause in the text"),

@@ -31,6 +31,7 @@ from fdhil.daemon.lock import sole_owner
 from fdhil.daemon.notify import notify
 from fdhil.daemon.offer_watch import OfferWatch
 from fdhil.daemon.outcome_store import OutcomeStore
+from fdhil.daemon.reachability import reach_again
 from fdhil.daemon.record_queue import RecordQueue
 from fdhil.daemon.resources import ResourceWatch, Use, uses
 from fdhil.daemon.shutdown import Budgets, Shutdown
@@ -78,7 +79,9 @@ class Service:
         self._gate = journal.FloodGate()
         self._audit = Audited(self._handle, config.store.directory)
         desk, access = self._desk, config.access
-        self._control = ControlServer(self._audit.of, lambda: desk.checking, desk.abandon, access, self._live.serve)
+        self._control = ControlServer(
+            self._audit.of, lambda: desk.checking, desk.abandon, access, self._live.serve, self._socket_lost
+        )
         self._acquisition = Acquisition(config, open_source, self._watch.hearing, self._tell)
         self._stop = asyncio.Event()
         self._budgets = budgets or Budgets()
@@ -321,6 +324,9 @@ class Service:
             return {"ok": True, "text": "stopping"}
         text = f"{request['request']!r} is no request"
         return refusal("BadRequest", text, "send status, live, arm, disarm, acknowledge or stop")
+
+    async def _socket_lost(self, trouble: str) -> None:
+        self._tell([await reach_again(self._desk, trouble)])
 
     def _status(self) -> Answer:
         counters = dict(self._acquisition.source.counters()) if self._acquisition.source is not None else {}

@@ -29,13 +29,18 @@ MAX_LINE_BYTES = 1 << 15
 MOST_DESCRIPTORS = 253  # the kernel's limit: what does not fit the buffer would be closed in this thread
 ANCILLARY_BYTES = socket.CMSG_SPACE(MOST_DESCRIPTORS * 4)
 
+LOOK_S = 1.0  # for the name of the socket
 AT_ONCE = struct.pack("ii", 1, 0)
 
 
 class Closer:
-    """Closes what clients sent or left, in a thread: closing a hung server's file may wait. No socket lingers."""
+    """Closes what clients sent or left, in a thread: closing a hung server's file may wait. No socket lingers.
 
-    def __init__(self) -> None:
+    ``look`` is called in that thread at least every LOOK_S.
+    """
+
+    def __init__(self, look: Callable[[], None] = lambda: None) -> None:
+        self._look = look
         self._left: queue.SimpleQueue[int | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="closer", daemon=True)
         self._thread.start()  # now: later there may be no room for a thread
@@ -45,7 +50,14 @@ class Closer:
         self._left.put(descriptor)
 
     def _run(self) -> None:
-        while (descriptor := self._left.get()) is not None:
+        while True:
+            self._look()
+            try:
+                descriptor = self._left.get(timeout=LOOK_S)
+            except queue.Empty:
+                continue
+            if descriptor is None:
+                return
             with contextlib.suppress(OSError):  # it is no socket
                 sent = socket.socket(fileno=descriptor)
                 try:
@@ -144,6 +156,63 @@ class Client:
         self.closer.take(self.socket.detach())
 
 
+class Listener:
+    """A listening socket at ``path``; where its name has gone (a cleaned run directory) it is made again.
+
+    ``lost`` says why that cannot be done, empty while nothing is lost. OSError when it cannot be made at all.
+    """
+
+    def __init__(self, path: Path, shared: bool) -> None:
+        self.lost = ""
+        self._path, self._mode = path, 0o660 if shared else 0o600
+        self._name = (0, 0)
+        self._renewed: socket.socket | None = None
+        self.socket = self._made()
+
+    def _made(self) -> socket.socket:
+        made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            os.fchmod(made.fileno(), 0o600)  # from the beginning, whatever the umask
+            self._path.unlink(missing_ok=True)  # the bus lock is ours already: no other guard listens here
+            made.bind(str(self._path))
+            self._path.chmod(self._mode)
+            made.listen(MAX_CLIENTS)
+            made.setblocking(False)
+            found = self._path.lstat()
+            self._name = found.st_dev, found.st_ino
+        except OSError:
+            made.close()
+            raise
+        return made
+
+    def look(self) -> None:
+        """Make the socket again where its name leads elsewhere; what disks have to do with it may wait."""
+        if self._renewed is not None or self._is_there():
+            self.lost = ""
+            return
+        folder = self._path.parent
+        try:
+            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            if folder.stat().st_mode & 0o002:
+                raise PermissionError(0, "anybody may write to its folder")
+            self._renewed, self.lost = self._made(), ""
+        except OSError as error:
+            self.lost = error.strerror or str(error)
+
+    def _is_there(self) -> bool:
+        try:
+            found = self._path.lstat()
+        except OSError:
+            return False
+        return (found.st_dev, found.st_ino) == self._name
+
+    def renew(self) -> None:
+        """Take the socket that was made again, if there is one."""
+        if self._renewed is not None:
+            self.socket.close()
+            self.socket, self._renewed = self._renewed, None
+
+
 class Control:
     """The listening socket ``guard.sock`` and its clients; DeviceError when it cannot be made.
 
@@ -155,25 +224,21 @@ class Control:
         self.path = run_directory / SOCKET_NAME
         self.clients: list[Client] = []
         self._access, self._turned_away = access, turned_away
-        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
-            self.path.unlink(missing_ok=True)  # the bus lock is ours already: no other guard listens here
-            mask = os.umask(0o117 if access.shared else 0o177)
-            try:
-                self._listener.bind(str(self.path))
-            finally:
-                os.umask(mask)
-            self._listener.listen(MAX_CLIENTS)
+            self._listener = Listener(self.path, access.shared)
         except OSError as error:
-            self._listener.close()
             text = f"the control socket cannot be made ({error.strerror or error}), and nothing is sent"
             raise DeviceError(str(self.path), f"{text}; check the run directory") from None
-        self._listener.setblocking(False)
-        self._closer = Closer()
+        self._closer = Closer(self._listener.look)
 
     def fileno(self) -> int:
         """The listener's descriptor, for poll."""
-        return self._listener.fileno()
+        return self._listener.socket.fileno()
+
+    @property
+    def lost(self) -> str:
+        """Why nobody can connect any more, empty while anybody can."""
+        return self._listener.lost
 
     @property
     def pending(self) -> bool:
@@ -182,6 +247,7 @@ class Control:
 
     def register(self, poll: select.poll) -> None:
         """Have ``poll`` look at the listener and at every client: what it sends, or whether it takes its answer."""
+        self._listener.renew()
         poll.register(self, select.POLLIN)
         for client in self.clients:
             poll.register(client, select.POLLOUT if client.outbox else select.POLLIN)
@@ -205,7 +271,7 @@ class Control:
     def _accept(self, now_s: float) -> None:
         """Take one connection of who may talk; when there are too many, the one that was silent longest ends."""
         try:
-            connection, _ = self._listener.accept()
+            connection, _ = self._listener.socket.accept()
         except OSError:
             return
         connection.setblocking(False)
@@ -235,6 +301,7 @@ class Control:
             client.close()
         self.clients = []
         self._closer.end()
-        self._listener.close()
+        self._listener.renew()
+        self._listener.socket.close()
         with contextlib.suppress(OSError):
             self.path.unlink()

@@ -69,6 +69,7 @@ class Guard:
         self._rested_s = 0.0
         self._silent, self._put_off = True, False
         self._stopping = False
+        self._lost = ""
         self._lost_seen = 0
         self._restore_s = 0.0
         self._refused_s, self._refused = -REFUSED_S, 0
@@ -124,8 +125,18 @@ class Guard:
         self._local_timer()
         if self._wake.fileno() in ready:
             self._stop()
+        if self.control.lost != self._lost:
+            self._unreachable()
         if rest_s <= 0:
             self._serve(ready - {self._can.fileno(), self._wake.fileno()})
+
+    def _unreachable(self) -> None:
+        """Nobody can ask for zero where the control socket has no name: ramp to it now."""
+        self._lost = self.control.lost
+        if self._lost:
+            text = f"the control socket is gone and cannot be made again ({self._lost}): what is on is ramped to zero"
+            self._journal.write("unreachable", text=f"{text}; make the run directory again")
+            self._requests.append((None, {}, Request("disarm")))
 
     def _wait(self, rest_s: float) -> set[int]:
         """Wait for the bus and for signals; for the clients too, unless they rest."""
