@@ -25,6 +25,7 @@ from fdhil.config.publish import OpcUaServer
 from fdhil.config.users import User as KnownUser
 from fdhil.config.users import matches, read_users
 from fdhil.errors import ConnectError
+from fdhil.shopfloor.opcua_subscriptions import ReportedValues
 
 NAME = "OPC UA server"
 ANYONE = User(role=UserRole.Anonymous)
@@ -90,7 +91,14 @@ class Doorkeeper(UserManager):
 
 
 class Visit(InternalSession):
-    """A client's session, which tells the doorkeeper where its client is."""
+    """A client's session, which tells the doorkeeper where its client is, and its client each change."""
+
+    async def create_subscription(self, *given: Any, **named: Any) -> ua.CreateSubscriptionResult:
+        """Make a subscription without items yet."""
+        made = await super().create_subscription(*given, **named)
+        subscription = self.subscription_service.subscriptions[made.SubscriptionId]
+        subscription.monitored_item_srv = ReportedValues(subscription, self.aspace)
+        return made
 
     def activate_session(self, *given: Any) -> Any:
         """Ask the doorkeeper whether it is let in; nothing else is done meanwhile."""

@@ -25,6 +25,7 @@ from fdhil.shopfloor.news import Listener
 from fdhil.shopfloor.opcua import Served, publish, serving
 from fdhil.shopfloor.opcua_nodes import OWN
 from fdhil.shopfloor.opcua_security import Doorkeeper
+from fdhil.shopfloor.opcua_subscriptions import is_news
 from fdhil.shopfloor.published import AXIS, BUS, MACHINE
 from tests.daemon.machine import Machine, config_of
 from tests.daemon.test_service import serving as daemon_serving
@@ -169,6 +170,74 @@ async def test_what_is_not_known_has_a_bad_quality_and_so_has_all_while_the_daem
     await stage.say(status())
     await until(lambda: heard.values == [0.5, None, 0.5])
     await subscription.delete()
+
+
+async def with_offset(stage: Stage, um: float) -> None:
+    answer = status()
+    answer["guard"]["offset_um"] = {"X": um, "Y": 0.0}
+    await stage.say(answer)
+
+
+async def test_client_with_a_deadband_is_told_what_creeps_and_that_the_daemon_is_silent(
+    stage: Stage, client: Client
+) -> None:
+    heard, text = Heard(), Heard()
+    await with_offset(stage, 1.0)
+    subscription, other = await client.create_subscription(20, heard), await client.create_subscription(20, text)
+    await subscription.deadband_monitor(await own(client, "X.offset"), ua.Double(0.5))
+    await other.deadband_monitor(await own(client, "state"), ua.Double(0.5))  # no number: each change
+    await until(lambda: heard.values == [1.0])
+    for creeping in (1.2, 1.4, 1.6, 1.8, 2.0, 2.2):
+        await with_offset(stage, creeping)
+    await until(lambda: heard.values == [1.0, 1.6, 2.2])
+    await stage.say(None)
+    await until(lambda: heard.values == [1.0, 1.6, 2.2, None])
+    await with_offset(stage, 2.2)
+    await until(lambda: heard.values == [1.0, 1.6, 2.2, None, 2.2])
+    await until(lambda: text.values == ["ACTIVE", None, "ACTIVE"])
+    await subscription.delete()
+    await other.delete()
+
+
+GOOD, BAD = ua.StatusCode(), ua.StatusCode(ua.UInt32(ua.StatusCodes.BadNoCommunication))
+TRIGGER, BAND = ua.DataChangeTrigger, ua.DeadbandType
+
+
+def at(value: Any, quality: ua.StatusCode | None = GOOD, second: int = 0) -> ua.DataValue:
+    return ua.DataValue(ua.Variant(value), StatusCode=quality, SourceTimestamp=ua.DateTime(2026, 1, 1, 0, 0, second))
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "trigger", "band", "told"),
+    [
+        (None, at(1.0), TRIGGER.Status, None, True),
+        (at(1.0), at(1.0), TRIGGER.StatusValue, None, False),
+        (at(1.0), at(1.1), TRIGGER.StatusValue, None, True),
+        (at(1.0), at(1.1), TRIGGER.Status, None, False),
+        (at(1.0), at(None, BAD), TRIGGER.Status, None, True),
+        (at(1.0), at(1.0, BAD), TRIGGER.StatusValue, 9.0, True),
+        (at(1.0), ua.DataValue(StatusCode=BAD), TRIGGER.StatusValue, 9.0, True),
+        (at(1.0, None), at(1.0), TRIGGER.StatusValue, None, False),
+        (at(1.0), at(1.5), TRIGGER.StatusValue, 0.5, False),
+        (at(1.0), at(1.6), TRIGGER.StatusValue, 0.5, True),
+        (at(1.0), at(0.4), TRIGGER.StatusValue, 0.5, True),
+        (at(1.0), at(float("nan")), TRIGGER.StatusValue, 0.5, True),
+        (at(1), at(2), TRIGGER.StatusValue, 1.0, False),
+        (at(False), at(True), TRIGGER.StatusValue, 5.0, True),
+        (at("a"), at("b"), TRIGGER.StatusValue, 5.0, True),
+        (at(1.0), at(1.0, second=1), TRIGGER.StatusValue, None, False),
+        (at(1.0), at(1.0, second=1), TRIGGER.StatusValueTimestamp, None, True),
+        (at(1.0), at(1.1, second=1), TRIGGER.StatusValueTimestamp, 0.5, False),
+    ],
+)
+async def test_a_client_is_told_each_change_of_what_it_was_told_last(
+    before: ua.DataValue | None, now: ua.DataValue, trigger: ua.DataChangeTrigger, band: float | None, told: bool
+) -> None:
+    kind = BAND.None_ if band is None else BAND.Absolute
+    assert is_news(before, now, ua.DataChangeFilter(trigger, kind, band or 0.0)) is told
+    if trigger is TRIGGER.StatusValue and band is None:
+        assert is_news(before, now) is told
+        assert is_news(before, now, ua.DataChangeFilter(trigger, BAND.Percent, 50.0)) is told
 
 
 async def subscribed(client: Client, heard: Heard, at: str = "messages") -> Any:
