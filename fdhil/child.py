@@ -42,14 +42,19 @@ def stopping_in_order() -> Iterator[None]:
             signal.signal(number, handler)
 
 
+def end_with(parent: int, number: int = signal.SIGTERM) -> None:
+    """Have the kernel send this process a signal when its parent ends; exit where it has ended already."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number, 0, 0, 0)
+    if os.getppid() != parent:
+        sys.exit(1)
+
+
 def main(parent: str, number: str, *command: str) -> None:
     """Become the command, unless the parent has ended already."""
     for each in (int(number), signal.SIGPIPE, signal.SIGXFSZ):  # Python ignores the last two; the command must not
         signal.signal(each, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [int(number)])
-    ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, int(number), 0, 0, 0)
-    if os.getppid() != int(parent):  # it ended before it could be noticed
-        sys.exit(1)
+    end_with(int(parent), int(number))
     try:
         os.execvp(command[0], command)
     except OSError as error:

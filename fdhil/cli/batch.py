@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from fdhil.child import end_with
 from fdhil.cli.compiling import forewarn
 from fdhil.cli.failing import error_document
 from fdhil.config import Axis, Identification, MachineConfig
@@ -160,5 +161,6 @@ def _cores() -> int:
 
 
 def _processes() -> ProcessPoolExecutor:
-    """Return processes that are spawned, not forked: a progress display has threads."""
-    return ProcessPoolExecutor(_cores(), mp_context=multiprocessing.get_context("spawn"))
+    """Return processes that are spawned, not forked: a progress display has threads. They end with this one."""
+    spawning = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(_cores(), spawning, initializer=end_with, initargs=(os.getpid(),))

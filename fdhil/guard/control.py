@@ -192,7 +192,9 @@ class Listener:
             return
         folder = self._path.parent
         try:
-            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            with contextlib.suppress(FileExistsError):  # the daemon may be quicker
+                folder.mkdir(parents=True)
+                folder.chmod(0o710 if self._mode == 0o660 else 0o700)
             if folder.stat().st_mode & 0o002:
                 raise PermissionError(0, "anybody may write to its folder")
             self._renewed, self.lost = self._made(), ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import signal
 import socket
 import ssl
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING
 from fdhil.config import MachineConfig
 from fdhil.config.web import Web, is_loopback
 from fdhil.daemon import heap
+from fdhil.daemon.shutdown import Shutdown
 from fdhil.errors import ConfigError, ConfigFault, ConnectError, FdhilError
 
 if TYPE_CHECKING:
@@ -25,6 +27,7 @@ LARGEST_MESSAGE = 64 * 1024
 BACKLOG = 64
 KEEP_ALIVE_S = 15
 STOP_S = 3
+END_S = 8.0  # below the TimeoutStopSec of the unit
 GIVE_BACK_S = 60.0
 
 
@@ -71,7 +74,11 @@ def serve(web: Web, make: Callable[[], FastAPI], ready: Callable[[str], None]) -
     certificate = _tls(web)
     heap.keep_small()
     with _listening(web) as listener:
-        asyncio.run(_serve(web, make, listener, certificate, ready))
+        shutdown = Shutdown(END_S, os._exit)
+        try:
+            asyncio.run(_serve(web, make, listener, certificate, ready, shutdown))
+        finally:
+            shutdown.end()
 
 
 def url_of(web: Web, listener: socket.socket) -> str:
@@ -115,10 +122,16 @@ async def _serve(
     listener: socket.socket,
     certificate: ssl.SSLContext | None,
     ready: Callable[[str], None],
+    shutdown: Shutdown,
 ) -> None:
     server = server_of(make(), certificate, lambda: ready(url_of(web, listener)))
+
+    def stop() -> None:
+        shutdown.begin()
+        server.should_exit = True
+
     for number in (signal.SIGTERM, signal.SIGINT):
-        asyncio.get_running_loop().add_signal_handler(number, setattr, server, "should_exit", True)
+        asyncio.get_running_loop().add_signal_handler(number, stop)
     giving_back = asyncio.create_task(_give_back(), name="free memory")
     try:
         await server.serve([listener])

@@ -7,6 +7,7 @@ import os
 import pty
 import select
 import signal
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -111,3 +112,25 @@ def test_a_terminal_sees_how_far_the_work_is(recordings: list[Path], capsys: pyt
             seen += os.read(master, 65536).decode()
     os.close(master)
     assert capsys.readouterr().out.startswith("{")
+
+
+ANALYSING = """
+import os, sys, time
+from fdhil.cli import batch
+def told(_):
+    print("up", flush=True)
+    time.sleep(600)
+if __name__ == "__main__":
+    batch._cores = lambda: 2
+    with batch._processes() as executor:
+        list(executor.map(told, range(2)))
+"""
+
+
+def test_processes_that_analyse_end_with_the_command_when_it_is_killed(tmp_path: Path) -> None:
+    (tmp_path / "analysing.py").write_text(ANALYSING)
+    with subprocess.Popen([sys.executable, tmp_path / "analysing.py"], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"up\n"
+        process.kill()
+        assert process.stdout.read() in (b"", b"up\n")  # the end: none has it open any more

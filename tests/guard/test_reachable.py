@@ -93,6 +93,15 @@ def test_the_name_is_looked_at_without_being_asked(folder: Path, monkeypatch: py
     shop.close()
 
 
+def test_folder_that_is_made_again_is_open_to_a_group_that_may_ask(folder: Path) -> None:
+    made = Listener(folder / SOCKET_NAME, shared=True)
+    shutil.rmtree(folder)
+    made.look()
+    made.renew()
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o710
+    made.socket.close()
+
+
 def test_socket_of_a_group_is_open_to_it(folder: Path) -> None:
     mask = os.umask(0o077)
     try:

@@ -48,9 +48,9 @@ def demo(out: Path, realtime: bool, pdf: bool, as_json: bool) -> None:
     with stopping_in_order():
         loop = run_loop(out, realtime, say)
         realistic = run_realistic(out / "realistic", realtime, say)
-    report = out / "report.html"
-    laid_out = page(loop, [realistic_page.headline(realistic)], [realistic_page.section(realistic)])
-    deliver(laid_out, report, report.with_suffix(".pdf") if pdf else None)
+        report = out / "report.html"
+        laid_out = page(loop, [realistic_page.headline(realistic)], [realistic_page.section(realistic)])
+        deliver(laid_out, report, report.with_suffix(".pdf") if pdf else None)
     if as_json:
         click.echo(json.dumps({**_document(loop, report), "realistic": _realistic(realistic)}))
     else:

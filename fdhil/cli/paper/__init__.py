@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from fdhil.child import stopping_in_order
 from fdhil.cli.options import FOLDER
 from fdhil.errors import OutputError
 
@@ -43,10 +44,11 @@ def paper(out: Path, runs: int, pdf: bool, as_json: bool) -> None:
     if pdf:
         find_browser()  # before the work
     _make(out)
-    claims = gather(runs, lambda text: click.echo(text, err=True) if sys.stderr.isatty() or not as_json else None)
-    files = write_pictures(claims, out)
-    told = document(claims, runs, version("fdhil"), files)
-    deliver(page(claims), out / "paper.html", out / "paper.pdf" if pdf else None)
+    with stopping_in_order():
+        claims = gather(runs, lambda text: click.echo(text, err=True) if sys.stderr.isatty() or not as_json else None)
+        files = write_pictures(claims, out)
+        told = document(claims, runs, version("fdhil"), files)
+        deliver(page(claims), out / "paper.html", out / "paper.pdf" if pdf else None)
     with open_output(out / "paper.json") as file:
         file.write(json.dumps(told, indent=1, ensure_ascii=False).encode())
     if as_json:
