@@ -21,6 +21,7 @@ import linuxcnc  # type: ignore[import-not-found]  # the package's own module, f
 
 JOINTS = int(os.environ["JOINTS"])
 PATIENCE_S = 300.0
+LOOK_S = 1.0
 
 
 class Failed(Exception):
@@ -30,13 +31,17 @@ class Failed(Exception):
 class Operator:
     """Gives orders and waits, by LinuxCNC's status alone, until they are done."""
 
-    def __init__(self) -> None:
+    def __init__(self, wire: socket.socket) -> None:
+        self._wire = wire
         self.command, self.status, self.errors = linuxcnc.command(), linuxcnc.stat(), linuxcnc.error_channel()
 
     def order(self, what: Callable[..., None], *arguments: Any) -> None:
         """Give an order and wait until it is done."""
         what(*arguments)
-        if self.command.wait_complete(PATIENCE_S) in (-1, linuxcnc.RCS_ERROR):
+        end = time.monotonic() + PATIENCE_S
+        while (result := self.command.wait_complete(LOOK_S)) == -1 and time.monotonic() < end:
+            self._leave_when_alone()
+        if result in (-1, linuxcnc.RCS_ERROR):
             raise Failed(f"{what.__name__}{arguments} was not done; {self._words()}")
 
     def wait(self, ready: Callable[[Any], bool]) -> None:
@@ -49,10 +54,17 @@ class Operator:
                 self.status.poll()
                 if ready(self.status):
                     return
+            self._leave_when_alone()
             time.sleep(0.005)
         now = self.status
         state = f"interpreter {now.interp_state}, task {now.exec_state}, queue {now.queue}, paused {now.paused}"
         raise Failed(f"the machine did not get there ({state}); {self._words()}")
+
+    def _leave_when_alone(self) -> None:
+        """End, and LinuxCNC with it, when whoever gave the order has ended."""
+        with contextlib.suppress(BlockingIOError):
+            if not self._wire.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT):
+                sys.exit(1)
 
     def _words(self) -> str:
         said = []
@@ -117,7 +129,7 @@ def main() -> None:
             lines.flush()
 
         try:
-            operator = Operator()
+            operator = Operator(wire)
             operator.prepare()
             answer(done="prepare")
         except (Failed, linuxcnc.error) as error:
