@@ -14,6 +14,8 @@ import pytest
 from fdhil import child
 from fdhil.child import ending_with_parent, stopping_in_order
 
+pytestmark = pytest.mark.usefixtures("processes")
+
 ENDED = [sys.executable, "-c", "import sys; sys.stdin.read()"]
 PARENT = """
 import os, subprocess, sys

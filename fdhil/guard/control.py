@@ -36,7 +36,7 @@ AT_ONCE = struct.pack("ii", 1, 0)
 class Closer:
     """Closes what clients sent or left, in a thread: closing a hung server's file may wait. No socket lingers.
 
-    ``look`` is called in that thread at least every LOOK_S.
+    ``look`` is called in that thread whenever nothing was left for LOOK_S.
     """
 
     def __init__(self, look: Callable[[], None] = lambda: None) -> None:
@@ -51,10 +51,10 @@ class Closer:
 
     def _run(self) -> None:
         while True:
-            self._look()
             try:
                 descriptor = self._left.get(timeout=LOOK_S)
             except queue.Empty:
+                self._look()
                 continue
             if descriptor is None:
                 return

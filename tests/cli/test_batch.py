@@ -127,6 +127,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.usefixtures("processes")
 def test_processes_that_analyse_end_with_the_command_when_it_is_killed(tmp_path: Path) -> None:
     (tmp_path / "analysing.py").write_text(ANALYSING)
     with subprocess.Popen([sys.executable, tmp_path / "analysing.py"], stdout=subprocess.PIPE) as process:

@@ -98,6 +98,7 @@ with stopping_in_order(), loop.running(Path(sys.argv[1]), False, lambda text: No
 """
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_machine_guard_and_daemon_end_with_the_demonstration(number: signal.Signals, tmp_path: Path) -> None:
     command = [sys.executable, "-c", RUNNING, str(tmp_path)]
