@@ -79,14 +79,14 @@ def identify(
     results = _analyse(recordings, settings, machine, accelerometer, columns)
     if machine is not None:
         results = [_against_data_sheet(result, axes) for result in results]
-    if model is not None:
-        from fdhil.cli.model_file import write_model
-
-        write_model(results, axes, model)
     if with_loops:
         from fdhil.cli.loops_view import with_all_loops
 
         results = with_all_loops(results, settings, machine)
+    if model is not None:
+        from fdhil.cli.model_file import write_model
+
+        write_model(results, axes, model)
     if as_json:
         document = {"schema": SCHEMA, "files": [_file_document(r, axes, with_loops) for r in results]}
         click.echo(json.dumps(document, allow_nan=False))

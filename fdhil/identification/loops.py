@@ -279,6 +279,12 @@ def regulators_of(loops: LoopEstimate) -> dict[str, Any]:
     return {"structure": loops.structure, **found, **dict.fromkeys(lacks, 0.0)}
 
 
+def changed_regulators(configured: Axis, used: Axis) -> dict[str, Any]:
+    """Return the keys of ``[axis.X.regulators]`` by which the used regulators differ from the configured ones."""
+    before = configured.regulators.model_dump()
+    return {key: value for key, value in used.regulators.model_dump().items() if value != before[key]}
+
+
 def differences(axis: Axis, loops: LoopEstimate) -> list[Difference]:
     """Return every key that was identified beside its configured value."""
     spread = np.sqrt(np.diag(loops.covariance))
