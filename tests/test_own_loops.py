@@ -8,7 +8,7 @@ import pytest
 
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
-from fdhil.pipeline import analyse
+from fdhil.pipeline import analyse, pool
 from fdhil.pipeline.own_loops import OwnLoops, better_axis, loops_of, suspected
 from fdhil.records import WindowOutcome
 from fdhil.validation.weight import LOOPS_DIFFER
@@ -56,6 +56,9 @@ def test_a_running_machine_goes_on_with_its_own_loops(filtered: list[WindowOutco
     assert first.verdict.accepted
     assert loops.axis is not None
     assert loops.axis.regulators.speed_filter_s == pytest.approx(0.001, rel=0.05)
+    changed = loops.changed
+    assert changed is not None
+    assert changed["speed_filter_s"] == loops.axis.regulators.speed_filter_s
     second, again = loops.analyse(filtered[1].window)
     assert again is None
     assert second.verdict.accepted
@@ -66,3 +69,15 @@ def test_a_running_machine_goes_on_with_its_own_loops(filtered: list[WindowOutco
 
 def test_loops_that_explain_the_rapids_are_left_alone() -> None:
     assert not suspected(outcomes(Loops()))
+
+
+def test_pool_is_refused_where_half_of_the_rapids_refute_the_loops_of_the_others(
+    filtered: list[WindowOutcome],
+) -> None:
+    accepted = [replace(o, verdict=replace(o.verdict, accepted=True, reasons=())) for o in filtered]
+    assert pool([*accepted, filtered[0]], SETTINGS)[1].accepted
+    _, verdict = pool([*accepted, *filtered], SETTINGS)
+    assert not verdict.accepted
+    (reason,) = verdict.reasons
+    assert reason.code == LOOPS_DIFFER
+    assert "2 rapids refute the loops with which 2 were accepted" in reason.text

@@ -319,6 +319,7 @@ def test_a_load_is_published_and_no_set_flips_with_the_direction(config: Machine
         assert each.parameters.term("load") == pytest.approx(1.0, abs=0.1)
         assert each.parameters.Cd == pytest.approx(5.0, rel=0.1)
         assert each.covariance.shape == (7, 7)
+        assert each.loops == {}
     assert sets[-1].windows == 6  # the newest four, and the newest two of the other direction
     assert sets[-1].window_ticks == (4000, 8000, 14000, 18000, 22000, 26000)
 

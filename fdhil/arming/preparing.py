@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.identification.loops import regulators_of
 from fdhil.model.terms import with_resonance
 from fdhil.prediction.gain import Gain, skill_of
-from fdhil.prediction.models import with_loops
+from fdhil.prediction.models import validated_models
 from fdhil.program import program_digest
 from fdhil.records import Parameters, Reason, Skill
 
@@ -118,23 +118,33 @@ def prepare(
 
     ProgramError, RecordingError or ConfigError when the program cannot be used.
     """
-    models = {}
-    for axis in config.axis:
-        published = known[axis].published
-        if published is None:
-            return _not_validated(axis)
-        models[axis] = with_resonance(published.parameters, config.axis[axis])
+    found = models_with_loops(tuple(config.axis), config, known)
+    if isinstance(found, Refused):
+        return found
+    models = {axis: with_resonance(model, config.axis[axis]) for axis, model in found[0].items()}
     digest = program_digest(program)
     ahead = method in (None, "inverse") and _longer_than_ring(program, config)
     if ahead and (off := gate.writing_off(list(config.axis), config)):
         return Refused(off)
-    return ArmRequest(program, digest, models, with_identified_loops(config, known), method, ahead)
+    return ArmRequest(program, digest, models, found[1], method, ahead)
 
 
-def with_identified_loops(config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> MachineConfig:
-    """Return the configuration with those regulators that were identified and are believed."""
-    loops = {name: regulators_of(axis.loops) for name, axis in known.items() if axis.loops is not None}
-    return with_loops(config, loops, "the identified loops")
+def models_with_loops(
+    axes: Sequence[str], config: MachineConfig, known: Mapping[str, AxisKnowledge]
+) -> tuple[dict[str, Parameters], MachineConfig] | Refused:
+    """Return the newest validated models of some axes, and the configuration with the loops that belong to them.
+
+    ConfigError where their loops are not known for this configuration.
+    """
+    sets = {}
+    for name in axes:
+        axis = known[name]
+        if axis.published is None:
+            return _not_validated(name)
+        sets[name] = axis.published
+        if axis.loops is not None:  # found by this daemon, with this configuration
+            sets[name] = replace(axis.published, loops=regulators_of(axis.loops), config_digest=config.digest)
+    return validated_models(sets, config, "the identified loops")
 
 
 def _not_validated(axis: str) -> Refused:
@@ -214,17 +224,17 @@ class Feeding:
 def prepare_feeding(config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> Feeding | Refused:
     """Find the on-line law of every axis from its newest validated parameters. StoreError for a damaged record."""
     axes = [name for name, axis in config.axis.items() if axis.correction is not None]
-    laws = {}
     for name in axes:
-        published = known[name].published
         if config.axis[name].feedforward is None:
             text = f"axis {name} has no section [axis.{name}.feedforward]: its speed and torque offsets are off"
             return Refused(
                 (Reason("FeedforwardOff", text, "add the section with its limits, then run fdhil commission"),)
             )
-        if published is None:
-            return _not_validated(name)
-        laws[name] = online.law(published.parameters, config.axis[name], config.machine.sync_period_s)
+    found = models_with_loops(axes, config, known)
+    if isinstance(found, Refused):
+        return found
+    models, own = found
+    laws = {name: online.law(models[name], own.axis[name], own.machine.sync_period_s) for name in axes}
     records = _records(axes, config)
     facts = feeding_facts(axes, config, known) | {
         "commissioned": all(holds(record, config, axis) for axis, record in records.items()),

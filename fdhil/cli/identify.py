@@ -203,21 +203,30 @@ def _used(result: FileResult) -> int:
 def _window_document(outcome: WindowOutcome) -> dict[str, Any]:
     from fdhil.identification.windows import moving_range
 
-    window = outcome.window
+    window, estimate = outcome.window, _usable(outcome)
     first, last = moving_range(window)
-    delay = _delay(outcome.estimate)
+    delay = _delay(estimate)
     return {
         "start_s": round(window.start_s + first * window.dt_s, 6),
         "end_s": round(window.start_s + last * window.dt_s, 6),
         "direction": window.direction,
-        "parameters": _parameters(outcome.estimate, outcome.verdict),
-        "terms": _terms(outcome.estimate),
+        "parameters": _parameters(estimate, outcome.verdict),
+        "terms": _terms(estimate),
         "validated": outcome.verdict.accepted,
         "fit_percent": outcome.verdict.fit_percent,
         **_verdict(outcome.verdict),
         **({"delay_s": delay} if delay is not None else {}),
         **({"at_table": asdict(outcome.at_table)} if outcome.at_table is not None else {}),
     }
+
+
+def _usable(outcome: WindowOutcome) -> Estimate | None:
+    """Return the estimate of a window; of a validated one the drive that predict and correct take."""
+    from fdhil.identification.physical_bounds import bounded
+
+    if outcome.estimate is None or not outcome.verdict.accepted:
+        return outcome.estimate
+    return bounded(outcome.estimate, outcome.window.direction)
 
 
 def _verdict(verdict: Verdict) -> dict[str, Any]:
@@ -299,7 +308,7 @@ def _show(results: Sequence[FileResult], axes: Mapping[str, Axis], with_loops: b
             window = outcome.window
             first, last = moving_range(window)
             span = f"{window.start_s + first * window.dt_s:.2f}-{window.start_s + last * window.dt_s:.2f}"
-            table.add_row(span, *_cells(outcome.estimate, outcome.verdict, weighed))
+            table.add_row(span, *_cells(_usable(outcome), outcome.verdict, weighed))
         table.add_section()
         table.add_row(f"all {_used(result)}", *_cells(result.pooled, result.verdict, weighed), style="bold")
         console.print(table)
@@ -330,7 +339,7 @@ def _cell(estimate: Estimate, name: str) -> str:
 
 def _show_terms(console: Any, result: FileResult) -> None:
     """Write what joined the six: of the pool, else of each window."""
-    each = ((f"{o.window.start_s:.2f} s", o.estimate) for o in result.outcomes)
+    each = ((f"{o.window.start_s:.2f} s", _usable(o)) for o in result.outcomes)
     for who, estimate in each if result.pooled is None else (("all", result.pooled),):
         if estimate is not None and estimate.terms:
             told = (cell(n, estimate.value(n), INTERVAL_95 * estimate.std(n), " ") for n in estimate.terms)

@@ -41,7 +41,6 @@ def write_model(results: Sequence[FileResult], axes: Mapping[str, Axis], path: P
 
 def _model(name: str, estimate: Estimate, axis: Axis | None) -> dict[str, Any]:
     values = {key: estimate.value(key) for key in PARAMETERS}
-    values |= {key: max(values[key], 0.0) for key in ("ft", "Cd")}  # friction may be nil, and no model has less
     unknown = [key for key, value in values.items() if not math.isfinite(value)]
     if unknown and axis is None:
         text = f"{' and '.join(unknown)} of axis {name} cannot be told without a voltage"

@@ -228,10 +228,11 @@ def inputs(
         given, loops = model_files.load_model_file(model_path)
         config = model_files.with_loops(config, loops, source)
     elif from_history:
-        from fdhil.store.history import latest_parameters
+        from fdhil.store.newest_sets import read_newest_sets
 
-        given = latest_parameters(config.store.directory, functools.partial(click.echo, err=True))
         source = str(config.store.directory)
+        newest = read_newest_sets(config.store.directory, config.axis, functools.partial(click.echo, err=True))
+        given, config = model_files.validated_models({axis: n.set for axis, n in newest.items()}, config, source)
     reference = load_trajectory(program, config)
     return reference, model_files.models_for(reference, given, config, source), config
 

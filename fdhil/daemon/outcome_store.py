@@ -33,6 +33,7 @@ from fdhil.records import (
 from fdhil.store import WINDOWS_FOLDER as WINDOWS_FOLDER
 from fdhil.store.atomic import sync_folder
 from fdhil.store.history import FILE_NAME, History
+from fdhil.store.newest_sets import newest_loops, newest_sets
 from fdhil.store.outbox import Outbox
 from fdhil.store.rows import Revision, Stamp, StoredWindow
 from fdhil.store.windows import RawScale, Scales, WindowStore
@@ -172,10 +173,7 @@ class OutcomeStore:
 
     def newest(self) -> dict[str, Revision]:
         """Return the newest revision of each axis that the history has."""
-        if self._history is None:
-            return {}
-        found = {axis: self._history.revisions(axis, limit=1) for axis in self._config.axis}
-        return {axis: revisions[0] for axis, revisions in found.items() if revisions}
+        return {} if self._history is None else newest_sets(self._history, self._config.axis)
 
     def skills(self) -> list[Skill]:
         """Return the newest skills of all axes, oldest first."""
@@ -195,7 +193,7 @@ class OutcomeStore:
         windows = [window for window in self._history.windows(axis, limit=2 * HISTORY) if window.accepted][-HISTORY:]
         points = tuple(map(_point, windows[-4 * POOL_WINDOWS :]))
         published = newest[0].set if newest else None
-        loops = self._history.own_loops(axis, self._config.digest)
+        loops = newest_loops(self._history, axis, self._config.digest)
         return Known(first, published, points, _members(windows), loops)
 
     def counts(self, axis: str) -> tuple[int, int]:

@@ -40,7 +40,7 @@ _HEAD = re.compile(
 MANY_DIGITS = 200 * b"0"
 _ONLY_DIGITS = bytes.maketrans(b"123456789E-", b"000000000e+")
 _JSON_COLUMNS = {"reasons", "parameters", "covariance", "window_ids", "terms", "warnings", "friction", "nc", "gains",
-                 "notices"}  # fmt: skip
+                 "notices", "loops"}  # fmt: skip
 _NOT_TOLD = {"id", "digest", "wall_s", "boot", "monotonic_ns", "told"}
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from fdhil.identification.physical_bounds import beyond_chance
 from fdhil.records import PARAMETERS, Estimate, Float, Reason, Result
 
 CONDITION_LIMIT = 1e6
@@ -19,7 +20,7 @@ PHYSICAL: Mapping[str, tuple[float, float]] = {
     "K": (1e-3, 100.0),
     "Jt": (1e-7, 100.0),
     "ft": (-np.inf, 10.0),
-    "Cd": (-np.inf, 1e3),
+    "Cd": (-1e3, 1e3),  # in one direction with a load, which may help
 }
 
 
@@ -95,18 +96,24 @@ def untold(estimate: Estimate, *, slow: bool) -> list[Reason]:
 
 
 def unphysical(estimate: Estimate, *, one_way: bool = False) -> list[Reason]:
-    """Return a reason for each parameter outside the box of what a feed drive can be; a NaN has its own reason.
+    """Return a reason for each value outside of what a feed drive can be; a NaN has its own reason.
 
-    Of moves ``one_way`` a constant load is part of Cd, and may be more than all friction.
+    Friction may be negligible, so only a significantly negative one is unphysical. Of moves ``one_way`` a constant load
+    is part of Cd, and may be more than all friction.
     """
     reasons = []
     for name, (low, high) in PHYSICAL.items():
-        if one_way and name == "Cd":
-            low = -high
         value = estimate.value(name)
-        # friction may be nil, so only a significantly negative one is unphysical
-        floor = -3 * estimate.std(name) if name in ("ft", "Cd") and not np.isfinite(low) else low
-        if np.isfinite(value) and not floor <= value <= high:
-            text = f"{name} = {value:.4g} lies outside {max(low, 0):.3g} to {high:.3g}"
-            reasons.append(Reason("Unphysical", text, "check the scale, sign and order of the signals"))
+        if np.isfinite(value) and not low <= value <= high:
+            reasons.append(_outside(f"{name} = {value:.4g} lies outside {max(low, 0):.3g} to {high:.3g}"))
+    for bound, value in beyond_chance(estimate.names, estimate.values, estimate.covariance):
+        if one_way and "Cd" in bound.weights:
+            continue
+        name = " + ".join(bound.weights)
+        high = PHYSICAL[name][1] if name in PHYSICAL else np.inf
+        reasons.append(_outside(f"{name} = {value:.4g} lies outside {bound.least:.3g} to {high:.3g}"))
     return reasons
+
+
+def _outside(text: str) -> Reason:
+    return Reason("Unphysical", text, "check the scale, sign and order of the signals")

@@ -24,6 +24,7 @@ from fdhil.identification.motion import Course, Motion
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.slow_voltage import in_order
 from fdhil.identification.terms import Candidate, candidates
+from fdhil.model.physical import bounds
 from fdhil.records import Estimate, Float
 
 Rows = npt.NDArray[np.intp]
@@ -74,7 +75,8 @@ def _weak(estimate: Estimate, chosen: Sequence[Candidate], untold: set[str]) -> 
         return {chosen[-1].family}
     weak = {c.family for c in chosen if not abs(estimate.value(c.family)) > LEAST_SURE * _std(estimate, c.family)}
     low = estimate.value("stribeck") if "stribeck" in estimate.names else 0.0
-    if low and min(estimate.value("Cd"), estimate.value("Cd") + low) < 0.0:
+    friction = {"Cd": estimate.value("Cd"), "stribeck": low}
+    if low and any(bound.beyond(friction) > 0.0 for bound in bounds(tuple(friction))):
         weak.add("stribeck" if any(c.family == "stribeck" for c in chosen) else chosen[-1].family)
     return weak
 

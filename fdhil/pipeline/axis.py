@@ -265,6 +265,7 @@ class AxisPipeline:
             window_ticks=tuple(found.outcome.window.start_tick for found in self._pool),
             unexplained_um=verdict.unexplained_um,
             warnings=verdict.warnings,
+            loops=self._loops.changed,
         )
         return [self._published, *self._against_data_sheet(estimate, window.start_tick)]
 

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Sequence
 
 from fdhil.config import Axis, Identification
-from fdhil.identification.loops import better_loops, identify_loops, with_loops
+from fdhil.identification.loops import better_loops, changed_regulators, identify_loops, with_loops
 from fdhil.pipeline.analysis import analyse, own
 from fdhil.pipeline.own_resonance import softer_axis
 from fdhil.records import LoopEstimate, Parameters, Window, WindowOutcome
@@ -124,6 +124,13 @@ class OwnLoops:
         self._due = 1
         self.axis = better_axis(axis, known) or axis
 
+    @property
+    def changed(self) -> dict[str, float | str] | None:
+        """The keys of the regulators by which the best known loops differ from the configured ones."""
+        if self._configured is None or self.axis is None:
+            return None
+        return changed_regulators(self._configured, self.axis)
+
     def analyse(self, window: Window) -> tuple[WindowOutcome, LoopEstimate | None]:
         """Return what a window says of the drive, and its loops where they were sought again."""
         outcome = analyse(window, self._settings, self.axis, self._period_s)
@@ -152,6 +159,8 @@ class OwnLoops:
         """Return the outcome of a window by the loops that the newest rapids show, and those loops."""
         found = loops_of(tuple(self._outcomes), self._configured, self._settings, self._period_s, growing=growing)
         better = better_axis(self._configured, found)
+        if better is None and found is not None and found.verdict.accepted:
+            better = self._configured  # which explain the rapids as well
         if better is None or self.axis is None:
             return outcome, found
         self.axis = better.model_copy(update={"resonance_hz": self.axis.resonance_hz})

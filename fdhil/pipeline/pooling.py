@@ -12,10 +12,12 @@ from fdhil.config import Identification
 from fdhil.identification.between import ALIKE, Between, Member, between
 from fdhil.identification.estimators import chosen
 from fdhil.identification.identifiability import unphysical, untold
+from fdhil.identification.physical_bounds import bounded
 from fdhil.identification.pooling import member, pooled
 from fdhil.pipeline.analysis import GAVE_UP, gave_up
 from fdhil.records import PARAMETERS, Estimate, Reason, Verdict, Window, WindowOutcome, frozen
 from fdhil.validation.agreement import moved
+from fdhil.validation.weight import LOOPS_DIFFER
 
 # what a window is refused for that says nothing of the direction: its samples, or how the move went
 OF_THE_MOVE = (
@@ -46,7 +48,9 @@ def pool(
         advice = "record moves at 60 % of the rapid speed or more"
         return None, Verdict(False, None, (Reason("NoWindow", "the recording holds no rapid move", advice),))
     members = [member(o.window, o.estimate, k) for k, o in enumerate(outcomes) if o.verdict.accepted and o.estimate]
-    return together(outcomes, members, members, settings, refit=refit)
+    estimate, verdict = together(outcomes, members, members, settings, refit=refit)
+    refuted = _loops_refuted(outcomes) if verdict.accepted else []
+    return estimate, replace(verdict, accepted=False, reasons=tuple(refuted)) if refuted else verdict
 
 
 def together(
@@ -67,7 +71,7 @@ def together(
         return None, Verdict(False, None, tuple(seen))
     told: Told = [(o.window, o.estimate) for o in accepted if o.estimate is not None]
     reasons = list(one_sided(outcomes))
-    estimate: Estimate | None = told[0][1]
+    estimate = told[0][1]
     if len(told) > 1:
         try:
             estimate = _estimated(told, members, between(history), settings, refit=refit)
@@ -75,8 +79,9 @@ def together(
             return None, Verdict(False, None, (gave_up(error, "look at the windows"),))
         # where the voltage is slow, or there is none, R and L may stay open
         slow = any(window.slow_voltage is not None or window.voltage_v is None for window, _ in told)
-        reasons += untold(estimate, slow=slow) + unphysical(estimate) + moved(told)
-    return estimate, _verdict(accepted, reasons)
+        reasons += untold(estimate, slow=slow)
+    beyond = unphysical(estimate)
+    return (estimate if beyond else bounded(estimate)), _verdict(accepted, [*reasons, *beyond, *moved(told)])
 
 
 def _estimated(
@@ -113,6 +118,20 @@ def one_sided(outcomes: Iterable[WindowOutcome]) -> list[Reason]:
         f"no move in the {way} direction is believed ({cause.code}), and one direction tells no friction of the other"
     )
     return [Reason("OneDirection", text, cause.advice or "see why the other moves are refused")]
+
+
+def _loops_refuted(outcomes: Sequence[WindowOutcome]) -> list[Reason]:
+    """Return the reason when as many rapids refute the loops that the others were validated with as were accepted.
+
+    What they show are the drive's loops, not its parameters: a model would be used with loops that are wrong.
+    """
+    refuting = [o for o in outcomes if [r.code for r in o.verdict.reasons] == [LOOPS_DIFFER]]
+    accepted = sum(o.verdict.accepted for o in outcomes)
+    if not refuting or len(refuting) < accepted:
+        return []
+    cause = refuting[0].verdict.reasons[0]
+    text = f"{len(refuting)} rapids refute the loops with which {accepted} were accepted, and none were found for all"
+    return [Reason(LOOPS_DIFFER, f"{text}: {cause.text}", cause.advice)]
 
 
 def refuses_the_model(outcome: WindowOutcome) -> bool:

@@ -16,20 +16,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdhil import config as configuration
-from fdhil.config import MachineConfig
+from fdhil.config import MachineConfig, Regulators
 from fdhil.errors import ConfigError, ConfigFault
+from fdhil.identification.physical_bounds import beyond_chance, nearest
+from fdhil.model import physical
 from fdhil.model.terms import with_resonance
-from fdhil.prediction.model_terms import families
-from fdhil.records import PARAMETERS, UNITS, Parameters, Trajectory, unit_of
+from fdhil.prediction.model_terms import families, values_of
+from fdhil.records import PARAMETERS, UNITS, Parameters, ParameterSet, Trajectory, unit_of
 
 MAX_BYTES = 64 * 1024
 SHOWN_CHARS = 40
 MOST_FAULTS = 50
 LARGEST, SMALLEST = 1e12, 1e-12
-_MAY_BE_ZERO = ("ft", "Cd", "coulomb_positive", "coulomb_negative", "viscous_positive", "viscous_negative",
-                "resonance_damping")  # fmt: skip
-_ABOVE_ZERO = ("R", "L", "K", "Jt", "stribeck_speed", "resonance")
-_LEAST_SHARE = 0.01  # of the inertia before and behind a spring: with less there is no second mass
+COPIED = 1e-3  # to which a value agrees that was copied from what fdhil shows
 _TABLES = ("terms", "loops")
 TERMS = ("load", "coulomb_positive", "coulomb_negative", "viscous_positive", "viscous_negative", "stribeck",
          "stribeck_speed", "ripple_screw_1", "ripple_screw_1_phase", "ripple_motor_1", "ripple_motor_1_phase",
@@ -95,6 +94,61 @@ def with_loops(config: MachineConfig, loops: Loops, source: str) -> MachineConfi
     return configuration.parse(document, source, made_up=True)
 
 
+def validated_models(
+    sets: Mapping[str, ParameterSet], config: MachineConfig, source: str
+) -> tuple[dict[str, Parameters], MachineConfig]:
+    """Return the model of each published set, and the configuration with the loops that they were validated with.
+
+    ConfigError where a drive showed other loops than those configured, and the configuration has been changed since:
+    neither is known to be the drive's. The same for a set that no drive can be.
+    """
+    faults: list[ConfigFault] = []
+    models = {axis: _physical_model(axis, published, faults) for axis, published in sets.items()}
+    loops = {}
+    for axis, published in sets.items():
+        if axis not in config.axis or not published.loops:
+            continue
+        if published.config_digest == config.digest:
+            loops[axis] = published.loops
+        elif fault := _refuted(axis, published.loops, config.axis[axis].regulators):
+            faults.append(fault)
+    if faults:
+        raise ConfigError(source, faults)
+    return models, with_loops(config, loops, source)
+
+
+def _refuted(axis: str, loops: Mapping[str, float | str], regulators: Regulators) -> ConfigFault | None:
+    """Return the fault of regulators that are configured otherwise than the drive showed them; None if they agree."""
+    pairs = {key: (getattr(regulators, key), shown) for key, shown in loops.items()}
+    apart = {key: pair for key, pair in pairs.items() if not _agree(*pair)}
+    if not apart:
+        return None
+    listed = ", ".join(f"{key} {shown:.4g} for {has:.4g}" if key != "structure" else f"{key} {shown} for {has}"
+                       for key, (has, shown) in apart.items())  # fmt: skip
+    text = f"LoopsDiffer: the rapids showed other loops ({listed}), and the configuration has been changed since"
+    advice = "enter what the rapids showed, or let the machine make a few rapids with this configuration"
+    return ConfigFault(f"axis.{axis}.regulators", text, advice)
+
+
+def _agree(configured: float | str, shown: float | str) -> bool:
+    if isinstance(configured, str) or isinstance(shown, str):
+        return configured == shown
+    return math.isclose(configured, shown, rel_tol=COPIED, abs_tol=1e-6)
+
+
+def _physical_model(axis: str, published: ParameterSet, faults: list[ConfigFault]) -> Parameters:
+    """Return the parameters of a set, within the physical bounds where an earlier fdhil left them beyond by chance."""
+    told, covariance = values_of(published.parameters), published.covariance
+    names, values = tuple(told), np.array([*told.values()])
+    if all(bound.beyond(told) <= 0.0 for bound in physical.bounds(names)):
+        return published.parameters
+    if covariance.shape != (len(names), len(names)) or beyond_chance(names, values, covariance):
+        text = "Unphysical: the friction of the newest set would push its axis, or another value cannot be negative"
+        faults.append(ConfigFault(axis, text, "record rapids in both directions, and identify the axis again"))
+        return published.parameters
+    return Parameters.of(dict(zip(names, nearest(names, values, covariance).tolist(), strict=True)))
+
+
 def _cannot(path: Path, what: str, suggestion: str) -> ConfigError:
     return ConfigError(str(path), [ConfigFault("model", what, suggestion)])
 
@@ -147,9 +201,9 @@ def _term_faults(axis: str, terms: Mapping[str, Any], dry_nm: Any) -> list[Confi
             faults.append(ConfigFault(f"{place}.{name[:SHOWN_CHARS]}", text))
     if "stribeck" in terms and "stribeck_speed" not in terms:
         faults.append(ConfigFault(f"{place}.stribeck", "needs stribeck_speed beside it", "in rad/s"))
-    if not faults and "stribeck" in terms:
-        sides = [terms.get(f"coulomb_{side}", dry_nm) for side in ("positive", "negative")]
-        if any(_fault("Cd", side) is None and side + terms["stribeck"] < 0 for side in sides):
+    if not faults and "stribeck" in terms and _fault("Cd", dry_nm) is None:
+        friction = {"Cd": dry_nm, **terms}
+        if any(bound.beyond(friction) > 0.0 for bound in physical.bounds(tuple(friction)) if len(bound.weights) > 1):
             text = "takes more from the dry friction than there is: at standstill it would be below 0"
             faults.append(ConfigFault(f"{place}.stribeck", text, "in N.m"))
     return faults
@@ -161,12 +215,12 @@ def _fault(name: str, value: Any) -> str | None:
         return f"must be a number, not {_shown(value)}"
     if abs(value) > LARGEST or not math.isfinite(value) or 0 < abs(value) < SMALLEST:
         return f"must be a finite number of this physical quantity, not {_shown(value)}"
-    if name in _ABOVE_ZERO and value <= 0:
+    if name in physical.ABOVE_ZERO and value <= 0:
         return f"must be above 0, not {_shown(value)}"
-    if name in _MAY_BE_ZERO and value < 0:
+    if name in physical.NOT_NEGATIVE and value < 0:
         return f"must be at least 0, not {_shown(value)}"
-    if name == "resonance_share" and not _LEAST_SHARE <= value <= 1 - _LEAST_SHARE:
-        return f"must be from {_LEAST_SHARE} to {1 - _LEAST_SHARE}, not {_shown(value)}"
+    if name == "resonance_share" and not physical.LEAST_SHARE <= value <= 1 - physical.LEAST_SHARE:
+        return f"must be from {physical.LEAST_SHARE} to {1 - physical.LEAST_SHARE}, not {_shown(value)}"
     return None
 
 

@@ -125,6 +125,8 @@ class ParameterSet:
     """A published revision of one axis' parameters: pooled from ``windows`` accepted windows.
 
     ``window_ticks`` are where they start, where that is known. ``unexplained_um`` and ``warnings`` are the verdict's.
+    ``loops`` are the keys of ``[axis.X.regulators]`` by which the loops that it was validated with differ from the
+    configured ones; None where that was not recorded.
     """
 
     axis: str
@@ -138,6 +140,7 @@ class ParameterSet:
     window_ticks: tuple[int, ...] = ()
     unexplained_um: float | None = None
     warnings: tuple[Reason, ...] = ()
+    loops: Mapping[str, float | str] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from typing import Any
 
 from fdhil.errors import StoreError
 from fdhil.identification.pooling import friction_at, member
-from fdhil.records import LoopEstimate, Notice, Parameters, ParameterSet, Reason, Skill, WindowOutcome
+from fdhil.records import LoopEstimate, Notice, ParameterSet, Reason, Skill, WindowOutcome
 from fdhil.store import HISTORY_FILE, schema
 from fdhil.store.atomic import make_folder
 from fdhil.store.rows import DECODED, Acknowledgement, Comparison, Revision, Stamp, StoredNotice, StoredWindow
@@ -194,6 +194,7 @@ class History:
             "terms": json.dumps(dict(published.parameters.terms)),
             "unexplained_um": published.unexplained_um,
             "warnings": _dumped(published.warnings),
+            "loops": json.dumps(published.loops),
         }
         return self._insert("revisions", row, stamp)
 
@@ -215,13 +216,6 @@ class History:
     def loops(self, axis: str | None = None, limit: int | None = None) -> list[tuple[Stamp, LoopEstimate]]:
         """Return what was found of the drives' own loops, oldest first."""
         return [] if self.version < schema.WITH_TERMS else self._read("loops", _of(axis), limit)
-
-    def own_loops(self, axis: str, config_digest: str) -> LoopEstimate | None:
-        """Return the newest loops of an axis if the configuration is the same: it may have been tuned with it."""
-        newest = self.revisions(axis, limit=1)
-        same = bool(newest) and newest[0].set.config_digest == config_digest
-        loops = self.loops(axis, limit=1) if same else []
-        return loops[0][1] if loops else None
 
     def add_skill(self, skill: Skill, stamp: Stamp) -> int:
         """Store how well a move was predicted."""
@@ -384,14 +378,3 @@ def described(outcome: WindowOutcome) -> dict[str, dict[str, Any]]:
         else:
             told[name] = {"value": None, "reason": str(estimate.missing.get(name, estimate.result.value))}
     return told
-
-
-def latest_parameters(store_directory: Path, tell: Callable[[str], object] | None = None) -> dict[str, Parameters]:
-    """Return the newest published parameters of each axis; empty when nothing was recorded yet.
-
-    ``tell`` hears of damaged rows. StoreError when a history exists but cannot be read.
-    """
-    if not (store_directory / FILE_NAME).is_file():
-        return {}
-    with History.read(store_directory, tell) as history:
-        return {revision.set.axis: revision.set.parameters for revision in history.revisions()}

@@ -46,6 +46,12 @@ class Stamp:
             return (now.monotonic_ns - self.monotonic_ns) * 1e-9
         return now.wall_s - self.wall_s
 
+    def is_after(self, other: Stamp) -> bool:
+        """Return whether it was written after another, as far as the clocks say."""
+        if self.boot and self.boot == other.boot:
+            return self.monotonic_ns > other.monotonic_ns
+        return self.wall_s > other.wall_s
+
 
 def since_boot_ns() -> int:
     """Return the time since the computer was started; the time in which it was suspended counts, a machine may age."""
@@ -156,7 +162,7 @@ def _revision(row: Mapping[str, Any]) -> Revision:
     covariance: Float = frozen(np.array(json.loads(row["covariance"]), dtype=np.float64))
     published = ParameterSet(
         row["axis"], row["revision"], parameters, covariance, row["windows"], row["tick"], row["temperature_c"],
-        row["config_digest"], (), row.get("unexplained_um"), _warnings(row),
+        row["config_digest"], (), row.get("unexplained_um"), _warnings(row), json.loads(row.get("loops") or "null"),
     )  # fmt: skip
     return Revision(row["id"], published, tuple(json.loads(row["window_ids"])), _stamp(row))
 

@@ -75,11 +75,13 @@ CREATE TABLE outbox (id INTEGER PRIMARY KEY AUTOINCREMENT, of TEXT NOT NULL, row
 CREATE TABLE outbox_of (store TEXT NOT NULL, dropped INTEGER NOT NULL);
 INSERT INTO outbox_of VALUES (lower(hex(randomblob(16))), 0)
 """
+_SET_LOOPS = "ALTER TABLE revisions ADD COLUMN loops TEXT"
 TABLES = (*_WITH_DIGESTS, "loops", "acknowledgements")
 _BESIDE = ("quarantine", "outbox", "outbox_of")
 # what leads from each schema to the next, in order: a new one is added at the end, an old one never changes; one that
-# changes the columns of a table renews the messages of its rows in the outbox, too
-_STEPS = (_FIRST, _COMPARISONS, _DIGESTS, _TERMS, _NC, _ACKNOWLEDGEMENTS, _OUTBOX)
+# changes the columns of a table is listed with it in _CHANGED
+_STEPS = (_FIRST, _COMPARISONS, _DIGESTS, _TERMS, _NC, _ACKNOWLEDGEMENTS, _OUTBOX, _SET_LOOPS)
+_CHANGED = {7: "revisions"}  # schema that was left -> table: its rows get other digests, and so do those in the outbox
 SCHEMA_VERSION = len(_STEPS)
 WITH_COMPARISONS, WITH_DIGESTS, WITH_TERMS, WITH_ACKNOWLEDGEMENTS, WITH_OUTBOX = 2, 3, 4, 6, 7
 # what the check of the structure says of single values; their row's digest tells the same and no more than the row
@@ -191,6 +193,9 @@ def bring_up(db: sqlite3.Connection, path: Path) -> None:
                     db.execute(statement)
                 if version + 1 >= WITH_DIGESTS:
                     _sign(db, sound)
+                if table := _CHANGED.get(version):
+                    renewed = f"(SELECT digest FROM {table} WHERE id = outbox.row)"
+                    db.execute(f"UPDATE outbox SET message = coalesce({renewed}, message) WHERE of = '{table}'")
                 db.execute(f"PRAGMA user_version = {version + 1}")
 
 

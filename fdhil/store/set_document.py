@@ -53,6 +53,7 @@ def set_document(published: ParameterSet) -> dict[str, Any]:
         "temperature_c": published.temperature_c,
         "parameters": parameters_status(published),
         "terms": terms_status(published),
+        "loops": published.loops,
         "unexplained_um": published.unexplained_um,
         "warnings": [str(warning) for warning in published.warnings],
     }

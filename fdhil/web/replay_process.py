@@ -22,6 +22,7 @@ from fdhil.errors import FdhilError
 from fdhil.pipeline.overlay import lay_over
 from fdhil.store.history import History
 from fdhil.store.named_file import open_named
+from fdhil.store.newest_sets import newest_loops
 from fdhil.store.windows import MAX_FILE_BYTES, decode_window
 from fdhil.web.answers import Refused, document_of, status_of
 from fdhil.web.pages.rapid_list import the_window
@@ -45,7 +46,7 @@ class Replays:
         store = self._config.store.directory
         with History.read(store, checked=self._checked) as history:
             file = the_window(history, axis, number).file
-            loops = history.own_loops(axis, self._digest)
+            loops = newest_loops(history, axis, self._digest)
         if not file:
             text = f"the recording of rapid {number} of axis {axis} was not kept: the disk refused it"
             raise Refused(404, "NotKept", text, "see the notices of that time")

@@ -21,10 +21,10 @@ from fdhil.arming.preparing import (
     Armament,
     ArmRequest,
     Refused,
+    models_with_loops,
     prepare,
     prepare_armament,
     standing_facts,
-    with_identified_loops,
 )
 from fdhil.arming.token import read_token
 from fdhil.arming.whole_plan import plan_whole
@@ -32,7 +32,7 @@ from fdhil.commissioning.record import CommissioningRecord, axis_digest, save_re
 from fdhil.commissioning.void import void_record
 from fdhil.config import MachineConfig
 from fdhil.daemon.outcome_store import OutcomeStore
-from fdhil.errors import ProgramError
+from fdhil.errors import ConfigError, ProgramError
 from fdhil.identification.loops import DIFFER
 from fdhil.program import loading, program_digest
 from fdhil.records import LoopEstimate, Notice, Reason, Skill, Verdict
@@ -288,13 +288,14 @@ def test_loops_that_were_identified_and_are_believed_are_planned_with(config: Ma
         "X", "p_pi_pi", ("speed_kp", "speed_filter_s"), np.array([21.0, 5e-4]), np.zeros((2, 2)), believed
     )
     knowledge = Knowledge(config.axis)
+    knowledge.note([replace(published(1, axis), config_digest=config.digest) for axis in "XY"])
     knowledge.note([loops])
-    found = with_identified_loops(config, knowledge.now())
+    found = own_config(config, knowledge)
     assert found.axis["X"].regulators.speed_kp == 21.0
     assert found.axis["X"].regulators.speed_filter_s == 5e-4
     assert found.axis["Y"] == config.axis["Y"]
     knowledge.note([replace(loops, verdict=replace(believed, accepted=False))])
-    assert with_identified_loops(config, knowledge.now()) is config
+    assert own_config(config, knowledge) is config
     request = prepare(program, None, config, known(config, loops=loops))
     assert isinstance(request, ArmRequest)
     assert request.config.axis["X"].regulators.speed_kp == 21.0
@@ -302,6 +303,24 @@ def test_loops_that_were_identified_and_are_believed_are_planned_with(config: Ma
     armament = whole(program, config, loops=loops)
     assert isinstance(armament, Armament)
     assert all(armament.facts.values()), armament.facts
+
+
+def own_config(config: MachineConfig, knowledge: Knowledge) -> MachineConfig:
+    """Return the configuration with which what is known would be planned."""
+    found = models_with_loops("XY", config, knowledge.now())
+    assert not isinstance(found, Refused)
+    return found[1]
+
+
+def test_a_set_is_planned_with_the_loops_it_was_validated_with(config: MachineConfig, program: Path) -> None:
+    """Also where the daemon was started since then, and found none itself."""
+    newest = replace(published(), config_digest=config.digest, loops={"speed_filter_s": 0.002})
+    request = prepare(program, None, config, known(config, published=newest))
+    assert isinstance(request, ArmRequest)
+    assert request.config.axis["X"].regulators.speed_filter_s == 0.002
+    older = replace(newest, config_digest="another")
+    with pytest.raises(ConfigError, match=r"LoopsDiffer: .*speed_filter_s 0.002 for 0"):
+        prepare(program, None, config, known(config, published=older))
 
 
 def test_a_resonance_that_is_configured_is_planned_with(config: MachineConfig, program: Path) -> None:

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import csv
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from fdhil import config as configuration
 from fdhil.cli.main import cli
 from fdhil.prediction.contour import contour_error_um
+from fdhil.prediction.models import load_model_file
 from fdhil.program import write_demand_csv
 from fdhil.records import Float
+from fdhil.store.history import History
+from fdhil.store.rows import Stamp
 from studies import real_plant as real
 from tests.bench import bench_toml
 from tests.identification.test_loops import shuttle
 from tests.paths import bench_trajectory, rms
+from tests.store.made import published
 
 MECHANICS, LOOPS = real.Mechanics(), real.Loops(speed_filter_s=0.002)
 WORSE_UM = 1.0
@@ -60,22 +65,44 @@ def test_model_file_holds_the_loops_it_was_validated_with(shop: Shop) -> None:
 
 def test_correction_with_the_model_file_makes_no_place_of_the_real_path_worse(shop: Shop) -> None:
     model = json.loads(shop.model.read_text())
-    shop.model.with_name("both.json").write_text(json.dumps({"X": model["X"], "Y": model["X"]}))
-    reference = bench_trajectory(10)
+    both = shop.folder / "both.json"
+    both.write_text(json.dumps({"X": model["X"], "Y": model["X"]}))
+    assert_corrected(shop, "--model", both)
+
+
+def test_correction_from_the_history_uses_the_loops_of_the_published_sets(shop: Shop) -> None:
+    config = configuration.load(shop.config)
+    model = load_model_file(shop.model)
+    found = replace(published(1, "X", model.parameters["X"]), config_digest=config.digest, loops=model.loops["X"])
+    with History.open(config.store.directory) as history:
+        for axis in "XY":
+            history.add_revision(replace(found, axis=axis), [], Stamp.now())
+    assert_corrected(shop, "--from-history")
+
+
+def test_model_of_recordings_without_a_configuration_says_that_its_loops_are_not_confirmed(shop: Shop) -> None:
+    path = shop.folder / "alone.json"
+    result = invoke("identify", shop.recording, "--write-model", path)
+    assert "loops" not in json.loads(path.read_text())["X"]
+    assert "has no loops of axis X: predict and correct will use the configured regulators" in result.stderr
+
+
+def assert_corrected(shop: Shop, *source: str | Path) -> None:
+    """Plan a correction of the bench path with a model, and make the real drives follow it."""
+    reference, out = bench_trajectory(10), shop.folder / "out.csv"
     write_demand_csv(reference, shop.folder / "demand.csv")
-    arguments = ["--config", shop.config, "--model", shop.folder / "both.json", "--out", shop.folder / "out.csv"]
-    result = invoke("correct", shop.folder / "demand.csv", *arguments)
+    result = invoke("correct", shop.folder / "demand.csv", "--config", shop.config, "--out", out, *source)
     assert result.exit_code == 0, result.output
-    with (shop.folder / "out.csv").open() as file:
+    with out.open() as file:
         rows = list(csv.DictReader(file))
     demand = np.column_stack([reference.position_mm[axis] for axis in "XY"])
     offset = np.column_stack([[float(row[f"{axis}_offset_um"]) / 1e3 for row in rows] for axis in "XY"])
-    before, after = (contour_error_um(demand, _table_mm(order), reference.dt_s) for order in (demand, demand + offset))
+    before, after = (contour_error_um(demand, table_mm(order), reference.dt_s) for order in (demand, demand + offset))
     assert rms(before) > 30.0
     assert rms(after) < 0.5
     assert (after - before).max() < WORSE_UM
 
 
-def _table_mm(order_mm: Float) -> Float:
+def table_mm(order_mm: Float) -> Float:
     """Return where the real table goes (n, 2)."""
     return np.column_stack([real.run(MECHANICS, column / 1e3, LOOPS).table_m * 1e3 for column in order_mm.T])

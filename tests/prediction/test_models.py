@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,11 @@ import numpy as np
 import pytest
 
 from fdhil.errors import ConfigError
-from fdhil.prediction.models import load_model_file, models_for, nominal_models, with_loops
+from fdhil.prediction.models import load_model_file, models_for, nominal_models, validated_models, with_loops
+from fdhil.records import Float, ParameterSet
 from tests.bench import bench_config
 from tests.paths import trajectory
+from tests.store.made import BENCH, published
 
 GOOD: dict[str, Any] = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.0, "Cd": 5}
 
@@ -139,3 +142,47 @@ def test_an_axis_that_stands_still_needs_no_model() -> None:
     assert set(models_for(trajectory(demand), {"X": nominal["X"]}, config, "m.json")) == {"X", "Y"}
     with pytest.raises(ConfigError, match="X: moves and has no model"):
         models_for(trajectory(demand), {"Y": nominal["Y"]}, config, "m.json")
+
+
+CONFIG = bench_config()
+FILTERED = {"speed_filter_s": 0.002, "speed_kp": 23.4}
+
+
+def set_with(loops: dict[str, float | str] | None, digest: str = CONFIG.digest) -> dict[str, ParameterSet]:
+    """Return a published set of X that was validated with these loops."""
+    return {"X": replace(published(), config_digest=digest, loops=loops)}
+
+
+def test_a_published_set_is_used_with_the_loops_it_was_validated_with() -> None:
+    models, config = validated_models(set_with(FILTERED), CONFIG, "store")
+    assert models == {"X": BENCH}
+    assert config.axis["X"].regulators.speed_filter_s == 0.002
+    assert config.axis["Y"] == CONFIG.axis["Y"]
+    assert config.store.directory == CONFIG.store.directory
+    assert validated_models(set_with(None), CONFIG, "store")[1] is CONFIG
+    assert validated_models(set_with({}, "another"), CONFIG, "store")[1] is CONFIG
+
+
+def test_loops_of_an_earlier_configuration_are_refused_unless_it_has_them_now() -> None:
+    older = set_with(FILTERED, "another")
+    with pytest.raises(ConfigError, match=r"axis\.X\.regulators: LoopsDiffer: .*speed_filter_s 0.002 for 0,") as error:
+        validated_models(older, CONFIG, "store")
+    assert "enter what the rapids showed" in str(error.value)
+    copied = with_loops(CONFIG, {"X": FILTERED | {"speed_kp": 23.402}}, "copied")
+    assert validated_models(older, copied, "store")[1] is copied
+
+
+def published_friction(dry_nm: float, stribeck_nm: float, covariance: Float) -> dict[str, ParameterSet]:
+    """Return a set of X with friction at low speed, as a history may have it."""
+    parameters = BENCH.changed(Cd=dry_nm, stribeck=stribeck_nm, stribeck_speed=8.0)
+    return {"X": replace(published(parameters=parameters), covariance=covariance)}
+
+
+def test_an_older_set_that_chance_made_unphysical_is_used_within_the_bounds() -> None:
+    covariance = np.diag([0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 2.8**2, 1.0])
+    models, _ = validated_models(published_friction(4.95, -6.4, covariance), CONFIG, "store")
+    assert models["X"].Cd + models["X"].term("stribeck") == 0.0
+    assert models["X"].Cd == pytest.approx(4.95 + 1.45 / (1 + 2.8**2))
+    for told in (published_friction(4.95, -26.4, covariance), published_friction(4.95, -6.4, np.zeros((6, 6)))):
+        with pytest.raises(ConfigError, match="X: Unphysical: the friction of the newest set would push"):
+            validated_models(told, CONFIG, "store")

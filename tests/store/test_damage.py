@@ -19,7 +19,8 @@ from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.errors import RecordingError, StoreError
 from fdhil.records import Notice, Parameters, Skill
 from fdhil.store import schema
-from fdhil.store.history import FILE_NAME, History, latest_parameters
+from fdhil.store.history import FILE_NAME, History
+from fdhil.store.newest_sets import read_newest_sets
 from fdhil.store.rows import Acknowledgement, Comparison, UsedParameters
 from fdhil.store.windows import decode_window, encode_window
 from tests.daemon.machine import config_of
@@ -153,7 +154,7 @@ def test_the_daemon_begins_anew_or_goes_on_whatever_bit_is_flipped(tmp_path: Pat
         assert again.open() == []
         assert again.keep([published(9), outcome()]) == []
         again.close()
-        assert latest_parameters(directory)["X"] == BENCH
+        assert read_newest_sets(directory, "X")["X"].set.parameters == BENCH
 
 
 def test_a_damaged_revision_is_told_and_the_one_before_it_is_used(tmp_path: Path) -> None:
@@ -163,7 +164,7 @@ def test_a_damaged_revision_is_told_and_the_one_before_it_is_used(tmp_path: Path
     db.commit()
     db.close()
     told: list[str] = []
-    assert latest_parameters(tmp_path, told.append)["X"].R == 0.5 + 6
+    assert read_newest_sets(tmp_path, "X", told.append)["X"].set.parameters.R == 0.5 + 6
     (sentence,) = told
     assert "1 of revisions (row 15) damaged and left out" in sentence
     with History.open(tmp_path) as history:
@@ -186,7 +187,7 @@ def test_a_row_of_an_older_schema_that_cannot_be_read_is_left_out(tmp_path: Path
     db.commit()
     db.close()
     told: list[str] = []
-    assert latest_parameters(tmp_path, told.append) == {}
+    assert read_newest_sets(tmp_path, "X", told.append) == {}
     assert len(told) == 1
     with History.open(tmp_path) as history:
         assert history.put_damaged_aside() == "1 of revisions (row 1)"

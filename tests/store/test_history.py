@@ -15,7 +15,8 @@ from fdhil.errors import StoreError
 from fdhil.records import LoopEstimate, Notice, Parameters, Reason, Skill, Verdict, frozen
 from fdhil.store import history as history_module
 from fdhil.store import schema
-from fdhil.store.history import FILE_NAME, History, latest_parameters
+from fdhil.store.history import FILE_NAME, History
+from fdhil.store.newest_sets import read_newest_sets
 from fdhil.store.rows import Acknowledgement, Comparison, Stamp, StoredNotice, UsedParameters
 from tests.store.made import BENCH, STAMP, outcome, published
 from tests.store.made import window as made_window
@@ -38,14 +39,15 @@ def test_a_revision_comes_back_bit_by_bit(tmp_path: Path) -> None:
 
 @pytest.mark.fault("F9")
 def test_the_newest_parameters_are_the_last_written_whatever_the_clock_says(tmp_path: Path) -> None:
-    assert latest_parameters(tmp_path) == {}
+    assert read_newest_sets(tmp_path, "X") == {}
     with History.open(tmp_path) as history:
         history.add_revision(published(1, "X", BENCH), [], STAMP)
         history.add_revision(published(1, "Y", BENCH), [], STAMP)
         history.add_revision(published(2, "X", DRIFTED), [], Stamp(0.0, "boot-2", 1))  # booted in 1970
         assert [r.set.revision for r in history.revisions("X")] == [1, 2]
         assert [r.set.revision for r in history.revisions("X", limit=1)] == [2]
-    assert latest_parameters(tmp_path) == {"X": DRIFTED, "Y": BENCH}
+    newest = read_newest_sets(tmp_path, "XYZ")
+    assert {axis: revision.set.parameters for axis, revision in newest.items()} == {"X": DRIFTED, "Y": BENCH}
 
 
 def test_windows_keep_verdict_reasons_and_parameters(tmp_path: Path) -> None:
@@ -133,7 +135,7 @@ def first_schema(folder: Path) -> None:
     with History.open(folder) as history:
         history.add_revision(published(), [4], STAMP)
         (row,) = history._db.execute("SELECT * FROM revisions").fetchall()
-        row = row[: -len(("digest", "terms", "unexplained_um", "warnings"))]
+        row = row[: -len(("digest", "terms", "unexplained_um", "warnings", "loops"))]
     (folder / FILE_NAME).unlink()
     db = sqlite3.connect(folder / FILE_NAME)
     db.executescript(schema._FIRST + "PRAGMA user_version = 1;")
@@ -251,7 +253,7 @@ def test_terms_warnings_and_what_is_unexplained_are_kept(tmp_path: Path) -> None
     assert window.friction["value"] == pytest.approx(5.0 + 0.05 * window.friction["speed_rad_s"])
     assert revision.set.parameters == BENCH.changed(load=2.5)
     assert (revision.set.unexplained_um, revision.set.warnings) == (1.25, (warning,))
-    assert latest_parameters(tmp_path)["X"].term("load") == 2.5
+    assert read_newest_sets(tmp_path, "X")["X"].set.parameters.term("load") == 2.5
 
 
 def test_the_first_window_of_either_direction_is_known(tmp_path: Path) -> None:

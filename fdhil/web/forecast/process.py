@@ -29,14 +29,14 @@ from fdhil.correction.advised import advised, entry, sources
 from fdhil.correction.document import correction_document
 from fdhil.errors import FdhilError, ProgramError
 from fdhil.prediction.feeds import Source
-from fdhil.prediction.models import models_for, nominal_models
+from fdhil.prediction.models import models_for, nominal_models, validated_models
 from fdhil.program import Budget, interpret, planner
 from fdhil.program.demand_csv import read_demand_csv
 from fdhil.records import Correction, Parameters, Trajectory
 from fdhil.report.figures import LEAST_UM, common_scale
 from fdhil.report.path import planes, worst_places
-from fdhil.store.history import FILE_NAME, History
 from fdhil.store.known_gain import known_gain
+from fdhil.store.newest_sets import read_newest_sets
 from fdhil.web.forecast import kept
 
 MOST_ROWS = 600_000
@@ -55,7 +55,7 @@ def forecast(program: Path, name: str, config: MachineConfig, folder: Path, tell
     """
     tell({"step": "read"})
     reference = load(program, name, config)
-    models, parameters = newest_models(reference, config)
+    models, parameters, config = newest_models(reference, config)
     tell({"step": "correct", "rows": reference.time_s.size})
     planned = correction.plan(reference, models, config)
     predicted = known_gain(planned, models, config, any(told["revision"] for told in parameters.values()))
@@ -78,7 +78,7 @@ def forecast(program: Path, name: str, config: MachineConfig, folder: Path, tell
 def advice(program: Path, name: str, config: MachineConfig, tolerance_um: float, tell: Tell) -> list[dict[str, Any]]:
     """Return the lines that leave a tolerance, with the feeds that keep it, as ``fdhil advise --json`` has them."""
     reference = load(program, name, config)
-    models, _ = newest_models(reference, config)
+    models, _, config = newest_models(reference, config)
     motions = None if program.suffix == ".csv" else list(interpret(_lines(program), Budget.of(config.nc)))
     trials = itertools.count(1)
 
@@ -116,17 +116,18 @@ def _lines(program: Path) -> Iterator[str]:
 
 def newest_models(
     reference: Trajectory, config: MachineConfig
-) -> tuple[dict[str, Parameters], dict[str, dict[str, Any]]]:
-    """Return the model of each axis, and what is known of it: the history's newest, else the data sheet's values."""
+) -> tuple[dict[str, Parameters], dict[str, dict[str, Any]], MachineConfig]:
+    """Return the model of each axis, what is known of it, and the configuration with the loops it was validated with.
+
+    The models are the history's newest, else the data sheet's values.
+    """
     given = nominal_models(config)
     told: dict[str, dict[str, Any]] = {axis: {"revision": 0, "age_s": None} for axis in config.axis}
-    if (config.store.directory / FILE_NAME).is_file():
-        with History.read(config.store.directory) as history:
-            for axis in config.axis:
-                for revision in history.revisions(axis, limit=1):
-                    given[axis] = revision.set.parameters
-                    told[axis] = {"revision": revision.set.revision, "age_s": round(revision.stamp.age_s(), 1)}
-    return models_for(reference, given, config, str(config.store.directory)), told
+    newest, source = read_newest_sets(config.store.directory, config.axis), str(config.store.directory)
+    for axis, revision in newest.items():
+        told[axis] = {"revision": revision.set.revision, "age_s": round(revision.stamp.age_s(), 1)}
+    models, config = validated_models({axis: revision.set for axis, revision in newest.items()}, config, source)
+    return models_for(reference, given | models, config, source), told, config
 
 
 def zones(planned: Correction) -> list[dict[str, Any]]:

@@ -1,0 +1,124 @@
+"""Keeps estimates within what a drive can physically be: the likeliest values that respect every bound.
+
+Where chance took an estimate beyond a bound, the maximum of its normal likelihood under the bounds takes its place: a
+step along the covariance to the bounds that hold it. The covariance stays: the interval is that of the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from fdhil.model.physical import Bound, bounds
+from fdhil.records import Estimate, Float, frozen
+
+SIGNIFICANT = 3.0  # standard deviations beyond a bound that are not due to chance
+_FRICTION = ("Cd", "stribeck")
+
+
+def bounded(estimate: Estimate, direction: int | None = None) -> Estimate:
+    """Return the estimate within all physical bounds; itself where it lies within them.
+
+    Of moves in one ``direction`` a constant load is part of the dry friction: what makes that surely negative is told
+    as ``load``.
+    """
+    if direction is not None:
+        estimate = _with_load(estimate, direction)
+    names, values = estimate.names, estimate.values
+    within = nearest(names, values, estimate.covariance)
+    return estimate if within is values else replace(estimate, values=frozen(within))
+
+
+def nearest(names: Sequence[str], values: Float, covariance: Float) -> Float:
+    """Return the likeliest values (k,) within the bounds, for the covariance (k, k); ``values`` itself if it is."""
+    usable = np.isfinite(values) & np.isfinite(np.diag(covariance))
+    rows = [k for k in range(len(names)) if usable[k]]
+    known = [names[k] for k in rows]
+    listed = [b for b in bounds(known) if set(b.weights) <= set(known)]
+    start = values[rows]
+    if not _broken(listed, known, start):
+        return values
+    own = covariance[np.ix_(rows, rows)]
+    within = values.copy()
+    within[rows] = _settled(known, _projected(listed, known, start, own), listed)
+    return within
+
+
+def beyond_chance(names: Sequence[str], values: Float, covariance: Float) -> list[tuple[Bound, float]]:
+    """Return the bounds beyond which values (k,) surely lie, each with the sum that should not be below it."""
+    told = _told(names, values)
+    found = []
+    for bound in bounds([name for name, value in told.items() if np.isfinite(value)]):
+        row = _row(bound, names)
+        known = np.flatnonzero(row)
+        std = float(np.sqrt(row[known] @ covariance[np.ix_(known, known)] @ row[known]))
+        if bound.beyond(told) > SIGNIFICANT * std:
+            found.append((bound, bound.least - bound.beyond(told)))
+    return found
+
+
+def _told(names: Sequence[str], values: Float) -> dict[str, float]:
+    return dict(zip(names, values.tolist(), strict=True))
+
+
+def _row(bound: Bound, names: Sequence[str]) -> Float:
+    return np.array([bound.weights.get(name, 0.0) for name in names])
+
+
+def _broken(listed: Sequence[Bound], names: Sequence[str], values: Float) -> list[Bound]:
+    told = _told(names, values)
+    return [bound for bound in listed if bound.beyond(told) > 0.0]
+
+
+def _projected(listed: Sequence[Bound], names: Sequence[str], start: Float, covariance: Float) -> Float:
+    """Return the values nearest to ``start``, measured by the covariance, within the bounds: an active-set method."""
+    values, active = start, list[Bound]()
+    for _ in range(2 * len(listed)):
+        broken = [b for b in _broken(listed, names, values) if b not in active]
+        if not broken:
+            break
+        active.append(max(broken, key=lambda b: b.beyond(_told(names, values))))
+        while active:
+            rows = np.stack([_row(b, names) for b in active])
+            missing = np.array([b.beyond(_told(names, start)) for b in active])
+            pull = np.linalg.lstsq(rows @ covariance @ rows.T, missing, rcond=None)[0]
+            if pull.min() >= 0.0:
+                break
+            active.pop(int(np.argmin(pull)))
+        values = start + covariance @ rows.T @ pull if active else start
+    return values
+
+
+def _settled(names: Sequence[str], values: Float, listed: Sequence[Bound]) -> Float:
+    """Return the values on their bounds to the last bit, where rounding or a value without doubt left them beyond."""
+    told = _told(names, values)
+    for bound in listed:
+        if bound.beyond(told) > 0.0:
+            others = sum(weight * told[name] for name, weight in bound.weights.items() if name != bound.moves)
+            told[bound.moves] = (bound.least - others) / bound.weights[bound.moves]
+    return np.array([*told.values()])
+
+
+def _with_load(estimate: Estimate, direction: int) -> Estimate:
+    """Return the estimate with the part of its friction that surely is a load as ``load``, N.m."""
+    found = beyond_chance(estimate.names, estimate.values, estimate.covariance)
+    surely = [(bound, value) for bound, value in found if set(bound.weights) <= set(_FRICTION)]
+    if not surely or "load" in estimate.names:
+        return estimate
+    bound, pushing_nm = min(surely, key=lambda pair: pair[1])
+    size = len(estimate.names)
+    as_load = np.vstack([np.eye(size), direction * _row(bound, estimate.names)])
+    values = np.append(estimate.values, direction * pushing_nm)
+    values[estimate.names.index("Cd")] -= pushing_nm
+    systematic = estimate.systematic
+    if systematic is not None:
+        systematic = frozen(as_load @ np.pad(systematic, ((0, size - len(systematic)), (0, 0))))
+    return replace(
+        estimate,
+        names=(*estimate.names, "load"),
+        values=frozen(values),
+        covariance=frozen(as_load @ estimate.covariance @ as_load.T),
+        systematic=systematic,
+    )

@@ -1,0 +1,56 @@
+"""Finds the newest published parameter set of each axis, and the loops that the drive's newest rapids show."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+
+from fdhil.identification.loops import better_loops, regulators_of
+from fdhil.records import LoopEstimate
+from fdhil.store.history import FILE_NAME, History
+from fdhil.store.rows import Revision
+
+
+def read_newest_sets(
+    store_directory: Path, axes: Iterable[str], tell: Callable[[str], object] | None = None
+) -> dict[str, Revision]:
+    """Return the newest published parameter set of each axis; empty when nothing was recorded yet.
+
+    ``tell`` receives which rows are damaged. StoreError when a history exists but cannot be read.
+    """
+    if not (store_directory / FILE_NAME).is_file():
+        return {}
+    with History.read(store_directory, tell) as history:
+        return newest_sets(history, axes)
+
+
+def newest_sets(history: History, axes: Iterable[str]) -> dict[str, Revision]:
+    """Return the newest published parameter set of each axis that has one."""
+    newest = {axis: history.revisions(axis, limit=1) for axis in axes}
+    return {axis: _with_newest_loops(found[0], history) for axis, found in newest.items() if found}
+
+
+def _with_newest_loops(revision: Revision, history: History) -> Revision:
+    """Return a set with loops that were identified after it, or whose use was not recorded with it."""
+    loops = history.loops(revision.set.axis, limit=1)
+    if not loops or not loops[0][1].verdict.accepted:
+        return revision
+    stamp, found = loops[0]
+    if revision.set.loops is not None and not stamp.is_after(revision.stamp):
+        return revision
+    return replace(revision, set=replace(revision.set, loops=regulators_of(found) if better_loops(found) else {}))
+
+
+def newest_loops(history: History, axis: str, config_digest: str) -> LoopEstimate | None:
+    """Return the newest loops of an axis as far as they were found with this configuration.
+
+    It may have been tuned with the drive. Loops that no set was published with since then are of an earlier one.
+    """
+    newest = next(iter(history.revisions(axis, limit=1)), None)
+    loops = history.loops(axis, limit=1)
+    if newest is None or not loops or newest.set.config_digest != config_digest:
+        return None
+    stamp, found = loops[0]
+    outdated = newest.set.loops == {} and better_loops(found) and not stamp.is_after(newest.stamp)
+    return None if outdated else found

@@ -1,0 +1,89 @@
+"""An estimate that chance took beyond what a drive can be is told within it; any other is left to the last bit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fdhil.identification.identifiability import unphysical
+from fdhil.identification.physical_bounds import bounded
+from fdhil.model.physical import bounds
+from fdhil.model.terms import torque
+from fdhil.records import PARAMETERS, Estimate, Float, Result
+
+TERMS = ("load", "viscous_positive", "viscous_negative", "stribeck", "stribeck_speed")
+NAMES = (*PARAMETERS, *TERMS)
+TRUE = np.array([0.5, 0.005, 0.8, 0.075, 0.05, 5.0, 1.0, 0.06, 0.04, -2.0, 10.0])
+
+
+def estimate(values: Float, covariance: Float | None = None, names: tuple[str, ...] = NAMES) -> Estimate:
+    """Return an estimate, if not told otherwise with friction that is hardly known."""
+    deviations = 0.01 * np.abs(values)
+    deviations[[names.index(name) for name in names if name in ("Cd", "stribeck", "ft")]] = 2.0
+    made = np.diag(deviations**2) if covariance is None else covariance
+    return Estimate("maximum_likelihood", names, values, made, {}, Result.OK)
+
+
+def changed(**values: float) -> Float:
+    """Return the true values but for some."""
+    told = TRUE.copy()
+    for name, value in values.items():
+        told[NAMES.index(name)] = value
+    return told
+
+
+def test_physical_estimate_is_left_as_it_is() -> None:
+    told = estimate(TRUE)
+    assert bounded(told) is told
+    assert bounded(told, -1) is told
+
+
+def test_friction_at_standstill_that_chance_made_negative_is_zero() -> None:
+    told = estimate(changed(Cd=4.95, stribeck=-6.4))
+    assert unphysical(told) == []
+    within = bounded(told)
+    assert within.value("Cd") + within.value("stribeck") == 0.0
+    # both give way, the more the less they are known
+    assert within.value("Cd") == pytest.approx(5.675)
+    assert within.covariance is told.covariance
+
+
+def test_friction_at_standstill_that_is_surely_negative_is_refused() -> None:
+    told = estimate(changed(Cd=4.95, stribeck=-16.4))
+    (reason,) = unphysical(told)
+    assert (reason.code, "Cd + stribeck = -11.45" in reason.text) == ("Unphysical", True)
+
+
+def test_correlated_values_follow_the_one_that_is_bounded() -> None:
+    names = PARAMETERS
+    covariance = np.zeros((6, 6))
+    covariance[4:, 4:] = [[1e-4, -9e-3], [-9e-3, 1.0]]  # ft and Cd nearly trade
+    within = bounded(estimate(np.array([*TRUE[:4], -0.001, 6.0]), covariance, names))
+    assert within.value("ft") == 0.0
+    assert within.value("Cd") == pytest.approx(6.0 - 0.09)
+
+
+def test_load_beyond_dry_friction_is_told_of_moves_in_one_direction() -> None:
+    names, covariance = PARAMETERS, np.diag([1e-6] * 6)
+    lowered = estimate(np.array([*TRUE[:5], -10.0]), covariance, names)
+    assert unphysical(lowered, one_way=True) == []
+    for direction in (1, -1):
+        within = bounded(lowered, direction)
+        assert (within.value("Cd"), within.value("load")) == (0.0, -10.0 * direction)
+        assert within.std("load") == pytest.approx(1e-3)
+        speed = np.array([50.0 * direction])
+        assert torque(within.parameters(), speed, np.zeros(1)) == pytest.approx(
+            direction * (0.05 * 50.0 - 10.0)
+        )  # what moves it is the same
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_every_estimate_is_taken_within_all_bounds(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    root = rng.normal(0.0, 1.0, (len(NAMES), len(NAMES))) * np.abs(TRUE)
+    values = TRUE + rng.choice([0.1, 1.0, 3.0]) * root @ rng.normal(0.0, 1.0, len(NAMES))
+    within = bounded(estimate(values, root @ root.T))
+    told = dict(zip(NAMES, within.values.tolist(), strict=True))
+    assert all(bound.beyond(told) <= 0.0 for bound in bounds(NAMES))

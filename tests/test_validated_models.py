@@ -1,0 +1,110 @@
+"""Whatever identify validates, a window or a pool, predict, correct and arming take, on any drive."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil import correction
+from fdhil.cli.batch import FileResult
+from fdhil.cli.identify import _file_document
+from fdhil.cli.model_file import write_model
+from fdhil.config import Identification
+from fdhil.pipeline import analyse, pool
+from fdhil.prediction import predict
+from fdhil.prediction.models import load_model_file, validated_models
+from fdhil.records import PARAMETERS, Estimate, Result, Trajectory, Verdict, WindowOutcome
+from studies import real_plant as real
+from tests.bench import bench_config
+from tests.identification.realistic import rapids
+from tests.paths import smooth, trajectory
+from tests.store.made import published
+
+CONFIG = bench_config("X")
+PLANTS = {
+    "bench": real.Mechanics(),
+    "weight above dry friction": real.Mechanics(Cd=1.0, load_nm=5.8),
+    "weight pulls up": real.Mechanics(Cd=2.0, load_nm=-6.0),
+    "no viscous friction": real.Mechanics(ft=0.0),
+    "hardly any dry friction": real.Mechanics(Cd=0.02),
+    "no friction": real.Mechanics(ft=0.0, Cd=0.02),
+    "sticks": real.Mechanics(static=0.3),
+    "asymmetric": real.Mechanics(asymmetry=0.2, load_nm=1.0),
+    "ordinary": real.ORDINARY_MECHANICS,
+    "friction builds up": replace(real.SLOW, static=-0.25, static_speed_rad_s=20.0),
+    "friction builds up from zero": replace(real.SLOW, static=-0.98, static_speed_rad_s=12.0),
+    "slow axis that sticks": replace(real.SLOW, static=0.2, static_speed_rad_s=20.0),
+    "slow weight above dry friction": replace(real.SLOW, load_nm=5.0),
+}
+
+
+def short_move() -> Trajectory:
+    """Return a move there and back, as an NC smooths it."""
+    way = np.concatenate([np.linspace(0.0, 5.0, 60), np.linspace(5.0, 0.0, 60), np.zeros(180)])
+    return trajectory(smooth(way[:, None], (0.060, 0.030), 0.001), "X")
+
+
+MOVE = short_move()
+
+
+@cache
+def identified(plant: real.Mechanics, seed: int) -> FileResult:
+    """Return what ``fdhil identify`` makes of four rapids of a plant."""
+    loops = real.SLOW_LOOPS if plant.Jt < 0.05 else None
+    outcomes = [analyse(window, Identification()) for window in rapids(plant, None, loops, moves=4, seed=seed)]
+    estimate, verdict = pool(outcomes, Identification())
+    return FileResult("recording.csv", "X", tuple(outcomes), estimate, verdict)
+
+
+def test_most_plants_are_validated() -> None:
+    """Else there would be nothing to take."""
+    assert sum(identified(plant, 3).verdict.accepted for plant in PLANTS.values()) >= 9
+
+
+def model_of(told: dict[str, Any]) -> dict[str, Any]:
+    """Return the model file's axis of a window or pool as ``identify --json`` has it."""
+    six = {name: figures["value"] for name, figures in told["parameters"].items()}
+    return {**six, "terms": {name: figures["value"] for name, figures in told["terms"].items()}}
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+@pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS)
+def test_validated_model_is_taken(plant: real.Mechanics, seed: int, tmp_path: Path) -> None:
+    result = identified(plant, seed)
+    document = _file_document(result, {}, with_loops=False)
+    told = [each for each in (*document["windows"], document["pooled"]) if each["validated"]]
+    path = tmp_path / "model.json"
+    for each in told:
+        path.write_text(json.dumps({"X": model_of(each)}))
+        predict(MOVE, load_model_file(path).parameters, CONFIG)
+    if not result.verdict.accepted or result.pooled is None:
+        return
+    write_model([result], CONFIG.axis, path)
+    written = load_model_file(path).parameters
+    newest = replace(published(1, "X", result.pooled.parameters()), covariance=result.pooled.covariance)
+    assert validated_models({"X": newest}, CONFIG, "store")[0] == written
+    assert correction.plan(MOVE, written, CONFIG).after.rms_um < 50.0
+
+
+def test_pool_whose_friction_at_standstill_chance_made_negative_is_taken(tmp_path: Path) -> None:
+    """Each window's friction is hardly told from zero; together they have -6.4 +- 2.0 N.m next to a Cd of 4.95."""
+    names = (*PARAMETERS, "stribeck", "stribeck_speed")
+    values = np.array([0.5, 0.005, 0.8, 0.075, 0.05, 4.95, -6.4, 8.0])
+    covariance = np.diag([1e-8, 1e-10, 1e-8, 1e-10, 1e-6, 0.25, 2.8**2, 1.0])
+    told = Estimate("maximum_likelihood", names, values, covariance, {}, Result.OK)
+    outcomes = [WindowOutcome(window, told, Verdict(True, 99.0)) for window in rapids(moves=2)]
+    estimate, verdict = pool(outcomes, Identification())
+    assert verdict.accepted
+    assert estimate is not None
+    assert estimate.value("Cd") == pytest.approx(4.95 + 1.45 / (1 + 2.8**2 / 0.25), rel=1e-3)
+    path = tmp_path / "model.json"
+    write_model([FileResult("recording.csv", "X", tuple(outcomes), estimate, verdict)], CONFIG.axis, path)
+    written = load_model_file(path).parameters["X"]
+    assert written.Cd + written.term("stribeck") == 0.0
+    predict(MOVE, {"X": written}, CONFIG)
