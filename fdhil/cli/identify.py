@@ -38,7 +38,7 @@ UNREADABLE = 3
     "--write-model",
     "model",
     type=OutputFile(".json"),
-    help="Write the validated pools as a model file, which --model of predict and correct reads.",
+    help="Write the validated pools, with terms and loops, as a model file for --model of predict and correct.",
 )
 @click.option("--loops", "with_loops", is_flag=True, help="Identify the drive's own loops, too.")
 @click.option(

@@ -15,26 +15,30 @@ from fdhil.config import Axis
 from fdhil.identification.loops import better_loops, changed_regulators, regulators_of, with_loops
 from fdhil.records import PARAMETERS, Estimate, LoopEstimate
 from fdhil.store.output import open_output
+from fdhil.validation.weight import LOOPS_DIFFER
 
 
 def write_model(results: Sequence[FileResult], axes: Mapping[str, Axis], path: Path) -> None:
     """Write the validated pools by axis, of several files of one axis the last one's.
 
     What has to be given is the ``axes``' nominal value; click.UsageError where a value stays unknown. Without a
-    validated pool nothing is written, which is reported on stderr.
+    validated pool nothing is written, nor where rapids of any file refute the loops that would be used with the model;
+    stderr says so.
     """
-    valid = {r.axis: (r.pooled, r.loops) for r in results if r.axis and r.pooled is not None and r.verdict.accepted}
+    valid = {r.axis: r.pooled for r in results if r.axis and r.pooled is not None and r.verdict.accepted}
     if not valid:
         click.echo(f"fdhil: {path} is not written: no recording gives a validated model", err=True)
         return
-    document = {
-        name: {**_model(name, estimate, axes.get(name)), **_loops(loops, axes.get(name))}
-        for name, (estimate, loops) in valid.items()
-    }
-    unchecked = [name for name, (_, loops) in valid.items() if loops is None and name not in axes]
-    if unchecked:
+    loops = {r.axis: told for r in results if r.axis and (told := _loops(r.loops, axes.get(r.axis))) is not None}
+    refuted = {r.axis for r in results for reason in r.verdict.reasons if reason.code == LOOPS_DIFFER and r.axis}
+    if wrong := ", ".join(sorted(refuted & valid.keys() - loops.keys())):
+        text = f"{LOOPS_DIFFER}: rapids of axis {wrong} refute the configured regulators, and no others explain them"
+        click.echo(f"fdhil: {path} is not written: {text}; enter those of the drive in the configuration", err=True)
+        return
+    if unchecked := sorted(valid.keys() - loops.keys() - axes.keys()):
         text = f"fdhil: {path} has no loops of axis {', '.join(unchecked)}: predict and correct will use the configured"
         click.echo(f"{text} regulators, which these recordings did not confirm; give --config or --loops", err=True)
+    document = {name: _model(name, pooled, axes.get(name)) | loops.get(name, {}) for name, pooled in valid.items()}
     with open_output(path) as file:
         file.write((json.dumps(document, indent=2, allow_nan=False) + "\n").encode())
 
@@ -51,11 +55,10 @@ def _model(name: str, estimate: Estimate, axis: Axis | None) -> dict[str, Any]:
     return {**values, "terms": terms} if terms else values
 
 
-def _loops(found: LoopEstimate | None, axis: Axis | None) -> dict[str, Any]:
-    """Return the table of the loops by which the model was validated, empty where those are the configured ones."""
+def _loops(found: LoopEstimate | None, axis: Axis | None) -> dict[str, Any] | None:
+    """Return the table of loops that explain the rapids where the configured ones do not; None where there are none."""
     if found is None or not found.verdict.accepted:
-        return {}
-    if axis is None:
+        return None
+    if axis is None or found.configured_um is None:
         return {"loops": regulators_of(found)}
-    changed = changed_regulators(axis, with_loops(axis, found)) if better_loops(found) else {}
-    return {"loops": changed} if changed else {}
+    return {"loops": changed_regulators(axis, with_loops(axis, found))} if better_loops(found) else None

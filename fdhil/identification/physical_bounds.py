@@ -42,7 +42,7 @@ def nearest(names: Sequence[str], values: Float, covariance: Float) -> Float:
         return values
     own = covariance[np.ix_(rows, rows)]
     within = values.copy()
-    within[rows] = _settled(known, _projected(listed, known, start, own), listed)
+    within[rows] = _projected(listed, known, start, own)
     return within
 
 
@@ -88,14 +88,14 @@ def _projected(listed: Sequence[Bound], names: Sequence[str], start: Float, cova
                 break
             active.pop(int(np.argmin(pull)))
         values = start + covariance @ rows.T @ pull if active else start
-    return values
+    return _settled(names, values, listed, active)
 
 
-def _settled(names: Sequence[str], values: Float, listed: Sequence[Bound]) -> Float:
-    """Return the values on their bounds to the last bit, where rounding or a value without doubt left them beyond."""
+def _settled(names: Sequence[str], values: Float, listed: Sequence[Bound], active: Sequence[Bound]) -> Float:
+    """Return the values on their ``active`` bounds to the last bit, and on those that no doubt let them reach."""
     told = _told(names, values)
     for bound in listed:
-        if bound.beyond(told) > 0.0:
+        if bound in active or bound.beyond(told) > 0.0:
             others = sum(weight * told[name] for name, weight in bound.weights.items() if name != bound.moves)
             told[bound.moves] = (bound.least - others) / bound.weights[bound.moves]
     return np.array([*told.values()])

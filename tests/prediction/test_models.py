@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -145,10 +146,10 @@ def test_an_axis_that_stands_still_needs_no_model() -> None:
 
 
 CONFIG = bench_config()
-FILTERED = {"speed_filter_s": 0.002, "speed_kp": 23.4}
+FILTERED: Mapping[str, float | str] = {"speed_filter_s": 0.002, "speed_kp": 23.4}
 
 
-def set_with(loops: dict[str, float | str] | None, digest: str = CONFIG.digest) -> dict[str, ParameterSet]:
+def set_with(loops: Mapping[str, float | str] | None, digest: str = CONFIG.digest) -> dict[str, ParameterSet]:
     """Return a published set of X that was validated with these loops."""
     return {"X": replace(published(), config_digest=digest, loops=loops)}
 
@@ -168,7 +169,7 @@ def test_loops_of_an_earlier_configuration_are_refused_unless_it_has_them_now() 
     with pytest.raises(ConfigError, match=r"axis\.X\.regulators: LoopsDiffer: .*speed_filter_s 0.002 for 0,") as error:
         validated_models(older, CONFIG, "store")
     assert "enter what the rapids showed" in str(error.value)
-    copied = with_loops(CONFIG, {"X": FILTERED | {"speed_kp": 23.402}}, "copied")
+    copied = with_loops(CONFIG, {"X": {**FILTERED, "speed_kp": 23.402}}, "copied")
     assert validated_models(older, copied, "store")[1] is copied
 
 

@@ -12,11 +12,12 @@ from fdhil.cli.demo.machines import REAL, machine_document
 from fdhil.cli.demo.report import Cut, Published
 from fdhil.config import MachineConfig
 from fdhil.errors import FdhilError
-from fdhil.model.terms import with_resonance
 from fdhil.prediction import predict
+from fdhil.prediction.models import models_for, validated_models
 from fdhil.program import load_trajectory
 from fdhil.records import Parameters, Prediction
 from fdhil.store.history import History
+from fdhil.store.newest_sets import read_newest_sets
 
 AMBIENT_C = 20.0
 
@@ -53,7 +54,7 @@ def run_realistic(out: Path, realtime: bool, say: Say) -> Realistic:
         cut(stage, "uncorrected", AMBIENT_C)
         refused = _corrected(stage)
         plants = true_plants(stage.config)
-        return Realistic(stage.config, plants, verdicts, _predicted(stage, verdicts), stage.cuts, refused)
+        return Realistic(stage.config, plants, verdicts, _predicted(stage), stage.cuts, refused)
 
 
 def _verdict(stage: Stage, axis: str) -> AxisVerdict:
@@ -65,16 +66,16 @@ def _verdict(stage: Stage, axis: str) -> AxisVerdict:
     return AxisVerdict(published_of(sets[0].set) if sets else None, believed, len(windows), reasons)
 
 
-def _predicted(stage: Stage, verdicts: Mapping[str, AxisVerdict]) -> Prediction | None:
-    """Return what the published models predict; None unless there is one of every axis."""
-    models = {
-        axis: with_resonance(told.published.parameters, stage.config.axis[axis])
-        for axis, told in verdicts.items()
-        if told.published is not None
-    }
-    if len(models) < len(verdicts):
+def _predicted(stage: Stage) -> Prediction | None:
+    """Return what the published models predict, with their loops; None unless there is one of every axis."""
+    source, program = str(stage.config.store.directory), stage.programs["10 m/min"]
+    newest = read_newest_sets(stage.config.store.directory, stage.config.axis)
+    if len(newest) < len(stage.config.axis):
         return None
-    return predict(load_trajectory(stage.programs["10 m/min"], stage.config), models, stage.config)
+    sets = {axis: revision.set for axis, revision in newest.items()}
+    models, config = validated_models(sets, stage.config, source)
+    reference = load_trajectory(program, config)
+    return predict(reference, models_for(reference, models, config, source), config)
 
 
 def _corrected(stage: Stage) -> str:

@@ -1,0 +1,55 @@
+"""A model file has the loops that any of its recordings showed, and is not written where they are unknown."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdhil.cli.batch import FileResult
+from fdhil.cli.model_file import write_model
+from fdhil.identification.loops import DIFFER
+from fdhil.prediction.models import load_model_file, with_loops
+from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Reason, Result, Verdict, frozen
+from tests.bench import bench_config
+from tests.store.made import BENCH
+
+CONFIG = bench_config("X")
+POOLED = Estimate(
+    "maximum_likelihood", PARAMETERS, frozen([*BENCH.as_dict().values()]), frozen(np.eye(6)), {}, Result.OK
+)
+VALID = FileResult("a.csv", "X", (), POOLED, Verdict(True, 99.0))
+REFUTED = replace(VALID, pooled=None, verdict=Verdict(False, None, (Reason(DIFFER, "the loops are others"),)))
+PID = LoopEstimate(
+    "X", "pid", ("position_gain_per_s", "position_ki_per_s2"), frozen([84.0, 1760.0]), frozen(np.eye(2)),
+    Verdict(True, None, (), 0.3, (Reason(DIFFER, "72 um"),)), 72.0,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("results", [[replace(VALID, loops=PID)], [replace(REFUTED, loops=PID), VALID]])
+def test_another_structure_travels_with_its_gains(results: list[FileResult], tmp_path: Path) -> None:
+    path = tmp_path / "model.json"
+    write_model(results, CONFIG.axis, path)
+    assert json.loads(path.read_text())["X"]["loops"] == {
+        "structure": "pid", "position_gain_per_s": 84.0, "position_ki_per_s2": 1760.0, "speed_ki": 0.0,
+    }  # fmt: skip
+    used = with_loops(CONFIG, load_model_file(path).loops, str(path)).axis["X"].regulators
+    assert (used.structure, used.speed_kp) == ("pid", CONFIG.axis["X"].regulators.speed_kp)
+
+
+def test_loops_as_configured_are_not_written(tmp_path: Path) -> None:
+    path = tmp_path / "model.json"
+    write_model([replace(VALID, loops=replace(PID, verdict=Verdict(True, None)))], CONFIG.axis, path)
+    assert "loops" not in json.loads(path.read_text())["X"]
+
+
+def test_model_is_not_written_where_rapids_refute_loops_that_none_replace(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "model.json"
+    write_model([REFUTED, VALID], CONFIG.axis, path)
+    assert not path.exists()
+    assert "LoopsDiffer: rapids of axis X refute the configured regulators" in capsys.readouterr().err
