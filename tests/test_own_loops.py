@@ -9,7 +9,7 @@ import pytest
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
-from fdhil.pipeline.own_loops import OwnLoops, better_axis, loops_of, suspected
+from fdhil.pipeline.own_loops import OwnLoops, better_axis, loops_of, mechanics_of, suspected
 from fdhil.records import WindowOutcome
 from fdhil.validation.weight import LOOPS_DIFFER
 from studies.bench import shuttle
@@ -69,6 +69,17 @@ def test_a_running_machine_goes_on_with_its_own_loops(filtered: list[WindowOutco
 
 def test_loops_that_explain_the_rapids_are_left_alone() -> None:
     assert not suspected(outcomes(Loops()))
+
+
+def test_loops_are_sought_with_a_weight_beyond_dry_friction_as_a_load() -> None:
+    mechanics = Mechanics(Cd=1.0, load_nm=5.8)
+    moved = run(mechanics, shuttle(moves=2), Loops())
+    windows = find_windows(recording(moved, mechanics, Sensors(), 0.5))
+    plants = [mechanics_of(analyse(window, SETTINGS, AXIS, PERIOD_S), AXIS) for window in windows]
+    lifted, lowered = (plant for plant in plants if plant is not None)
+    assert lifted.term("load") == lowered.Cd == 0.0
+    assert lifted.Cd == pytest.approx(6.8, abs=0.3)
+    assert lowered.term("load") == pytest.approx(4.8, abs=0.3)
 
 
 def test_pool_is_refused_where_half_of_the_rapids_refute_the_loops_of_the_others(

@@ -13,7 +13,7 @@ import click
 from fdhil.cli.batch import FileResult
 from fdhil.config import Axis
 from fdhil.identification.loops import better_loops, changed_regulators, regulators_of, with_loops
-from fdhil.records import PARAMETERS, Estimate, LoopEstimate
+from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Reason
 from fdhil.store.output import open_output
 from fdhil.validation.weight import LOOPS_DIFFER
 
@@ -30,10 +30,10 @@ def write_model(results: Sequence[FileResult], axes: Mapping[str, Axis], path: P
         click.echo(f"fdhil: {path} is not written: no recording gives a validated model", err=True)
         return
     loops = {r.axis: told for r in results if r.axis and (told := _loops(r.loops, axes.get(r.axis))) is not None}
-    refuted = {r.axis for r in results for reason in r.verdict.reasons if reason.code == LOOPS_DIFFER and r.axis}
-    if wrong := ", ".join(sorted(refuted & valid.keys() - loops.keys())):
-        text = f"{LOOPS_DIFFER}: rapids of axis {wrong} refute the configured regulators, and no others explain them"
-        click.echo(f"fdhil: {path} is not written: {text}; enter those of the drive in the configuration", err=True)
+    refuting = {r.axis: reason for r in results if r.axis and (reason := _refuting(r, axes)) is not None}
+    if wrong := sorted(refuting.keys() & valid.keys() - loops.keys()):
+        text = f"axis {wrong[0]}: {refuting[wrong[0]]}; {refuting[wrong[0]].advice}"
+        click.echo(f"fdhil: {path} is not written, its loops would be wrong: {text}", err=True)
         return
     if unchecked := sorted(valid.keys() - loops.keys() - axes.keys()):
         text = f"fdhil: {path} has no loops of axis {', '.join(unchecked)}: predict and correct will use the configured"
@@ -53,6 +53,14 @@ def _model(name: str, estimate: Estimate, axis: Axis | None) -> dict[str, Any]:
         values |= {key: float(getattr(axis.nominal, key)) for key in unknown}
     terms = {key: estimate.value(key) for key in estimate.terms}
     return {**values, "terms": terms} if terms else values
+
+
+def _refuting(result: FileResult, axes: Mapping[str, Axis]) -> Reason | None:
+    """Return why the regulators that would be used with a model cannot be the drive's; None where nothing says so."""
+    reasons = [reason for reason in result.verdict.reasons if reason.code == LOOPS_DIFFER]
+    if result.loops is not None and result.axis not in axes:
+        reasons += result.loops.verdict.reasons
+    return reasons[0] if reasons else None
 
 
 def _loops(found: LoopEstimate | None, axis: Axis | None) -> dict[str, Any] | None:

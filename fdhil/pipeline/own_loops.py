@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Sequence
 
 from fdhil.config import Axis, Identification
 from fdhil.identification.loops import better_loops, changed_regulators, identify_loops, with_loops
+from fdhil.identification.physical_bounds import bounded
 from fdhil.pipeline.analysis import analyse, own
 from fdhil.pipeline.own_resonance import softer_axis
 from fdhil.records import LoopEstimate, Parameters, Window, WindowOutcome
@@ -49,7 +50,7 @@ def mechanics_of(outcome: WindowOutcome, axis: Axis | None) -> Parameters | None
     """Return the parameters of a window's estimate, its winding filled up; None where K, Jt, ft or Cd is not told."""
     if outcome.estimate is None:
         return None
-    found = outcome.estimate.parameters()
+    found = bounded(outcome.estimate, outcome.window.direction).parameters()
     values = found.as_dict()
     winding = {"R": UNKNOWN_R, "L": UNKNOWN_L} if axis is None else {"R": axis.nominal.R, "L": axis.nominal.L}
     filled = {name: winding.get(name, value) if value != value else value for name, value in values.items()}

@@ -52,4 +52,8 @@ def test_model_is_not_written_where_rapids_refute_loops_that_none_replace(
     path = tmp_path / "model.json"
     write_model([REFUTED, VALID], CONFIG.axis, path)
     assert not path.exists()
-    assert "LoopsDiffer: rapids of axis X refute the configured regulators" in capsys.readouterr().err
+    assert "its loops would be wrong: axis X: LoopsDiffer: the loops are others" in capsys.readouterr().err
+    unexplained = Verdict(False, None, (Reason("LoopsUnexplained", "the best loops leave 30 um"),))
+    write_model([replace(VALID, loops=replace(PID, verdict=unexplained, configured_um=None))], {}, path)
+    assert not path.exists()
+    assert "axis X: LoopsUnexplained: the best loops leave 30 um" in capsys.readouterr().err
