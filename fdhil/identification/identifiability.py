@@ -13,6 +13,7 @@ from fdhil.records import PARAMETERS, Estimate, Float, Reason, Result
 CONDITION_LIMIT = 1e6
 RELATIVE_STD_LIMIT: Mapping[str, float] = {"R": 0.10, "L": 0.25, "K": 0.05, "Jt": 0.10, "ft": 0.5, "Cd": 0.5}
 FRICTION_SHARE, TORQUE_SHARE = 0.25, 0.02
+SIGNALS = "check the scale, sign and order of the signals"
 TOLD_BY_VOLTAGE = frozenset({"R", "L"})
 PHYSICAL: Mapping[str, tuple[float, float]] = {
     "R": (1e-3, 1e3),
@@ -105,15 +106,14 @@ def unphysical(estimate: Estimate, *, one_way: bool = False) -> list[Reason]:
     for name, (low, high) in PHYSICAL.items():
         value = estimate.value(name)
         if np.isfinite(value) and not low <= value <= high:
-            reasons.append(_outside(f"{name} = {value:.4g} lies outside {max(low, 0):.3g} to {high:.3g}"))
+            text = f"{name} = {value:.4g} lies outside {max(low, 0):.3g} to {high:.3g}"
+            reasons.append(Reason("Unphysical", text, SIGNALS))
     for bound, value in beyond_chance(estimate.names, estimate.values, estimate.covariance):
         if one_way and "Cd" in bound.weights:
             continue
         name = " + ".join(bound.weights)
         high = PHYSICAL[name][1] if name in PHYSICAL else np.inf
-        reasons.append(_outside(f"{name} = {value:.4g} lies outside {bound.least:.3g} to {high:.3g}"))
+        text = f"{name} = {value:.4g} lies outside {bound.least:.3g} to {high:.3g}"
+        advice = f"record rapids in both directions, as a weight may move the axis; else {SIGNALS}"
+        reasons.append(Reason("Unphysical", text, advice))
     return reasons
-
-
-def _outside(text: str) -> Reason:
-    return Reason("Unphysical", text, "check the scale, sign and order of the signals")

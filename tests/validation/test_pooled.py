@@ -13,6 +13,7 @@ from fdhil.pipeline import analyse, pool
 from fdhil.records import Reason, Verdict, WindowOutcome
 from studies import bench, drives, faults, real_plant
 from studies.scenes import demand_of, measured, recorded
+from tests.identification.realistic import rapids
 from tests.identification.recorded import windows
 from tests.validation.test_interruptions import SCENE
 
@@ -114,6 +115,20 @@ def test_a_counterweight_that_is_off_by_three_times_the_friction_is_told() -> No
     assert estimate is not None
     assert estimate.value("load") == pytest.approx(15.0, abs=0.02)
     assert estimate.value("Cd") == pytest.approx(5.0, rel=0.02)
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_weight_that_moves_the_axis_is_not_told_from_one_direction(number: int) -> None:
+    """Each window is sound: what resists the other direction, they do not tell."""
+    mechanics = real_plant.Mechanics(Cd=1.0, load_nm=5.8)
+    outcomes = [analyse(window, Identification()) for window in rapids(mechanics, moves=4)]
+    lowered = [outcome for outcome in outcomes if outcome.window.direction < 0][:number]
+    assert all(outcome.verdict.accepted for outcome in lowered)
+    _, verdict = pool(lowered, Identification())
+    (reason,) = verdict.reasons
+    assert reason.code == "Unphysical"
+    assert "both directions" in reason.advice
+    assert pool(outcomes, Identification())[1].accepted
 
 
 def test_a_winding_that_warms_is_followed_to_the_newest_window() -> None:
