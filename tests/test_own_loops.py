@@ -7,10 +7,11 @@ from dataclasses import replace
 import pytest
 
 from fdhil.config import Identification
+from fdhil.identification.loops import DIFFER
 from fdhil.identification.windows import find_windows
-from fdhil.pipeline import analyse, pool
+from fdhil.pipeline import AxisPipeline, Known, analyse, pool
 from fdhil.pipeline.own_loops import OwnLoops, better_axis, loops_of, mechanics_of, suspected
-from fdhil.records import WindowOutcome
+from fdhil.records import LoopEstimate, ParameterSet, Reason, Verdict, WindowOutcome, frozen
 from fdhil.validation.weight import LOOPS_DIFFER
 from studies.bench import shuttle
 from studies.real_plant import Loops, Mechanics, Sensors, recording, run
@@ -65,6 +66,14 @@ def test_a_running_machine_goes_on_with_its_own_loops(filtered: list[WindowOutco
     after_restart = OwnLoops(AXIS, SETTINGS, PERIOD_S, known=found)
     assert after_restart.axis is not None
     assert after_restart.axis.regulators == loops.axis.regulators
+
+
+def test_published_set_has_the_loops_it_was_validated_with(filtered: list[WindowOutcome]) -> None:
+    verdict = Verdict(True, None, (), 0.1, (Reason(DIFFER, "the configured ones leave 28 um"),))
+    found = LoopEstimate("X", "p_pi_pi", ("speed_filter_s",), frozen([1e-3]), frozen([[1e-10]]), verdict)
+    outcomes = AxisPipeline("X", bench_config("X"), known=Known(loops=found)).feed(filtered[0].window)
+    (published,) = (outcome for outcome in outcomes if isinstance(outcome, ParameterSet))
+    assert published.loops == {"speed_filter_s": 1e-3}
 
 
 def test_loops_that_explain_the_rapids_are_left_alone() -> None:

@@ -54,17 +54,17 @@ MOVE = short_move()
 
 
 @cache
-def identified(plant: real.Mechanics, seed: int) -> FileResult:
+def identified(plant: real.Mechanics) -> FileResult:
     """Return what ``fdhil identify`` makes of four rapids of a plant."""
     loops = real.SLOW_LOOPS if plant.Jt < 0.05 else None
-    outcomes = [analyse(window, Identification()) for window in rapids(plant, None, loops, moves=4, seed=seed)]
+    outcomes = [analyse(window, Identification()) for window in rapids(plant, None, loops, moves=4, seed=3)]
     estimate, verdict = pool(outcomes, Identification())
     return FileResult("recording.csv", "X", tuple(outcomes), estimate, verdict)
 
 
 def test_most_plants_are_validated() -> None:
     """Else there would be nothing to take."""
-    assert sum(identified(plant, 3).verdict.accepted for plant in PLANTS.values()) >= 9
+    assert sum(identified(plant).verdict.accepted for plant in PLANTS.values()) >= 9
 
 
 def model_of(told: dict[str, Any]) -> dict[str, Any]:
@@ -73,10 +73,9 @@ def model_of(told: dict[str, Any]) -> dict[str, Any]:
     return {**six, "terms": {name: figures["value"] for name, figures in told["terms"].items()}}
 
 
-@pytest.mark.parametrize("seed", [3, 4])
 @pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS)
-def test_validated_model_is_taken(plant: real.Mechanics, seed: int, tmp_path: Path) -> None:
-    result = identified(plant, seed)
+def test_validated_model_is_taken(plant: real.Mechanics, tmp_path: Path) -> None:
+    result = identified(plant)
     document = _file_document(result, {}, with_loops=False)
     told = [each for each in (*document["windows"], document["pooled"]) if each["validated"]]
     path = tmp_path / "model.json"

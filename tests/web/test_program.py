@@ -6,6 +6,7 @@ import asyncio
 import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import AsyncExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +22,15 @@ from fdhil.correction.learning import Lesson
 from fdhil.errors import ProgramError
 from fdhil.prediction.models import nominal_models
 from fdhil.program import load_trajectory
+from fdhil.store.history import History
 from fdhil.store.lessons import lesson_path, write_lesson
+from fdhil.store.rows import Stamp
 from fdhil.web.answers import Refused
 from fdhil.web.app import make_app
 from fdhil.web.forecast import desk, process
 from fdhil.web.forecast.view import knots
 from tests.bench import bench_config
+from tests.store.made import published
 
 PROGRAM = Path(__file__).parents[2] / "configs" / "programs" / "bench_10m.ngc"
 LONG_ENOUGH_S = 300.0
@@ -120,6 +124,18 @@ def test_a_dropped_program_says_what_the_command_says(judged: dict[str, Any], pl
         (zone.max_um for zone in planned.before.zones), reverse=True
     )
     assert {zone["place"] for zone in told["zones"]} >= {1, 2, 3, 4}
+
+
+def test_forecast_uses_the_loops_that_the_newest_set_was_validated_with(tmp_path: Path) -> None:
+    own = bench_config(folder=tmp_path)
+    with History.open(own.store.directory) as history:
+        found = replace(published(), config_digest=own.digest, loops={"speed_filter_s": 0.002})
+        history.add_revision(found, [], Stamp.now())
+    models, told, used = process.newest_models(load_trajectory(PROGRAM, own), own)
+    assert models["X"] == found.parameters
+    assert (told["X"]["revision"], told["Y"]["revision"]) == (1, 0)
+    assert used.axis["X"].regulators.speed_filter_s == 0.002
+    assert used.axis["Y"] == own.axis["Y"]
 
 
 def test_few_points_keep_the_largest_error_and_stay_on_the_path(
