@@ -40,7 +40,7 @@ Loops = Mapping[str, Mapping[str, float | str]]
 
 
 class ModelFile(NamedTuple):
-    """What a model file says of each axis."""
+    """What a model file says of each axis; one without a table of loops has none in ``loops``."""
 
     parameters: dict[str, Parameters]
     loops: Loops
@@ -80,7 +80,7 @@ def load_model_file(path: Path) -> ModelFile:
     if faults:
         raise ConfigError(str(path), faults[:MOST_FAULTS])
     known = {axis: model for axis, model in models.items() if model is not None}
-    return ModelFile(known, {axis: values for axis, values in loops.items() if values})
+    return ModelFile(known, {axis: values for axis, values in loops.items() if "loops" in document[axis]})
 
 
 def with_loops(config: MachineConfig, loops: Loops, source: str) -> MachineConfig:
@@ -110,24 +110,23 @@ def validated_models(
             continue
         if published.config_digest == config.digest:
             loops[axis] = published.loops
-        elif fault := _refuted(axis, published.loops, config.axis[axis].regulators):
-            faults.append(fault)
+        elif apart := loops_apart(published.loops, config.axis[axis].regulators):
+            text = f"LoopsDiffer: the rapids showed other loops ({apart}), and the configuration has been changed since"
+            advice = "enter what the rapids showed, or let the machine make a few rapids with this configuration"
+            faults.append(ConfigFault(f"axis.{axis}.regulators", text, advice))
     if faults:
         raise ConfigError(source, faults)
     return models, with_loops(config, loops, source)
 
 
-def _refuted(axis: str, loops: Mapping[str, float | str], regulators: Regulators) -> ConfigFault | None:
-    """Return the fault of regulators that are configured otherwise than the drive showed them; None if they agree."""
-    pairs = {key: (getattr(regulators, key), shown) for key, shown in loops.items()}
-    apart = {key: pair for key, pair in pairs.items() if not _agree(*pair)}
-    if not apart:
-        return None
-    listed = ", ".join(f"{key} {shown:.4g} for {has:.4g}" if key != "structure" else f"{key} {shown} for {has}"
-                       for key, (has, shown) in apart.items())  # fmt: skip
-    text = f"LoopsDiffer: the rapids showed other loops ({listed}), and the configuration has been changed since"
-    advice = "enter what the rapids showed, or let the machine make a few rapids with this configuration"
-    return ConfigFault(f"axis.{axis}.regulators", text, advice)
+def loops_apart(loops: Mapping[str, float | str], regulators: Regulators) -> str:
+    """Return where loops that rapids showed differ from the configured regulators, for people; empty: nowhere."""
+    pairs = [(key, shown, getattr(regulators, key)) for key, shown in loops.items()]
+    return ", ".join(f"{key} {_brief(shown)} for {_brief(has)}" for key, shown, has in pairs if not _agree(has, shown))
+
+
+def _brief(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:.4g}"
 
 
 def _agree(configured: float | str, shown: float | str) -> bool:

@@ -21,6 +21,7 @@ from fdhil.store.history import History
 from fdhil.store.rows import Stamp
 from studies import real_plant as real
 from tests.bench import bench_toml
+from tests.cli.test_predict import invoke as run
 from tests.identification.test_loops import shuttle
 from tests.paths import bench_trajectory, rms
 from tests.store.made import published
@@ -78,6 +79,15 @@ def test_correction_from_the_history_uses_the_loops_of_the_published_sets(shop: 
         for axis in "XY":
             history.add_revision(replace(found, axis=axis), [], Stamp.now())
     assert_corrected(shop, "--from-history")
+    older = {axis: {k: v for k, v in json.loads(shop.model.read_text())["X"].items() if k != "loops"} for axis in "XY"}
+    path = shop.folder / "older.json"
+    path.write_text(json.dumps(older))
+    refused = run("correct", shop.folder / "demand.csv", "--config", shop.config, "--model", path)
+    assert refused.exit_code == 2
+    assert "X.loops: LoopsDiffer: is missing" in refused.stderr
+    assert "speed_filter_s 0.002" in refused.stderr
+    path.write_text(json.dumps({axis: model | {"loops": {}} for axis, model in older.items()}))  # said to be right
+    assert run("predict", shop.folder / "demand.csv", "--config", shop.config, "--model", path).exit_code == 0
 
 
 def test_model_of_recordings_without_a_configuration_says_that_its_loops_are_not_confirmed(shop: Shop) -> None:
