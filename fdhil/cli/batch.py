@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from fdhil.store import suffixes
 from fdhil.store.accelerometer_csv import with_accelerometer
 from fdhil.store.column_map import ColumnMap
 from fdhil.store.recording_parquet import stored_window
-from fdhil.store.recording_table import SOURCES
+from fdhil.store.recording_table import NOTES, RECORD_HZ, SLOW_HZ, SOURCES
 from fdhil.store.recordings import read_recording
 
 MANY_FILES = 16  # from here on further processes pay for their start
@@ -121,7 +121,7 @@ def analyse_file(
     outcomes, loops = analyse_windows(windows, settings, axis, period_s, _outcomes, step)
     estimate, verdict = pool(outcomes, settings)
     step()
-    return FileResult(str(path), recorded.axis, tuple(outcomes), estimate, verdict, loops=loops)
+    return FileResult(str(path), recorded.axis, tuple(outcomes), estimate, _of_reading(recorded, verdict), loops=loops)
 
 
 def _read(path: Path, accelerometer: Path | None, columns: ColumnMap | None) -> Recording | Window:
@@ -133,6 +133,19 @@ def _read(path: Path, accelerometer: Path | None, columns: ColumnMap | None) -> 
         return stored
     recording = read_recording(path, columns)
     return recording if accelerometer is None else with_accelerometer(recording, accelerometer)
+
+
+def _of_reading(recorded: Recording | Window, verdict: Verdict) -> Verdict:
+    """Return the verdict with what its file explains: numbers changed as they were read, and samples far apart."""
+    notes = None if isinstance(recorded, Window) else recorded.headers.get(NOTES)
+    if notes is not None:
+        read = Reason("ReadOtherwise", notes, "compare with the file")
+        verdict = replace(verdict, warnings=(*verdict.warnings, read))
+    if verdict.accepted or recorded.dt_s <= 1 / SLOW_HZ:
+        return verdict
+    text = f"{1 / recorded.dt_s:.4g} Hz is too slow to follow how a drive accelerates"
+    slow = Reason("LowExcitation", text, f"record at {RECORD_HZ} Hz or faster")
+    return replace(verdict, reasons=(slow, *verdict.reasons))
 
 
 def _windows(recorded: Recording | Window, axis: Axis | None) -> list[Window]:

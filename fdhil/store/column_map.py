@@ -18,7 +18,18 @@ from fdhil.config.section import Finite, Section
 from fdhil.csv_text import shown
 from fdhil.errors import ConfigError, ConfigFault, RecordingError
 from fdhil.records import Float
-from fdhil.store.recording_table import COLUMNS, FORMAT, REQUIRED, SAMPLING, VOLTAGE, RecordingTable
+from fdhil.store.counter_wraps import unwrap_counter
+from fdhil.store.recording_table import (
+    COLUMNS,
+    FORMAT,
+    NOTES,
+    REQUIRED,
+    SAMPLING,
+    VOLTAGE,
+    RecordingTable,
+    unlike_lengths,
+)
+from fdhil.store.sample_times import even_times, usual_step
 from fdhil.store.trace_text import TraceText
 
 SHOWN_NAMES = 12
@@ -34,6 +45,7 @@ FACTORS: Mapping[str, Mapping[str, float]] = {
     "table_mm": {"mm": 1.0, "m": 1e3, "um": 1e-3},
     "table_m_s2": {"m/s2": 1.0, "mm/s2": 1e-3, "g": 9.80665},
 }  # fmt: skip
+COUNTED = ("time_s", "position_m", "demand_m")  # what a counter may count
 Signal = Literal[
     "time_s", "voltage_V", "current_A", "speed_rad_per_s", "position_m", "demand_m", "table_mm", "table_m_s2"
 ]
@@ -98,42 +110,123 @@ def _faults(told: ColumnMap) -> list[ConfigFault]:
 def mapped(raw: RecordingTable, told: ColumnMap, source: str) -> RecordingTable:
     """Return the recording that a file is by its map; rows that lack a value are left out, which makes a gap.
 
-    RecordingError when a column is not in the file, or the rest is wrong.
+    What was done to the numbers is in its header ``import_notes``. RecordingError when a column is not in the file, or
+    the rest is wrong.
     """
     headers = {"format": FORMAT, **raw.headers, **{key: _text(value) for key, value in told.headers.items()}}
-    pitch_m = _number(headers.get("pitch_m_per_rev"), source)
-    columns: dict[str, Float] = {
-        signal: np.sum([_column(raw, c, _factor(signal, c.unit, pitch_m), source) for c in _as_tuple(of)], axis=0)
-        for signal, of in told.columns.items()
-    }
+    pitch_m = _positive(headers.get("pitch_m_per_rev"), "pitch_m_per_rev", "a length above 0, in m", source)
+    rate_hz = None
+    if "sample_rate_hz" in headers:
+        rate_hz = _positive(headers["sample_rate_hz"], "sample_rate_hz", "a number above 0", source)
+    raw = _sampled_together(raw, told, source)
+    columns, notes = _signals(raw, told, pitch_m, source)
     if "time_s" not in columns:
-        columns["time_s"] = _column(raw, Column(name="time_s", unit="s"), 1.0, source)
+        columns = {"time_s": _time(raw, rate_hz, len(columns["position_m"]), source), **columns}
+    _check_lengths(columns, source)
     whole = np.isfinite(np.column_stack([columns[name] for name in columns if not name.startswith("table_")])).all(1)
     columns = {name: values[whole] for name, values in columns.items()}
     if columns["time_s"].size < 2:
         raise RecordingError(f"{source} has no row in which every mapped column has a number: correct the column map")
-    columns["time_s"] = np.round(columns["time_s"] - columns["time_s"][0], 9)
-    step_s = float(np.median(np.diff(columns["time_s"])))
-    if "sample_rate_hz" not in headers and step_s > 0:
-        headers["sample_rate_hz"] = f"{1 / step_s:.9g}"
+    time_s, note = even_times(np.round(columns["time_s"] - columns["time_s"][0], 9), rate_hz, source)
+    columns["time_s"] = np.round(time_s, 9)
+    if rate_hz is None and (period_s := usual_step(columns["time_s"])) > 0:
+        headers["sample_rate_hz"] = f"{1 / period_s:.9g}"
     if "speed_rad_per_s" not in columns:
         turned = np.diff(columns["position_m"]) / np.diff(columns["time_s"]) * 2 * math.pi / pitch_m
         columns["speed_rad_per_s"] = np.concatenate([[0.0], turned])
         headers["speed_source"] = "difference"
+    if notes := [*notes, *([note] if note else [])]:
+        headers[NOTES] = "; ".join(notes)
     return RecordingTable(headers, columns)
+
+
+def _sampled_together(raw: RecordingTable, told: ColumnMap, source: str) -> RecordingTable:
+    """Return those columns of a file that have one time and all that the map names."""
+    names = dict.fromkeys(column.name for columns in told.columns.values() for column in _as_tuple(columns))
+    tables = [raw, *raw.others]
+    having = [table for table in tables if all(name in table.columns or name in table.doubts for name in names)]
+    if len(having) == 1:
+        return having[0]
+    for name in names:
+        if not any(name in table.columns or name in table.doubts for table in tables):
+            raise RecordingError(
+                f"{source} has no column {shown(name)}; it has {_what_it_has(*tables)}: correct the column map"
+            )
+    listed = ", ".join(map(shown, names))
+    if not having:
+        raise RecordingError(
+            f"{source} has no group with all of {listed}: they are sampled at other times; record or export them with "
+            "one sample time"
+        )
+    sizes = " and ".join(f"{table.columns['time_s'].size} rows" for table in having)
+    raise RecordingError(
+        f"{source} has {listed} in {len(having)} groups of samples ({sizes}): export the one that is meant alone"
+    )
+
+
+def _signals(raw: RecordingTable, told: ColumnMap, pitch_m: float, source: str) -> tuple[dict[str, Float], list[str]]:
+    """Return the signals that the map gives, and what was done to them."""
+    signals: dict[str, Float] = {}
+    notes: dict[str, None] = {}  # in order, each once
+    found: dict[int, str] = {}
+    for signal, of in told.columns.items():
+        parts = []
+        for column in _as_tuple(of):
+            values = _column(raw, column.name, source)
+            other = found.setdefault(id(values), column.name)
+            if other != column.name and not {other[0], column.name[0]} & {"#"}:
+                raise RecordingError(
+                    f"{source} has {shown(other)} and {shown(column.name)} above one column: its head "
+                    "lists signals one a line; say by #1, #2 ... from the left which column each is"
+                )
+            if signal in COUNTED:
+                values, bits = unwrap_counter(values)
+                if bits is not None:
+                    text = f"{column.name} jumps by 2^{bits} as a counter of {bits} bits does, and was unwrapped"
+                    notes[text] = None
+            factor = 1.0 if column.name in raw.clocks and signal == "time_s" else _factor(signal, column.unit, pitch_m)
+            parts.append((values * column.factor + column.offset) * factor)
+        if len({part.size for part in parts}) == 1:
+            signals[signal] = np.sum(parts, axis=0)
+        else:
+            _check_lengths({c.name: part for c, part in zip(_as_tuple(of), parts, strict=True)}, source)
+    return signals, [*notes]
+
+
+def _time(raw: RecordingTable, rate_hz: float | None, rows: int, source: str) -> Float:
+    """Return the file's own time, else the rows' numbers by their rate."""
+    if "time_s" in raw.columns or "time_s" in raw.doubts:
+        return _column(raw, "time_s", source)
+    if rate_hz is None:
+        raise RecordingError(
+            f"{source} has no column 'time_s'; it has {_what_it_has(raw)}: say in the column map which is "
+            "time_s, or give sample_rate_hz under [headers] where the rows have no time"
+        )
+    if raw.interruption:
+        raise RecordingError(
+            f"{source}: {raw.interruption}, and without times it is unknown how many samples are lost there: export it "
+            "with a time"
+        )
+    return np.arange(rows) / rate_hz
+
+
+def _check_lengths(columns: Mapping[str, Float], source: str) -> None:
+    sizes = {name: values.size for name, values in columns.items()}
+    if len(set(sizes.values())) > 1:
+        raise unlike_lengths(sizes, source)
 
 
 def _text(value: str | float) -> str:
     return value if isinstance(value, str) else repr(value)
 
 
-def _number(text: str | None, source: str) -> float:
+def _positive(text: str | None, key: str, what: str, source: str) -> float:
     try:
         value = float(text or "")
     except ValueError:
         value = math.nan
-    if not value > 0:
-        raise RecordingError(f"{source}: header pitch_m_per_rev of the column map must be a length above 0, in m")
+    if not 0 < value < math.inf:
+        raise RecordingError(f"{source}: header {key} of the column map must be {what}")
     return value
 
 
@@ -143,12 +236,18 @@ def _factor(signal: str, unit: str, pitch_m: float) -> float:
     return FACTORS[signal][unit]
 
 
-def _column(raw: RecordingTable, column: Column, factor: float, source: str) -> Float:
-    if column.name not in raw.columns:
-        names = [shown(name) for name in raw.columns if not name.startswith("#")][:SHOWN_NAMES]
-        raise RecordingError(
-            f"{source} has no column {shown(column.name)}, or one sampled at other times; it has {', '.join(names)}: "
-            "correct the column map"
-        )
-    values: Float = (raw.columns[column.name] * column.factor + column.offset) * factor
-    return values
+def _column(raw: RecordingTable, name: str, source: str) -> Float:
+    if name in raw.doubts:
+        raise RecordingError(f"{source}: {shown(name)} {raw.doubts[name]}")
+    return raw.columns[name]
+
+
+def _what_it_has(*tables: RecordingTable) -> str:
+    """Return what a map may name; never nothing."""
+    every = dict.fromkeys(name for table in tables for name in (*table.columns, *table.doubts))
+    names = [shown(name) for name in every if not name.startswith("#")]
+    places = [name for name in every if name.startswith("#")]
+    listed = [", ".join(names[:SHOWN_NAMES])] if names else []
+    if places:
+        listed.append(f"{places[0]} to {places[-1]}" if len(places) > 1 else places[0])
+    return " and ".join(listed) or "no columns of numbers"

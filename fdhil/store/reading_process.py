@@ -18,6 +18,7 @@ import subprocess
 import sys
 import traceback
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib import import_module
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
@@ -212,9 +213,12 @@ def _parts(reader: Any, content: bytes, source: str) -> Iterator[bytes]:
     except FdhilError as error:
         yield json.dumps({"error": type(error).__name__, "text": str(error)}).encode()
         return
-    yield json.dumps({"headers": dict(table.headers), "columns": [*table.columns]}).encode()
-    for values in table.columns.values():
-        yield np.asarray(values, dtype=np.float64).tobytes()
+    yield json.dumps({"tables": 1 + len(table.others)}).encode()
+    for each in (table, *table.others):
+        told = {"headers": dict(each.headers), "columns": [*each.columns], "clocks": [*each.clocks]}
+        yield json.dumps({**told, "doubts": dict(each.doubts)}).encode()
+        for values in each.columns.values():
+            yield np.asarray(values, dtype=np.float64).tobytes()
 
 
 def receive(asked: Connection) -> RecordingTable | FdhilError:
@@ -223,8 +227,14 @@ def receive(asked: Connection) -> RecordingTable | FdhilError:
     if "error" in told:
         refusal: FdhilError = getattr(errors, told["error"])(told["text"])
         return refusal
+    first, *others = [_table(asked) for _ in range(told["tables"])]
+    return replace(first, others=tuple(others))
+
+
+def _table(asked: Connection) -> RecordingTable:
+    told = json.loads(asked.recv_bytes())
     columns = {name: np.frombuffer(asked.recv_bytes()).copy() for name in told["columns"]}
-    return RecordingTable(told["headers"], columns)
+    return RecordingTable(told["headers"], columns, frozenset(told["clocks"]), told["doubts"])
 
 
 if __name__ == "__main__":

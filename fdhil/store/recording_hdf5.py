@@ -9,10 +9,12 @@ import numpy as np
 
 from fdhil.errors import FdhilError
 from fdhil.records import Float
+from fdhil.store.matlab_variables import MOST_DEPTH, matlab_table, texts
 from fdhil.store.reading_process import read_apart
 from fdhil.store.recording_table import UNITS, UNREADABLE, RecordingTable, check_size, unreadable
 
 KIND = "HDF5 file"
+MATLAB = "MATLAB 7.3 file"
 MOST_DATASETS = 1000
 
 
@@ -38,9 +40,9 @@ def read(content: bytes, source: str) -> RecordingTable:
     try:
         with h5py.File(io.BytesIO(content), "r") as file:
             found = _vectors(file, h5py)
-            check_size(max((stored.size for stored in found.values()), default=0), len(found), source)
+            check_size(max((max(stored.shape) for stored, _ in found.values()), default=0), len(found), source)
             columns: dict[str, Float] = {
-                name: np.asarray(stored[()], dtype=np.float64).ravel() for name, stored in found.items()
+                name: np.asarray(stored[part], dtype=np.float64).ravel() for name, (stored, part) in found.items()
             }
             headers = {str(key): _text(value) for key, value in file.attrs.items()}
     except UNREADABLE as error:
@@ -48,14 +50,69 @@ def read(content: bytes, source: str) -> RecordingTable:
     return RecordingTable(headers, columns)
 
 
-def _vectors(file: Any, h5py: Any) -> dict[str, Any]:
-    """Return the datasets of real numbers along one dimension, by path; links out of the file are not followed."""
+def read_matlab(content: bytes, source: str) -> RecordingTable:
+    """Return the table of a file of MATLAB 7.3, in this process, which a damaged file may end."""
+    h5py = library()
+    try:
+        with h5py.File(io.BytesIO(content), "r") as file:
+            names = [name for name in file if not name.startswith("#")][:MOST_DATASETS]
+            sizes: list[int] = []
+            variables = {name: _variable(file, file[name], h5py, sizes, source) for name in names}
+    except UNREADABLE as error:
+        raise unreadable(source, MATLAB, error) from None
+    return matlab_table(variables, texts(variables.pop("headers", None)), source)
+
+
+def _variable(file: Any, item: Any, h5py: Any, sizes: list[int], source: str, depth: int = 0) -> Any:
+    """Return a variable as MATLAB has it; ``sizes`` of what was read so far keep all of it within a recording's."""
+    kind = _text(item.attrs.get("MATLAB_class", b""))
+    if depth > MOST_DEPTH or len(sizes) > MOST_DATASETS:
+        return None
+    if isinstance(item, h5py.Group):
+        fields = {name: _variable(file, item[name], h5py, sizes, source, depth + 1) for name in item}
+        return _listed(fields)
+    if "MATLAB_empty" in item.attrs or item.external or item.is_virtual:
+        return "" if kind == "char" else np.zeros(0)
+    sizes.append(item.size)
+    check_size(sum(sizes), 1, source)
+    if item.dtype.kind == "O" and h5py.check_ref_dtype(item.dtype):
+        places = item[()].T.ravel()[:MOST_DATASETS]
+        parts = [_variable(file, file[place], h5py, sizes, source, depth + 1) for place in places]
+        return parts if kind == "cell" else tuple(parts)
+    if kind == "char":
+        return "".join(map(chr, item[()].T.ravel()))
+    return item[()].T if item.dtype.kind in "fiub" else None
+
+
+def _listed(fields: dict[str, Any]) -> Any:
+    """Return a structure; of an array of them, each field of which is a tuple, the list."""
+    if not fields or not all(isinstance(part, tuple) for part in fields.values()):
+        return fields
+    return [dict(zip(fields, parts, strict=True)) for parts in zip(*fields.values(), strict=True)]
+
+
+def _vectors(file: Any, h5py: Any) -> dict[str, tuple[Any, Any]]:
+    """Return the dataset and the part of it of each vector of real numbers, by path, not of links out of the file.
+
+    A column of a matrix is ``path[:,0]`` or ``path[0,:]``, a field of a table ``path/field``.
+    """
     found: dict[str, Any] = {}
 
     def look(name: str, item: Any) -> None:
-        plain = isinstance(item, h5py.Dataset) and not item.external and not item.is_virtual
-        if plain and item.dtype.kind in "fiu" and item.size == max(item.shape or (0,)) and len(found) < MOST_DATASETS:
-            found[name] = item
+        if not isinstance(item, h5py.Dataset) or item.external or item.is_virtual or len(found) >= MOST_DATASETS:
+            return
+        shape = item.shape or (0,)
+        if item.dtype.names and len(shape) == 1:
+            for field in item.dtype.names:
+                if item.dtype[field].kind in "fiu" and not item.dtype[field].shape:
+                    found[f"{name}/{field}"] = (item, field)
+        elif item.dtype.kind in "fiu" and item.size == max(shape):
+            found[name] = (item, ())
+        elif item.dtype.kind in "fiu" and len(shape) == 2 and min(shape) <= MOST_DATASETS:
+            is_tall = shape[0] == max(shape)
+            for k in range(min(shape)):
+                place = (slice(None), k) if is_tall else (k, slice(None))
+                found[f"{name}[:,{k}]" if is_tall else f"{name}[{k},:]"] = (item, place)
 
     file.visititems(look)
     return found

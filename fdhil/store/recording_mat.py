@@ -7,17 +7,19 @@ scipy's process, so it is read in one of its own.
 from __future__ import annotations
 
 import io
+import math
 from typing import Any
 
-import numpy as np
-
+from fdhil.store.matlab_variables import MOST_DEPTH, matlab_table, texts
 from fdhil.store.reading_process import read_apart
 from fdhil.store.recording_table import UNITS, UNREADABLE, RecordingTable, check_size, unreadable
 
 KIND = "MATLAB file"
 MOST_VARIABLES = 1000
 _V73 = b"MATLAB 7.3"
-_NUMBERS = {"double", "single", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"}
+_NUMBERS = {"double", "single", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "logical"}
+_READ = _NUMBERS | {"struct", "cell"}
+_OBJECTS = {"object", "opaque", "function", "sparse"}
 
 
 def encode(table: RecordingTable) -> bytes:
@@ -39,30 +41,32 @@ def read(content: bytes, source: str) -> RecordingTable:
     if content.startswith(_V73):
         from fdhil.store import recording_hdf5
 
-        return recording_hdf5.read(content, source)
+        return recording_hdf5.read_matlab(content, source)
     scipy_io = library()
     try:
         told = scipy_io.whosmat(io.BytesIO(content))
-        vectors = [name for name, shape, kind in told[:MOST_VARIABLES] if kind in _NUMBERS and _is_vector(shape)]
-        check_size(max((max(shape) for name, shape, _ in told if name in vectors), default=0), len(vectors), source)
-        wanted = [*vectors, *(name for name, shape, kind in told if (name, kind) == ("headers", "struct"))]
-        read: dict[str, Any] = scipy_io.loadmat(io.BytesIO(content), variable_names=wanted, squeeze_me=True)
-        columns = {name: np.atleast_1d(np.asarray(read[name], dtype=np.float64)) for name in vectors}
-        headers = _texts(read.get("headers"))
+        wanted = [(name, shape) for name, shape, kind in told[:MOST_VARIABLES] if kind in _READ]
+        check_size(max((math.prod(shape) for _, shape in wanted), default=0), 1, source)
+        names = [name for name, _ in wanted]
+        read: dict[str, Any] = scipy_io.loadmat(io.BytesIO(content), variable_names=names, simplify_cells=False)
+        variables = {name: _plain(read[name]) for name in names if name in read}
+        variables |= {str(name): None for name, _, kind in told if kind in _OBJECTS}
     except (scipy_io.matlab.MatReadError, *UNREADABLE) as error:
         raise unreadable(source, KIND, error) from None
-    return RecordingTable(headers, columns)
+    return matlab_table(variables, texts(variables.pop("headers", None)), source)
 
 
-def _is_vector(shape: tuple[int, ...]) -> bool:
-    return len(shape) == 2 and min(shape) == 1
-
-
-def _texts(headers: Any) -> dict[str, str]:
-    """Return the fields of a struct of texts; of any other value nothing."""
-    if headers is None or getattr(headers, "dtype", None) is None or headers.dtype.names is None:
-        return {}
-    return {name: str(headers[name]) for name in headers.dtype.names}
+def _plain(value: Any, depth: int = 0) -> Any:
+    """Return scipy's value with structures as mappings, arrays of structures and cells as lists, and texts as such."""
+    kind = getattr(getattr(value, "dtype", None), "kind", "")
+    if kind == "V" and value.dtype.names and depth < MOST_DEPTH:
+        parts = [{name: _plain(part[name], depth + 1) for name in value.dtype.names} for part in value.ravel()]
+        return parts[0] if len(parts) == 1 else parts
+    if kind == "O" and depth < MOST_DEPTH:
+        return [_plain(part, depth + 1) for part in value.ravel()]
+    if kind in "US":
+        return str(value.ravel()[0]) if value.size == 1 else ""
+    return value
 
 
 def library() -> Any:

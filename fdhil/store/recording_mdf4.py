@@ -11,6 +11,7 @@ import html
 import io
 import json
 import re
+from dataclasses import replace
 from typing import Any
 from xml.parsers.expat import ExpatError
 
@@ -19,9 +20,10 @@ import numpy as np
 from fdhil.errors import FdhilError
 from fdhil.records import Float
 from fdhil.store.reading_process import read_apart
-from fdhil.store.recording_table import UNITS, UNREADABLE, RecordingTable, check_size, unreadable
+from fdhil.store.recording_table import COLUMNS, UNITS, UNREADABLE, RecordingTable, check_size, unreadable
 
 KIND = "MDF 4 file"
+MASTER = (2, 3)  # channel types of MDF 4 that give the time, as recorded or by the number of the sample
 _COMMENT = re.compile(r"<TX>(.*?)</TX>", re.DOTALL)
 
 
@@ -43,7 +45,7 @@ def encode(table: RecordingTable) -> bytes:
 
 
 def decode(content: bytes, source: str) -> RecordingTable:
-    """Return the channels of the largest group, and of those sampled with it; ``time_s`` is the group's own time.
+    """Return the channels of each group, and of those sampled with it; ``time_s`` is the group's own time.
 
     RecordingError when it is no MDF file.
     """
@@ -59,26 +61,46 @@ def read(content: bytes, source: str) -> RecordingTable:
         with asammdf.MDF(io.BytesIO(content)) as file:
             rows = [group.channel_group.cycles_nr for group in file.groups]
             check_size(max(rows, default=0), sum(len(group.channels) for group in file.groups), source)
-            return RecordingTable(_headers(str(file.header.comment)), _channels(file, rows))
+            headers = _headers(str(file.header.comment))
+            tables = [RecordingTable(headers, columns, frozenset(), doubts) for columns, doubts in _groups(file, rows)]
     except UnboundLocalError:  # the library's own, where a file says that it is unfinished and has no block to finish
         raise unreadable(source, KIND, ValueError("it is unfinished, or damaged")) from None
     except (asammdf.blocks.utils.MdfException, ExpatError, *UNREADABLE) as error:
         raise unreadable(source, KIND, error) from None
+    # of a recording of fdhil the group that has its columns, of any other the largest
+    tables.sort(
+        key=lambda table: (sum(n in table.columns for n in COLUMNS), table.columns["time_s"].size), reverse=True
+    )
+    return replace(tables[0], others=tuple(tables[1:])) if tables else RecordingTable({}, {})
 
 
-def _channels(file: Any, rows: list[int]) -> dict[str, Float]:
-    if not rows:
-        return {}
-    time_s = np.asarray(file.get_master(int(np.argmax(rows))), dtype=np.float64)
-    columns: dict[str, Float] = {"time_s": time_s}
+def _groups(file: Any, rows: list[int]) -> list[tuple[dict[str, Float], dict[str, str]]]:
+    """Return the channels of the groups that were sampled at the same times, ``time_s`` among them, and their doubts.
+
+    What a file marks as invalid is ``nan``.
+    """
+    groups: list[tuple[dict[str, Float], dict[str, str]]] = []
     for k, group in enumerate(file.groups):
-        if rows[k] != time_s.size or not np.array_equal(file.get_master(k), time_s):
-            continue  # sampled at other times
+        if not rows[k]:
+            continue
+        time_s = np.asarray(file.get_master(k), dtype=np.float64)
+        columns, doubts = next((g for g in groups if np.array_equal(g[0]["time_s"], time_s)), ({"time_s": time_s}, {}))
+        if len(columns) == 1:
+            groups.append((columns, doubts))
         for j, channel in enumerate(group.channels):
-            values = np.asarray(file.get(group=k, index=j).samples)
-            if values.ndim == 1 and values.dtype.kind in "fiu":
-                columns.setdefault(channel.name, values.astype(np.float64))
-    return columns
+            samples, invalid = file.get(group=k, index=j, samples_only=True, ignore_invalidation_bits=True)
+            values = np.asarray(samples)
+            if values.ndim != 1 or values.dtype.kind not in "fiu":
+                doubts.setdefault(channel.name, "is a channel of texts or arrays: map one of numbers")
+                continue
+            is_time = channel.channel_type in MASTER
+            if channel.name in columns and not is_time and channel.name != "time_s":
+                doubts[channel.name] = "is the name of two channels with the same times: export the one that is meant"
+            values = values.astype(np.float64)
+            if invalid is not None:
+                values[np.asarray(invalid, dtype=bool)] = np.nan
+            columns.setdefault(channel.name, values)
+    return groups
 
 
 def _headers(comment: str) -> dict[str, str]:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from fdhil.records import Window
+from fdhil.records import Float, Window
 from fdhil.store.export import table_of
 from fdhil.store.recording_table import FORMAT, UNITS, UNREADABLE, RecordingTable, check_size, unreadable
 from fdhil.store.windows import FORMAT as WINDOW_FORMAT
@@ -37,12 +39,57 @@ def decode(content: bytes, source: str) -> RecordingTable:
             return table_of(decode_window(content, source))
         told = file.metadata
         check_size(told.num_rows, told.num_columns, source)
-        numeric = [f.name for f in file.schema_arrow if pa.types.is_floating(f.type) or pa.types.is_integer(f.type)]
-        read = file.read(columns=numeric)
-        columns = {name: np.asarray(read.column(name).to_numpy(), dtype=np.float64) for name in numeric}
+        kinds = [*_kinds(file.schema_arrow)]
+        read = file.read(columns=[name for name, kind in kinds if _is_number(kind) or pa.types.is_temporal(kind)])
+        columns, clocks, doubts = _columns(read)
+        others = {name: kind for name, kind in kinds if name not in columns and name not in doubts}
+        doubts |= {name: f"is of type {kind}: write it as a number or a time" for name, kind in others.items()}
     except (pa.ArrowException, *UNREADABLE) as error:
         raise unreadable(source, "Parquet file", error) from None
-    return RecordingTable({str(key): str(value) for key, value in headers.items()}, columns)
+    return RecordingTable({str(key): str(value) for key, value in headers.items()}, columns, clocks, doubts)
+
+
+def _kinds(fields: Iterable[pa.Field], above: str = "") -> Iterator[tuple[str, pa.DataType]]:
+    """Yield name and type of each column, of a field of a structure as ``structure.field``."""
+    for field in fields:
+        if pa.types.is_struct(field.type):
+            yield from _kinds(field.type, f"{above}{field.name}.")
+        else:
+            yield f"{above}{field.name}", field.type
+
+
+def _columns(read: pa.Table) -> tuple[dict[str, Float], frozenset[str], dict[str, str]]:
+    """Return the columns of numbers and times, which of them are times in s, and why a name stands for none."""
+    while any(pa.types.is_struct(field.type) for field in read.schema):
+        read = read.flatten()
+    columns: dict[str, Float] = {}
+    clocks: set[str] = set()
+    doubts: dict[str, str] = {}
+    for k, field in enumerate(read.schema):
+        places = read.schema.get_all_field_indices(field.name)
+        if len(places) > 1:
+            doubts[field.name] = f"stands above {len(places)} columns: write them with different names"
+        elif pa.types.is_temporal(field.type):
+            columns[field.name] = _seconds(read.column(k))
+            clocks.add(field.name)
+        else:
+            columns[field.name] = np.asarray(read.column(k).cast(pa.float64(), safe=False).to_numpy())
+    return columns, frozenset(clocks), doubts
+
+
+def _is_number(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_decimal(kind))
+
+
+def _seconds(times: pa.ChunkedArray) -> Float:
+    """Return times, durations or times of day in s from the first on; a lost one is ``nan``."""
+    kind = times.type
+    if pa.types.is_date(kind):
+        return np.asarray(times.cast(pa.timestamp("s")).cast(pa.int64()).cast(pa.float64()).to_numpy())
+    counts = times.cast(pa.int32() if kind.bit_width == 32 else pa.int64())
+    first = next((value.as_py() for value in counts if value.is_valid), 0)
+    per_s = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}[kind.unit]
+    return np.asarray(pc.subtract(counts, pa.scalar(first, counts.type)).cast(pa.float64()).to_numpy()) / per_s
 
 
 def is_recording(path: Path) -> bool:

@@ -10,7 +10,7 @@ import math
 import struct
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -24,6 +24,7 @@ VOLTAGE = "voltage_V"
 TABLE = ("table_mm", "table_m_s2")  # sensors at the table, which may have lost rows
 REQUIRED = ("format", "sample_rate_hz", "axis", "pitch_m_per_rev")
 SAMPLING = "voltage_sampling"  # required where there is a voltage
+NOTES = "import_notes"  # header: what was done to another program's numbers as they were read
 SOURCES: Mapping[str, tuple[str, ...]] = {
     "speed_source": ("sensor", "difference", "filtered"),
     "voltage_source": ("terminals", "command"),
@@ -49,16 +50,27 @@ MAX_VALUES = 64_000_000  # half a gigabyte
 MAX_SAMPLES_CHARS = 16 * 1024 * 1024
 PITCH_M = (1e-5, 0.8)
 RATE_HZ = (1.0, 1e6)
+SLOW_HZ = 200.0  # below, a drive that accelerates in 0.1 s does so within too few samples
+RECORD_HZ = 1000  # what a rapid is best recorded with
 RAPID_M_S = (1e-4, 20.0)
 CONSTANT_NM_A = (1e-3, 100.0)
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingTable:
-    """``headers`` and ``columns`` (n,) of a recording; a lost sample is a missing row."""
+    """``headers`` and ``columns`` (n,) of a recording; a lost sample is a missing row.
+
+    Of another program's file further: ``clocks``, the columns that are times in seconds by their kind; ``doubts``, why
+    a column of that name cannot be used; ``interruption``, what keeps the number of a row from being a time; and the
+    ``others``, its columns that were sampled at other times.
+    """
 
     headers: Mapping[str, str]
     columns: Mapping[str, Float]
+    clocks: frozenset[str] = frozenset()
+    doubts: Mapping[str, str] = field(default_factory=dict)
+    interruption: str = ""
+    others: tuple[RecordingTable, ...] = ()
 
 
 def recording_of(table: RecordingTable, source: str = "recording") -> Recording:
@@ -101,6 +113,11 @@ def check_size(rows: int, columns: int, source: str) -> None:
         raise RecordingError(f"{source} declares {columns} columns of {rows} rows, more than a recording has: cut it")
 
 
+def unlike_lengths(sizes: Mapping[str, int], source: str) -> RecordingError:
+    """Return the error for columns that do not have one length."""
+    return RecordingError(f"{source} has columns of unlike lengths, {sizes}: export them with one time step")
+
+
 def unreadable(source: str, kind: str, error: BaseException) -> RecordingError:
     """Return the error that tells why a file is none of its kind."""
     first = (str(error).splitlines() or [type(error).__name__])[0][:200]
@@ -127,7 +144,12 @@ def _rows(table: RecordingTable, names: list[str], source: str) -> Float:
     """Return the columns side by side (n, k): all finite but what the table tells."""
     sizes = {name: table.columns[name].size for name in names}
     if len(set(sizes.values())) > 1:
-        raise RecordingError(f"{source} has columns of unlike lengths, {sizes}: export them with one time step")
+        raise unlike_lengths(sizes, source)
+    if sizes["time_s"] < MIN_ROWS and 1 < sizes["time_s"] < SLOW_HZ * np.ptp(table.columns["time_s"]):
+        raise RecordingError(
+            f"{source} has {sizes['time_s']} samples in {np.ptp(table.columns['time_s']):.3g} s, which is too slow to "
+            f"follow how a drive accelerates: record at {RECORD_HZ} Hz or faster"
+        )
     if sizes["time_s"] < MIN_ROWS:
         raise RecordingError(f"{source} is truncated: {sizes['time_s']} rows are no recording; record it again")
     for name in names:

@@ -1,27 +1,34 @@
-"""Text files of oscilloscopes, drives and NCs: a head of any kind, then rows of numbers.
+"""Text files of oscilloscopes, drives and NCs: a head of any kind, then rows of numbers, read as RFC 4180 has them.
 
-Separator, decimal comma, encoding and the first row of numbers are found where the column map does not say them. A
-column is found by any text that stands above it in the head: makers write names, addresses and units there.
+Separator, decimal mark, encoding and the first row of numbers are found where the column map does not give them. A
+column is found by the text nearest above its numbers, or as ``#1``, ``#2`` ... from the left. Where a text can be read
+in two ways it is refused with both: a name above two columns, a mark that is decimal or separates thousands.
 """
 
 from __future__ import annotations
 
 import codecs
-import math
-from dataclasses import dataclass
+import csv
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
 
-import numpy as np
 from pydantic import Field
 
 from fdhil.config.section import Section
-from fdhil.csv_text import check_lengths, text_of
+from fdhil.csv_text import check_lengths, shown, text_of
 from fdhil.errors import RecordingError
 from fdhil.records import Float
 from fdhil.store.recording_table import RecordingTable, check_size
+from fdhil.store.trace_cells import DECIMALS, is_number, is_void, is_written_by, parse_column, plain
+from fdhil.store.trace_head import find_names
+from fdhil.store.trace_rows import SAMPLE_ROWS, Body, Row, find_body
 
-SEPARATORS = "\t;,|"
-HEAD_LINES = 400  # of a file's beginning, in which the first row of numbers is sought
-SAME_WIDTH = 3  # rows of numbers in succession that show where they begin
+SEPARATORS = "\t;,| "  # a blank stands for a run of blanks
+MOST_LINES_IN_ROW = 8
+_EXCEL = re.compile(r"\"?sep=(.)\"?\s*", re.IGNORECASE)
+_COMMENT = re.compile(r"\s*(?:#+|%+|//+)\s*")
+_WIDE_BLANKS = re.compile(r"\t|\s{2,}")
 
 
 class TraceText(Section):
@@ -32,33 +39,23 @@ class TraceText(Section):
     encoding: str | None = Field(None, max_length=20, description="left out: UTF-16 or UTF-8 where it is, else cp1252")
 
 
-@dataclass(frozen=True, slots=True)
-class _Shape:
-    separator: str
-    decimal: str
-
-
 def parse_trace(content: bytes, told: TraceText, source: str) -> RecordingTable:
-    """Return all columns of a text, under every name that stands above them and as ``#1``, ``#2`` ...
+    """Return all columns of a text, under the names nearest above them and as ``#1``, ``#2`` ...
 
-    A row of fewer cells has ``nan`` in those it lacks. RecordingError where there are no rows of numbers.
+    A lost value is ``nan``. RecordingError where there are no rows of numbers, or where they can be read in two ways.
     """
-    lines = _text(content, told, source).splitlines()
+    lines = _text(content, told, source).replace("\r\r\n", "\n").splitlines(keepends=True)
     check_lengths(lines, 1, source)
-    shape = _shape(lines, told)
-    first = _first_row(lines, shape)
-    if first is None:
-        raise RecordingError(
-            f"{source} has no rows of numbers (looked for with separator {shape.separator!r} and decimal "
-            f"{shape.decimal!r}): give separator and decimal under [text] of the column map, or export it as text"
-        )
-    values = _values(lines[first:], shape, source)
-    columns: dict[str, Float] = {f"#{j + 1}": values[:, j] for j in range(values.shape[1])}
-    for line in lines[:first]:
-        for j, cell in enumerate(line.split(shape.separator)[: values.shape[1]]):
-            if name := cell.strip().strip('"').strip():
-                columns.setdefault(name, values[:, j])
-    return RecordingTable({}, columns)
+    separator = told.separator
+    if lines and (stated := _EXCEL.fullmatch(lines[0])):
+        separator, lines[0] = separator or stated[1], "\n"
+    separator = separator or _separator(lines)
+    body = find_body(_records(lines, separator, source), source, lines[-1:] == [] or lines[-1][-1] in "\r\n")
+    if body is None:
+        raise _no_rows(lines, separator, source)
+    check_size(len(body.rows), body.layout.width, source)
+    decimal = told.decimal or _decimal(body, separator, source)
+    return _table(body, _head(lines, body, separator), decimal)
 
 
 def _text(content: bytes, told: TraceText, source: str) -> str:
@@ -70,6 +67,8 @@ def _text(content: bytes, told: TraceText, source: str) -> str:
         return text_of(content, source, told.encoding)
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return text_of(content, source, "utf-16")
+    if b"\0" in content[:2]:  # UTF-16 without its mark
+        return text_of(content, source, "utf-16-be" if content[:1] == b"\0" else "utf-16-le")
     try:
         content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -77,47 +76,109 @@ def _text(content: bytes, told: TraceText, source: str) -> str:
     return text_of(content, source)
 
 
-def _shape(lines: list[str], told: TraceText) -> _Shape:
-    """Return how the last full row is written; a comma between digits is decimal where another separator is there."""
-    row = next((line for line in reversed(lines) if sum(c.isdigit() for c in line) > 1), "")
-    separator = told.separator or max(SEPARATORS, key=lambda s: (row.count(s) > 0, -SEPARATORS.index(s)))
-    comma = separator != "," and "," in row
-    return _Shape(separator, told.decimal or ("," if comma else "."))
+def _separator(lines: Sequence[str]) -> str:
+    """Return what takes most lines apart into numbers and nothing else."""
+    some = [line for line in lines if any(map(str.isdigit, line))]
+    sample = some[:: max(1, len(some) // SAMPLE_ROWS)]
+
+    def score(separator: str) -> int:
+        total = 0
+        for line in sample:
+            cells = [cell for _, row in _split([line], separator) for cell in row if not is_void(cell)]
+            numbers = sum(map(is_number, cells))
+            total += 2 * numbers - len(cells) if numbers > 1 else 0
+        return total
+
+    return max(SEPARATORS, key=score)  # the first of those that are as good
 
 
-def _first_row(lines: list[str], shape: _Shape) -> int | None:
-    """Return where the rows of numbers begin: several in succession, of two cells or more."""
-    for k in range(min(len(lines), HEAD_LINES)):
-        rows = [_cells(line, shape) for line in lines[k : k + SAME_WIDTH]]
-        if len(rows) == SAME_WIDTH and all(sum(math.isfinite(v) for v in row or ()) > 1 for row in rows):
-            return k
-    return None
+def _split(lines: Iterable[str], separator: str, quoting: int = csv.QUOTE_MINIMAL) -> Iterator[tuple[int, list[str]]]:
+    """Yield the cells of each record, and the number of its last line."""
+    is_blank = separator == " "
+    if is_blank:
+        lines = (re.sub(r"[ \t]+", " ", line.strip()) for line in lines)
+    reader = csv.reader(lines, delimiter=separator, skipinitialspace=not is_blank, quoting=quoting)  # type: ignore[arg-type]
+    for cells in reader:
+        yield reader.line_num, cells
 
 
-def _cells(line: str, shape: _Shape) -> list[float] | None:
-    """Return the numbers of a row, ``nan`` for an empty cell; None where one is no number."""
-    numbers = []
-    for cell in line.split(shape.separator):
-        text = cell.strip().strip('"').strip()
-        if shape.decimal == ",":
-            text = text.replace(",", ".")
-        try:
-            numbers.append(float(text) if text else math.nan)
-        except ValueError:
-            return None
-    return numbers
+def _records(lines: Sequence[str], separator: str, source: str) -> list[Row]:
+    try:
+        rows = [Row(*record) for record in _split(lines, separator)]
+        ends = [0, *(row.line for row in rows)]
+        if any(below - above > MOST_LINES_IN_ROW for above, below in pairwise(ends)):  # a quote without an end
+            rows = [Row(*record) for record in _split(lines, separator, csv.QUOTE_NONE)]
+    except (csv.Error, TypeError, ValueError) as error:  # of a separator that is a quote, or an end of line
+        raise RecordingError(
+            f"{source} cannot be taken apart with separator {separator!r} ({error}): correct it in the column map"
+        ) from None
+    return rows
 
 
-def _values(lines: list[str], shape: _Shape, source: str) -> Float:
-    """Return the rows (n, k); the first line that is none must be the end of the file, as ``EOF``."""
-    width = len(lines[0].split(shape.separator))
-    check_size(len(lines), width, source)
-    rows = []
-    for k, line in enumerate(lines):
-        row = _cells(line, shape) if line.strip() else [math.nan] * width
-        if row is None or len(row) > width:
-            if any(text.strip() for text in lines[k + 1 :]):
-                raise RecordingError(f"{source} has a line that is no row of numbers: {line[:60]!r}; export it again")
-            break
-        rows.append(row + [math.nan] * (width - len(row)))
-    return np.array(rows, dtype=np.float64)
+def _no_rows(lines: Sequence[str], separator: str, source: str) -> RecordingError:
+    last = next((line.strip() for line in reversed(lines) if any(map(str.isdigit, line))), "")
+    return RecordingError(
+        f"{source} has no rows of numbers (looked for with separator {separator!r}; the last line with a digit is "
+        f"{shown(last)}): give separator and decimal under [text] of the column map, or export it as text"
+    )
+
+
+def _decimal(body: Body, separator: str, source: str) -> str:
+    """Return the decimal mark, by the first number that only one of them can have written."""
+    marked = ""
+    padded = ""
+    for row in body.rows:
+        for j in body.layout.numbers:
+            cell = plain(row.cells[j])
+            marks = [mark for mark in DECIMALS if is_written_by(cell, mark)]
+            if len(marks) == 1:
+                return marks[0]
+            if marks and not cell.isdigit():
+                marked = marked or next((cell for mark in DECIMALS if mark in cell), "")
+            elif marks and cell[0] == "0" and cell.strip("0"):
+                padded = padded or cell
+    if marked:
+        raise RecordingError(
+            f"{source} has numbers such as {shown(marked)} alone, whose mark may be decimal or stand between "
+            "thousands: give decimal under [text] of the column map"
+        )
+    if padded and separator == ",":
+        raise RecordingError(
+            f"{source} has cells such as {shown(padded)} and no decimal point: commas that separate cells may be "
+            "decimal commas too; export it with quoted cells, or with another separator"
+        )
+    return "."
+
+
+def _head(lines: Sequence[str], body: Body, separator: str) -> list[list[Row]]:
+    """Return the lines above the rows in the ways in which they may be taken apart."""
+    head: list[list[Row]] = []
+    for row in body.head:
+        cells = row.cells
+        if cells and (mark := _COMMENT.match(cells[0])):
+            cells = cells[1:] if mark[0] == cells[0] and separator == " " else [cells[0][mark.end() :], *cells[1:]]
+        ways = [Row(row.line, cells)]
+        if separator == " ":
+            ways.append(Row(row.line, _WIDE_BLANKS.split(_COMMENT.sub("", lines[row.line - 1], count=1).strip())))
+        head.append(ways)
+    return head
+
+
+def _table(body: Body, head: Sequence[Sequence[Row]], decimal: str) -> RecordingTable:
+    columns: dict[str, Float] = {}
+    doubts: dict[str, str] = {}
+    clocks: set[str] = set()
+    names, unclear = find_names(head, body.layout)
+    named: dict[int, list[str]] = {j: [f"#{j + 1}"] for j in range(body.layout.width)}
+    for name, j in names.items():
+        named[j].append(name)
+    for j, cells in enumerate(zip(*(row.cells for row in body.rows), strict=True)):
+        read = parse_column(cells, decimal)
+        columns |= dict.fromkeys(named[j], read.values)
+        if read.bad is not None:
+            text = f"has {shown(cells[read.bad])} in line {body.rows[read.bad].line}, where a number belongs"
+            doubts |= dict.fromkeys(named[j], f"{text}: correct it there, or export the file again")
+        if read.is_clock:
+            clocks.update(named[j])
+    doubts |= {name: why for name, why in unclear.items() if name not in columns}
+    return RecordingTable({}, columns, frozenset(clocks), doubts, body.interruption)

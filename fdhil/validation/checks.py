@@ -66,8 +66,14 @@ class Check:
 
 
 def _few_rows(evidence: Evidence) -> Iterator[Reason]:
-    if not _enough_rows(evidence):
-        yield Reason("LowExcitation", f"{evidence.window.n} rows are no rapid move", "record a whole rapid")
+    window, stages = evidence.window, evidence.window.stages
+    if _enough_rows(evidence):
+        return
+    if stages.accelerate is not None and stages.brake is not None:
+        text = f"{1 / window.dt_s:.4g} Hz is too slow: a whole rapid has {window.n} samples, fewer than {LEAST_ROWS}"
+        yield Reason("LowExcitation", text, "record at 1000 Hz or faster")
+    else:
+        yield Reason("LowExcitation", f"{window.n} rows are no rapid move", "record a whole rapid")
 
 
 def _play(evidence: Evidence) -> Iterator[Reason]:

@@ -218,3 +218,67 @@ def test_a_wrong_column_map_is_told_as_configuration(shuttle: Path, tmp_path: Pa
     refused = invoke(shuttle, "--columns", wrong).exception
     assert isinstance(refused, ConfigError)
     assert "headers.axis" in str(refused)
+
+
+TRACE_MAP = """
+[headers]
+axis = "X"
+pitch_m_per_rev = 0.02
+rapid_speed_m_per_s = 0.5
+voltage_sampling = "%s"
+[columns]
+time_s = { name = "Time", unit = "ms" }
+voltage_V = { name = "Voltage", unit = "V" }
+current_A = { name = "Current", unit = "A" }
+speed_rad_per_s = { name = "Speed", unit = "rad/s" }
+position_m = { name = "Position", unit = "um" }
+demand_m = { name = "Demand", unit = "mm" }
+"""
+
+
+def _trace(tmp_path: Path, every: int = 1, sampling: str = "interval_mean") -> tuple[Path, Path]:
+    """Write a trace as a scope does: decimal commas, quoted, the position by a counter of 16 bits; and its map."""
+    lines = bench.as_csv(signals(moves=2), 0.003).partition("time_s")[2].splitlines()[1::every]
+    rows = ['"Time","Voltage","Current","Speed","Position","Demand"']
+    for line in lines:
+        time_s, voltage, current, speed, position_m, demand_m = map(float, line.split(","))
+        counts = (round(position_m * 1e6) + 32768) % 65536 - 32768
+        cells = (
+            f"{time_s * 1e3:.3f}",
+            f"{voltage:,.4f}",
+            f"{current:,.4f}",
+            f"{speed:,.5f}",
+            str(counts),
+            f"{demand_m * 1e3:.4f}",
+        )
+        rows.append(",".join(f'"{cell}"'.translate(str.maketrans(".,", ",.")) for cell in cells))
+    (tmp_path / "trace.csv").write_text("\n".join([*rows, ""]))
+    (tmp_path / "map.toml").write_text(TRACE_MAP % sampling)
+    return tmp_path / "trace.csv", tmp_path / "map.toml"
+
+
+def test_a_scopes_trace_is_identified_and_says_how_it_was_read(tmp_path: Path) -> None:
+    trace, columns = _trace(tmp_path)
+    result = invoke(trace, "--columns", columns, "--json")
+    pooled = told_document(result)["files"][0]["pooled"]
+    assert pooled["validated"], pooled
+    assert pooled["parameters"]["K"]["value"] == pytest.approx(0.8, rel=0.01)
+    assert "ReadOtherwise: Position jumps by 2^16 as a counter of 16 bits does, and was unwrapped" in pooled["warnings"]
+
+
+def test_a_rapid_recorded_too_slowly_is_refused_by_its_rate(tmp_path: Path) -> None:
+    trace, columns = _trace(tmp_path, every=50, sampling="instant")
+    pooled = told_document(invoke(trace, "--columns", columns, "--json"))["files"][0]["pooled"]
+    assert not pooled["validated"]
+    assert pooled["reasons"][0] == "LowExcitation: 20 Hz is too slow to follow how a drive accelerates"
+
+
+def test_columns_of_unlike_lengths_are_json_as_well(tmp_path: Path) -> None:
+    from scipy import io
+
+    columns = _trace(tmp_path)[1]
+    names = ("Time", "Voltage", "Current", "Speed", "Position", "Demand")
+    io.savemat(tmp_path / "short.mat", {name: list(range(50 + (name == "Current"))) for name in names})
+    result = invoke(tmp_path / "short.mat", "--columns", columns, "--json")
+    assert result.return_value == 3
+    assert "unlike lengths" in told_document(result)["files"][0]["error"]["text"]

@@ -1,0 +1,93 @@
+"""Times of samples that were written with too few digits: the even grid that they stand for, if there is only one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fdhil.errors import RecordingError
+from fdhil.records import Float, Int
+from fdhil.store.recording_table import STEP_TOLERANCE
+
+FIT = 1.1  # of the rounding, by which times may leave an even grid
+MULTIPLE = 0.05  # of the rounding, by which a step may be off a multiple of it
+FEW = 4  # steps that are off: as many may be lost samples of an even grid
+LEAST_SPANS = 20  # of the rounding, that all times must cover to tell the period to a percent
+
+
+def even_times(time_s: Float, rate_hz: float | None, source: str) -> tuple[Float, str]:
+    """Return the times (n,), or the even grid that they were rounded from, and what was done ("" if nothing).
+
+    RecordingError where steps may be rounded times or lost samples; ``rate_hz``, where it is given, decides.
+    """
+    steps = np.diff(time_s)
+    rounding_s = _rounding(steps)
+    if steps.size < FEW or rounding_s is None or (steps < 0).any():
+        return time_s, ""
+    usual = float(np.median(steps)) if rate_hz is None else 1 / rate_hz
+    off = np.abs(steps - usual) > STEP_TOLERANCE * usual
+    is_loss = usual > 0 and _are_multiples(steps[off], usual)
+    if not off.any() or (off.sum() < FEW and (is_loss or not steps[off].all())):
+        return time_s, ""
+    grid = _grid(time_s, np.arange(time_s.size), rounding_s, rate_hz)
+    is_short = rate_hz is None and time_s[-1] - time_s[0] < LEAST_SPANS * rounding_s
+    if usual == 0 and (grid is None or is_short):
+        raise RecordingError(
+            f"{source}: times are written to {rounding_s:g} s, too coarse to tell how far its samples are apart: give "
+            "sample_rate_hz under [headers] of the column map"
+        )
+    if grid is None or is_short:
+        return (time_s, "") if is_loss else _with_gaps(time_s, steps, rounding_s, rate_hz)
+    period_s = float(grid[-1] - grid[0]) / steps.size
+    if is_loss and rate_hz is None:
+        raise RecordingError(
+            f"{source}: {off.sum()} of {steps.size} steps of time are a multiple of {usual:g} s: samples "
+            f"{period_s:.6g} s apart whose times are rounded to {rounding_s:g} s, or samples {usual:g} s apart of "
+            "which some are lost; give sample_rate_hz under [headers] of the column map"
+        )
+    return grid, _note(period_s, rounding_s)
+
+
+def usual_step(time_s: Float) -> float:
+    """Return the mean of the steps that are as long as most are, s."""
+    steps = np.diff(time_s)
+    usual = np.median(steps)
+    return float(steps[np.abs(steps - usual) <= STEP_TOLERANCE * abs(usual)].mean())
+
+
+def _with_gaps(time_s: Float, steps: Float, rounding_s: float, rate_hz: float | None) -> tuple[Float, str]:
+    """Return the even grid with rows left out where whole samples are lost; the times where they are on none."""
+    near = steps[steps < 1.5 * np.median(steps)]
+    if not near.size or rounding_s > near.mean() / 2:
+        return time_s, ""
+    rows = np.concatenate([[0], np.cumsum(np.maximum(np.rint(steps / near.mean()), 1))]).astype(np.int64)
+    grid = _grid(time_s, rows, rounding_s, rate_hz)
+    return (time_s, "") if grid is None else (grid, _note(float((grid[-1] - grid[0]) / rows[-1]), rounding_s))
+
+
+def _note(period_s: float, rounding_s: float) -> str:
+    return f"times are rounded to {rounding_s:.4g} s, samples are taken as {period_s:.6g} s apart"
+
+
+def _rounding(steps: Float) -> float | None:
+    """Return the least difference between two steps that differ, where all steps are multiples of it."""
+    distinct = np.unique(np.round(steps, 9))
+    least = float(np.diff(distinct).min()) if distinct.size > 1 else 0.0
+    if least < 2e-9 or np.abs(distinct / least - np.rint(distinct / least)).max() > MULTIPLE:
+        return None
+    return least
+
+
+def _are_multiples(steps: Float, usual: float) -> bool:
+    """Whether each step is as long as two usual ones or more, which is what lost samples leave."""
+    counts = np.rint(steps / usual)
+    return bool(((counts >= 2) & (np.abs(steps - counts * usual) <= STEP_TOLERANCE * steps)).all())
+
+
+def _grid(time_s: Float, rows: Int, rounding_s: float, rate_hz: float | None) -> Float | None:
+    """Return the even times at ``rows`` that these are within one rounding of; None where there are none."""
+    middle, about = rows - rows.mean(), time_s - time_s.mean()
+    period_s = float(middle @ about / (middle @ middle)) if rate_hz is None else 1 / rate_hz
+    if np.ptp(about - period_s * middle) > FIT * rounding_s:
+        return None
+    even: Float = time_s[0] + period_s * (rows - rows[0])
+    return even

@@ -1,0 +1,48 @@
+"""Names of columns in the head of a text: the nearest above the numbers, where the names count as the cells do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from fdhil.store.trace_cells import plain
+from fdhil.store.trace_rows import Layout, Row
+
+UNFILLED = ("comment", "comments", "kommentar", "remark")  # a last column whose cells are left out where it has none
+
+
+def find_names(head: Sequence[Sequence[Row]], layout: Layout) -> tuple[dict[str, int], dict[str, str]]:
+    """Return the column (from 0) of each name, and why another text of the head names none.
+
+    ``head`` has each line, from the top, in the ways in which it may be taken apart.
+    """
+    columns: dict[str, int] = {}
+    twice: dict[str, str] = {}
+    uneven: dict[str, str] = {}
+    for ways in reversed(head):
+        row = next((row for row in ways if _fits(row, layout)), None)
+        for name, places in _places(row or ways[0]).items():
+            if row is None:
+                count = f"{len(ways[0].cells)} cells of line {ways[0].line}, the rows have {layout.width}"
+                uneven.setdefault(name, f"stands among the {count}: say by #1, #2 ... from the left which column it is")
+            elif name not in columns and len(places) > 1:
+                stands = " and ".join(f"#{j + 1}" for j in places)
+                twice.setdefault(name, f"stands above {stands} (line {row.line}): give one of these as its name")
+            elif name not in twice and places[0] < layout.width:
+                columns.setdefault(name, places[0])
+    return columns, {name: why for name, why in {**uneven, **twice}.items() if name not in columns}
+
+
+def _fits(row: Row, layout: Layout) -> bool:
+    """Whether a line has as many names as a row has cells, or has numbers."""
+    filled = max((j + 1 for j, cell in enumerate(row.cells) if cell.strip()), default=0)
+    if len(row.cells) == layout.width or filled == layout.filled:
+        return True
+    return filled == layout.filled + 1 and row.cells[filled - 1].strip().lower() in UNFILLED
+
+
+def _places(row: Row) -> dict[str, list[int]]:
+    places: dict[str, list[int]] = {}
+    for j, cell in enumerate(row.cells):
+        if name := " ".join(plain(cell).split()):
+            places.setdefault(name, []).append(j)
+    return places

@@ -1,0 +1,161 @@
+"""Which records of a text are rows of numbers: where they begin and end, and what stands between them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from fdhil.csv_text import shown
+from fdhil.errors import RecordingError
+from fdhil.store.trace_cells import is_number, is_void, plain
+
+HEAD_LINES = 400  # of a file's beginning, in which the first row of numbers is searched
+SAME_WIDTH = 3  # rows of numbers in succession that show where they begin
+SAMPLE_ROWS = 600  # that show which columns are numbers
+COMMENTS = ("#", "%", "//")
+COMMENT_MARKS = "#%/ "
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """The cells of one record, and the number of the line on which it ends (1 is the first)."""
+
+    line: int
+    cells: list[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """How many cells a row has, and which of its columns (from 0) are numbers, or empty, in most rows."""
+
+    width: int
+    numbers: tuple[int, ...]
+    empty: tuple[int, ...] = ()
+
+    @property
+    def filled(self) -> int:
+        """Return how many cells a row has up to its last number."""
+        return self.numbers[-1] + 1
+
+    def is_row(self, row: Row) -> bool:
+        """Whether a record is a row of numbers by its length and its first number."""
+        return len(row.cells) == self.width and self._begins(row)
+
+    def is_short(self, row: Row) -> bool:
+        """Whether a record is a row of numbers whose last cells are missing."""
+        return len(row.cells) < self.width and self._begins(row) and len(self._found(row)) > 1 and self._is_clean(row)
+
+    def begins_rows(self, rows: Sequence[Row]) -> bool:
+        """Whether these records are all rows of two numbers or more, without a text among them."""
+        return all(self.is_row(row) and len(self._found(row)) > 1 and self._is_clean(row) for row in rows)
+
+    def has_label(self, row: Row) -> bool:
+        """Whether a row of numbers has a text where the others have nothing."""
+        return any(not is_void(row.cells[j]) for j in self.empty)
+
+    def _begins(self, row: Row) -> bool:
+        first = row.cells[self.numbers[0]] if len(row.cells) > self.numbers[0] else "text"
+        return is_number(first) or (is_void(first) and bool(self._found(row)))
+
+    def _found(self, row: Row) -> list[str]:
+        return [cell for cell in self._cells(row) if is_number(cell)]
+
+    def _is_clean(self, row: Row) -> bool:
+        return all(is_number(cell) or is_void(cell) for cell in self._cells(row))
+
+    def _cells(self, row: Row) -> list[str]:
+        return [row.cells[j] for j in self.numbers if j < len(row.cells)]
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """The rows of numbers of a text, the records before them, and the first interruption ("" where there is none)."""
+
+    head: Sequence[Row]
+    rows: Sequence[Row]
+    layout: Layout
+    interruption: str
+
+
+def find_body(rows: Sequence[Row], source: str, is_complete: bool) -> Body | None:
+    """Return the rows of numbers; None without any. A last row that was not written to its end is left out.
+
+    Between rows may stand nothing but empty lines, comments, the names again, and rows without a value: RecordingError
+    for any other, and for a row of more or fewer cells than the others.
+    """
+    layout = _layout(rows)
+    first = None if layout is None else _first_row(rows, layout)
+    if layout is None or first is None:
+        return None
+    if not is_complete and len(rows[-1].cells) < layout.width:
+        rows = rows[:-1]
+    is_any = [layout.is_row(row) or layout.is_short(row) for row in rows]
+    end = len(rows) - is_any[::-1].index(True)
+    head = {_words(row) for row in rows[:first]}
+    body: list[Row] = []
+    interruption = ""
+    for k in range(first, end):
+        row = rows[k]
+        missing = layout.width - len(row.cells)
+        if is_any[k] and missing and any(layout.is_row(later) for later in rows[k + 1 : end]):
+            raise _uneven(row, layout, source)
+        if is_any[k]:
+            body.append(Row(row.line, row.cells + [""] * missing) if missing else row)
+            continue
+        if missing < 0 and layout.is_row(cut := Row(row.line, row.cells[: layout.width])):
+            if any(cell.strip() for cell in row.cells[layout.width :]):
+                raise _uneven(row, layout, source)
+            body.append(cut)
+            continue
+        is_empty = not any(cell.strip() for cell in row.cells)
+        if is_empty and not missing:
+            body.append(row)
+            continue
+        if not is_empty and _words(row) not in head and not row.cells[0].strip().startswith(COMMENTS):
+            text = shown(" ".join(row.cells))
+            raise RecordingError(
+                f"{source} has a line that is no row of numbers: line {row.line}, {text}; export it again"
+            )
+        interruption = interruption or f"line {row.line} between the rows is no row"
+    return Body(rows[:first], body, layout, interruption)
+
+
+def _words(row: Row) -> str:
+    return " ".join(map(plain, row.cells)).lstrip(COMMENT_MARKS)
+
+
+def _uneven(row: Row, layout: Layout, source: str) -> RecordingError:
+    return RecordingError(
+        f"{source} has {len(row.cells)} cells in line {row.line} where the other rows have {layout.width}: its numbers "
+        "may stand in wrong columns; quote cells with decimal commas, or export it again"
+    )
+
+
+def _layout(rows: Sequence[Row]) -> Layout | None:
+    """Return the layout that most records of two numbers or more have."""
+    rows = rows[:: max(1, len(rows) // SAMPLE_ROWS)]
+    sample = [[is_number(cell) for cell in row.cells] for row in rows]
+    numeric = [flags for flags in sample if sum(flags) > 1]
+    if not numeric:
+        return None
+    width, _ = Counter(map(len, numeric)).most_common(1)[0]
+    columns = [*zip(*(flags for flags in numeric if len(flags) == width), strict=True)]
+    numbers = tuple(j for j, flags in enumerate(columns) if 2 * sum(flags) >= len(flags))
+    full = [row for row in rows if len(row.cells) == width]
+    void = [sum(is_void(row.cells[j]) for row in full) for j in range(width)]
+    empty = tuple(j for j, count in enumerate(void) if j not in numbers and 2 * count > len(full))
+    return Layout(width, numbers, empty) if numbers else None
+
+
+def _first_row(rows: Sequence[Row], layout: Layout) -> int | None:
+    """Return where the rows of numbers begin: several in succession.
+
+    Labels may stand beside the first of them; a head whose lines have numbers beside labels goes on with other lines.
+    """
+    for k in range(min(len(rows) - SAME_WIDTH + 1, HEAD_LINES)):
+        if layout.begins_rows(rows[k : k + SAME_WIDTH]):
+            after = next((row for row in rows[k:] if not layout.is_row(row) or not layout.has_label(row)), None)
+            if after is not None and layout.is_row(after):
+                return k
+    return None

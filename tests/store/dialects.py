@@ -1,0 +1,164 @@
+"""A made trace written as people's programs write theirs: one dialect is one choice of each habit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fdhil.records import Float
+
+SIGNALS = ("Voltage", "Current", "Velocity", "Position", "Command")
+ROWS = 60
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """How a program writes: each field is a habit that some program has."""
+
+    separator: str = ";"
+    quotes: str = ""  # "", "names", "all", "needed"
+    decimal: str = "."
+    thousands: str = ""
+    names: str = "plain"  # "plain", "blanks", "unit", "comma"
+    head: str = ""  # "", "remark", "list", "keys", "sep", "group"
+    units: bool = False
+    comment: str = ""
+    footer: str = ""  # "", "remark", "statistics", "EOF", "cut"
+    end: str = "\n"
+    encoding: str = "utf-8"
+    time: str = "ms"  # "ms", "s", "us", "clock", "date", "us date", "none"
+    minus: str = "-"
+    form: str = ".4f"
+    trailing: bool = False
+    extra: str = ""  # "", "text", "index"
+    lost: str = ""  # "", or what stands in a cell without a value
+    begins_s: float = 0.0
+    repeated: bool = False
+
+
+def signals() -> dict[str, Float]:
+    """Return the signals (n,): what passes 1000, what is near zero, what is negative."""
+    k = np.arange(ROWS)
+    bell = np.sin(np.pi * k / (ROWS - 1)) ** 2
+    return {
+        "Voltage": 90.0 * bell - 3.0 * np.cos(k),
+        "Current": -12.5 * bell + 0.05 * np.sin(7.0 * k),
+        "Velocity": 1300.0 * bell,
+        "Position": 5.0 + 0.2 * np.cumsum(bell),
+        "Command": 5.1 + 0.2 * np.cumsum(bell),
+    }
+
+
+def name_of(dialect: Dialect, signal: str) -> str:
+    """Return what stands above a column."""
+    forms = {"plain": signal, "blanks": f"Axis {signal}", "unit": f"{signal} [x]", "comma": f"{signal}, actual"}
+    return forms[dialect.names]
+
+
+def number(value: float, dialect: Dialect) -> str:
+    """Return a number as the dialect writes it."""
+    text = format(value, f",{dialect.form}" if dialect.thousands else dialect.form)
+    table: dict[str, str | int | None] = {",": dialect.thousands, ".": dialect.decimal, "-": dialect.minus}
+    return text.translate(str.maketrans(table))
+
+
+def rows_kept(dialect: Dialect) -> list[int]:
+    """Return the rows that have every value."""
+    return [k for k in range(ROWS) if not (dialect.lost and k in (20, 21))]
+
+
+def time_cell(k: int, dialect: Dialect) -> str:
+    """Return the time of row ``k`` at 1 kHz."""
+    seconds = dialect.begins_s + k * 1e-3
+    if dialect.time in ("clock", "date", "us date"):
+        of_day = (23 * 3600 + 59 * 60 + 59.97 + k * 1e-3) % 86400
+        day = 5 if of_day > 43200 else 6
+        minutes, rest = divmod(of_day, 60.0)
+        clock = f"{int(minutes // 60):02d}:{int(minutes % 60):02d}:{rest:06.3f}".replace(".", dialect.decimal)
+        before = {"clock": "", "date": f"2025-03-{day:02d}T", "us date": f"3/{day}/2025 "}[dialect.time]
+        return before + clock
+    form = {"ms": (1e3, ".1f"), "s": (1.0, ".6f"), "us": (1e6, ".0f")}[dialect.time]
+    return number(float(format(seconds * form[0], form[1])), Dialect(decimal=dialect.decimal, form=form[1]))
+
+
+def write(dialect: Dialect, values: dict[str, Float]) -> bytes:
+    """Return the file."""
+    has_time = dialect.time != "none"
+    names = [*(["Time"] if has_time else []), *(name_of(dialect, signal) for signal in values)]
+    records = []
+    for k in range(ROWS):
+        cells = [time_cell(k, dialect)] if has_time else []
+        for signal in values:
+            is_lost = dialect.lost and k in (20, 21) and signal == "Current"
+            cells.append(dialect.lost.replace("empty", "") if is_lost else number(values[signal][k], dialect))
+        records.append(cells)
+    units = [*(["s"] if has_time else []), *("x" for _ in values)]
+    if dialect.extra:
+        names, units = [*names, "State"], [*units, "-"]
+        records = [[*cells, "OK" if dialect.extra == "text" else str(k)] for k, cells in enumerate(records)]
+    above = [_joined(names, dialect, is_name=True)] + ([_joined(units, dialect, is_name=True)] if dialect.units else [])
+    lines = [*_head(dialect, names), *(dialect.comment + line for line in above)]
+    for k, cells in enumerate(records):
+        lines += above[:1] if dialect.repeated and k == 30 else []
+        lines.append(_joined(cells, dialect))
+    text = dialect.end.join([*lines, *_footer(dialect, names)])
+    return (text if dialect.footer == "cut" else text + dialect.end).encode(dialect.encoding)
+
+
+def _head(dialect: Dialect, names: list[str]) -> list[str]:
+    separator = dialect.separator.strip() or dialect.separator[:1]
+    match dialect.head:
+        case "remark":
+            return ["Recorder, version 2.1 of 2025-03-05", ""]
+        case "list":
+            return ["Signal" + separator + "Unit", *(f"{name}{separator}x" for name in names), ""]
+        case "keys":
+            return [f"Sample rate{separator}1000", f"Trigger{separator}20", "Axis: X", ""]
+        case "sep":
+            return [f"sep={separator}"]
+        case "group":
+            return [separator.join(["", "Axis X", *("" for _ in names[2:])])]
+    return []
+
+
+def _footer(dialect: Dialect, names: list[str]) -> list[str]:
+    match dialect.footer:
+        case "remark":
+            return ["", "Exported 2025-03-05, 10:22:03; 60 rows"]
+        case "statistics":
+            return [_joined([word, *("1" for _ in names[1:])], dialect) for word in ("Mean", "Max")]
+        case "EOF":
+            return ["EOF"]
+        case "cut":
+            return [_joined([time_cell(ROWS, dialect) if dialect.time != "none" else "1", "7"], dialect)]
+    return []
+
+
+def _joined(cells: list[str], dialect: Dialect, is_name: bool = False) -> str:
+    quoted = dialect.quotes == "all" or (dialect.quotes == "names" and is_name)
+    mark = dialect.separator.strip() or " "
+    written = [f'"{c}"' if quoted or (dialect.quotes == "needed" and mark in c) else c for c in cells]
+    return dialect.separator.join(written) + (dialect.separator if dialect.trailing else "")
+
+
+def column_map(dialect: Dialect) -> dict[str, Any]:
+    """Return the map of the file as a document."""
+    units = {"ms": "ms", "us": "us"}
+    of = dict(zip(("voltage_V", "current_A", "speed_rad_per_s", "position_m", "demand_m"), SIGNALS, strict=True))
+    columns: dict[str, Any] = {
+        signal: {"name": name_of(dialect, name), "unit": {"V": "V", "A": "A", "s": "rad/s", "m": "m"}[signal[-1]]}
+        for signal, name in of.items()
+    }
+    headers: dict[str, Any] = {"axis": "X", "pitch_m_per_rev": 0.02, "voltage_sampling": "instant"}
+    if dialect.time == "none":
+        headers["sample_rate_hz"] = 1000.0
+    else:
+        columns["time_s"] = {"name": "Time", "unit": units.get(dialect.time, "s")}
+    return {"headers": headers, "columns": columns}
+
+
+def written_values(dialect: Dialect, values: dict[str, Float]) -> dict[str, Float]:
+    """Return the signals rounded as the file has them."""
+    return {name: np.array([float(format(v, dialect.form)) for v in column]) for name, column in values.items()}

@@ -1,0 +1,91 @@
+"""Times with too few digits are the even grid that they stand for, where there is only one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fdhil.errors import RecordingError
+from fdhil.records import Float
+from fdhil.store.counter_wraps import unwrap_counter
+from fdhil.store.sample_times import even_times
+
+K = np.arange(1000.0)
+
+
+def _rounded(time_s: Float, to_s: float) -> Float:
+    return np.rint(time_s / to_s) * to_s
+
+
+@pytest.mark.parametrize(
+    ("period_s", "to_s"), [(0.625e-3, 1e-4), (0.25e-3, 1e-4), (1 / 1024, 1e-3), (1 / 480, 1e-3), (1e-3, 1e-2)]
+)
+def test_rounded_times_become_the_grid_that_they_were_rounded_from(period_s: float, to_s: float) -> None:
+    even, note = even_times(_rounded(K * period_s, to_s), None, "trace")
+    np.testing.assert_allclose(np.diff(even), period_s, rtol=2e-3)
+    assert f"rounded to {to_s:.4g} s" in note
+
+
+def test_samples_lost_between_rounded_times_stay_lost() -> None:
+    kept = np.delete(K, [400, 401, 402, 700])
+    even, _ = even_times(_rounded(kept * 0.625e-3, 1e-4), None, "trace")
+    np.testing.assert_allclose(np.diff(even) / 0.625e-3, np.diff(kept), rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "time_s",
+    [
+        K * 1e-3,
+        np.delete(K, 500) * 1e-3,
+        np.delete(K, np.random.default_rng(1).choice(998, 30, replace=False) + 1) * 1e-3,
+        np.delete(K, [*range(200, 205), *range(400, 405), *range(600, 605), *range(800, 805)]) * 1e-3,
+        K * 1e-3 + np.random.default_rng(1).uniform(-5e-5, 5e-5, 1000),
+        np.sort(np.append(K, 500)) * 1e-3,
+    ],
+    ids=["even", "one lost", "thirty lost", "four bursts lost", "jitter", "one twice"],
+)
+def test_other_times_are_left_as_they_are(time_s: Float) -> None:
+    even, note = even_times(time_s, None, "trace")
+    assert np.array_equal(even, time_s)
+    assert note == ""
+
+
+def test_steps_that_are_rounded_or_lost_are_refused_unless_the_rate_is_given() -> None:
+    time_s = _rounded(K * 1.02e-3, 1e-3)
+    with pytest.raises(RecordingError, match=r"samples 0.00102\d* s apart .* or samples 0.001 s apart of which some"):
+        even_times(time_s, None, "trace")
+    assert np.array_equal(even_times(time_s, 1000.0, "trace")[0], time_s)
+    np.testing.assert_allclose(np.diff(even_times(time_s, 1 / 1.02e-3, "trace")[0]), 1.02e-3)
+
+
+def test_times_too_coarse_to_tell_the_rate_need_it() -> None:
+    time_s = np.floor(K[:300] * 1e-3 / 0.1 + 1e-9) * 0.1
+    with pytest.raises(RecordingError, match="too coarse"):
+        even_times(time_s, None, "trace")
+    np.testing.assert_allclose(np.diff(even_times(time_s, 1000.0, "trace")[0]), 1e-3)
+
+
+COUNTS = 1000 + np.rint(np.cumsum(np.concatenate([np.zeros(100), np.linspace(0, 400, 200), np.full(300, 400.0)])))
+
+
+@pytest.mark.parametrize("bits", [16, 32])
+@pytest.mark.parametrize("signed", [True, False])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_counter_that_passes_the_end_of_its_range_is_unwrapped(bits: int, signed: bool, sign: int) -> None:
+    counts = sign * COUNTS * (1 if bits == 16 else 40_000)
+    low = -(2.0 ** (bits - 1)) if signed else 0.0
+    counts[50] = np.nan
+    unwrapped, found = unwrap_counter((counts - low) % 2.0**bits + low)
+    assert found == bits
+    np.testing.assert_array_equal(unwrapped - unwrapped[0], counts - counts[0])
+
+
+@pytest.mark.parametrize(
+    "counts",
+    [COUNTS, COUNTS % 65536 + 0.5, np.where(COUNTS > 40_000, COUNTS - 40_000, COUNTS), COUNTS * 90 % 65536],
+    ids=["no wrap", "no whole numbers", "another period", "too fast"],
+)
+def test_another_jump_is_left_to_the_checks(counts: Float) -> None:
+    unwrapped, found = unwrap_counter(counts)
+    assert found is None
+    assert np.array_equal(unwrapped, counts)

@@ -1,0 +1,148 @@
+"""Heads as oscilloscopes, drives and programs write them: which names and places a column map can use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from fdhil.errors import RecordingError
+from fdhil.store.recording_table import RecordingTable
+from fdhil.store.trace_text import TraceText, parse_trace
+
+N = 40
+TIME = np.arange(N) * 1e-3
+U = np.round(10 * np.sin(np.arange(N) / 7), 4)
+I = np.round(2 * np.cos(np.arange(N) / 5), 4)  # noqa: E741 - the current
+Row = Callable[[int], str]
+
+
+def _comma(text: str) -> str:
+    return text.replace(".", ",")
+
+
+def _labels(k: int) -> str:
+    labels = ["Record Length,40,Points", "Sample Interval,0.001,s", "Trigger Point,100,Samples", ",,", "Offset,0,s"]
+    return labels[k] if k < len(labels) else ",,"
+
+
+LABVIEW = (
+    "LabVIEW Measurement\t\nSeparator\tTab\nDecimal_Separator\t,\nDate\t2025/03/05\nTime\t10:22:03,1234567\n"
+    "***End_of_Header***\t\t\t\nChannels\t2\t\t\nSamples\t40\t40\t\nX0\t0,0E+0\t0,0E+0\t\nDelta_X\t0,001\t0,001\t\n"
+    "***End_of_Header***\t\t\t\nX_Value\tSpannung\tStrom\tComment\n"
+)
+YOKOGAWA = (
+    '"Model Name","DL850"\n"TraceName"," CH1"," CH2"\n"BlockSize",40,40\n"SampleRate",1.0E+03,1.0E+03\n'
+    '"HResolution",1.0E-03,1.0E-03\n"HOffset",-1.0E-02,-1.0E-02\n"Date"," 2025/03/05"," 2025/03/05"\n\n'
+)
+# instrument -> its head, its rows, and what stands above time, voltage and current
+HEADS: dict[str, tuple[str, Row, tuple[str, str, str]]] = {
+    "Tektronix MSO": (
+        "Model,MSO4034\n\nPoint Format,Y,\nProbe Attenuation,10,1\nVertical Units,V,A\nLabel,,\nTIME,CH1,CH2\n",
+        lambda k: f"{TIME[k]:.6e},{U[k]},{I[k]}",
+        ("TIME", "CH1", "CH2"),
+    ),
+    "Tektronix TDS": ("", lambda k: f"{_labels(k)},{TIME[k]:.6f},{U[k]},{I[k]},", ("#4", "#5", "#6")),
+    "Keysight": (
+        "x-axis,1,2\nsecond,Volt,Ampere\n",
+        lambda k: f"{TIME[k]:+.8E},{U[k]:+.5E},{I[k]:+.5E}",
+        ("x-axis", "1", "2"),
+    ),
+    "Siglent": (
+        "Record Length,Analog:40\nVertical Scale,CH1:1.0,CH2:1.0\nSource,CH1,CH2\nSecond,Volt,Volt\n",
+        lambda k: f"{TIME[k]:.12f},{U[k]:.5f},{I[k]:.5f}",
+        ("Second", "CH1", "CH2"),
+    ),
+    "PicoScope": (
+        "Zeit;Kanal A;Kanal B\n(s);(V);(A)\n\n",
+        lambda k: _comma(f"{TIME[k]:.8f};{U[k]:.8f};{I[k]:.8f}"),
+        ("Zeit", "Kanal A", "Kanal B"),
+    ),
+    "Rohde & Schwarz": (
+        "in s,C1 in V,C2 in A\n",
+        lambda k: f"{TIME[k]:.6E},{U[k]:.5E},{I[k]:.5E}",
+        ("in s", "C1 in V", "C2 in A"),
+    ),
+    "LabVIEW": (
+        LABVIEW,
+        lambda k: _comma(f"{TIME[k]:.6f}\t{U[k]:.6f}\t{I[k]:.6f}"),
+        ("X_Value", "Spannung", "Strom"),
+    ),
+    "Yokogawa": (YOKOGAWA, lambda k: f",{U[k]:.5E},{I[k]:.5E},{TIME[k]}", ("#4", "#2", "#3")),
+    "halsampler": ("", lambda k: f"{TIME[k]:.6f} {U[k]:.6f} {I[k]:.6f} ", ("#1", "#2", "#3")),
+    "pandas": (",t,u,i\n", lambda k: f"{k},{TIME[k]:.4f},{U[k]},{I[k]}", ("t", "u", "i")),
+    "catman": (
+        "HBM_CATMAN\t\t\r\nMessrate\t1000 Hz\t\r\nZeit  1 - Standard\tSpannung\tStrom\r\ns\tV\tA\r\n",
+        lambda k: _comma(f"{TIME[k]:.6f}\t{U[k]:.5f}\t{I[k]:.5f}"),
+        ("Zeit 1 - Standard", "Spannung", "Strom"),
+    ),
+    "two lines in a name": (
+        'Time,"Voltage\n[V]",Current\n',
+        lambda k: f"{TIME[k]:.4f},{U[k]},{I[k]}",
+        ("Time", "Voltage [V]", "Current"),
+    ),
+    "a quote that never ends": (
+        '"Remark, no end\nTime,U,I\n',
+        lambda k: f"{TIME[k]:.4f},{U[k]},{I[k]}",
+        ("Time", "U", "I"),
+    ),
+    "a table of Markdown": (
+        "| Time | U | I |\n|------|---|---|\n",
+        lambda k: f"| {TIME[k]:.4f} | {U[k]} | {I[k]} |",
+        ("Time", "U", "I"),
+    ),
+    "names with wide blanks": (
+        "Time s   Axis voltage   Axis current\n",
+        lambda k: f"{TIME[k]:6.3f}   {U[k]:12.4f}   {I[k]:12.4f}",
+        ("Time s", "Axis voltage", "Axis current"),
+    ),
+}
+
+
+def _parsed(head: str, row: Row) -> RecordingTable:
+    return parse_trace((head + "".join(f"{row(k)}\n" for k in range(N))).encode(), TraceText(), "trace")
+
+
+@pytest.mark.parametrize("instrument", HEADS)
+def test_the_names_of_an_instrument_stand_for_its_columns(instrument: str) -> None:
+    head, row, names = HEADS[instrument]
+    read = _parsed(head, row)
+    for name, values in zip(names, (TIME, U, I), strict=True):
+        assert name not in read.doubts
+        np.testing.assert_allclose(read.columns[name], values, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("head", "name", "words"),
+    [
+        ("Time;Axis X;;Axis Y;\n;U;I;U;I\n", "U", "stands above #2 and #4"),
+        ("X;CH1;CH2;Start;Increment;More\n", "CH1", "stands among the 6 cells of line 1, the rows have 5"),
+        ("Time, s;Voltage\n", "Voltage", "stands among the 2 cells of line 1, the rows have 5"),
+    ],
+)
+def test_a_name_without_one_column_is_doubted(head: str, name: str, words: str) -> None:
+    read = _parsed(head, lambda k: f"{k};{U[k]};{I[k]};{U[k]};{I[k]}")
+    assert words in read.doubts[name]
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        (lambda k: f"{k},{_comma(f'{U[k]:.2f}')},{_comma(f'{I[k]:.2f}')}", "decimal commas too"),
+        (lambda k: f"{k};{k + 1}.125;{k + 2}.250", "may be decimal or stand between thousands"),
+        (lambda k: f"{k};{U[k]};{I[k]}" if k != 9 else "9;1.5", "2 cells in line 10 where the other rows have 3"),
+        (lambda k: f"{k};{U[k]};{I[k]}" if k != 9 else "9;1;5;2", "4 cells in line 10 where the other rows have 3"),
+        (lambda k: f"{k} {U[k]} {I[k]}" + ("\noverrun" if k == 9 else ""), "line 11, 'overrun'"),
+        (lambda k: f"{k} ms;{U[k]} V;{I[k]} A", "no rows of numbers"),
+    ],
+)
+def test_rows_that_can_be_read_in_two_ways_are_refused(row: Row, words: str) -> None:
+    with pytest.raises(RecordingError, match=words):
+        _parsed("", row)
+
+
+def test_a_text_among_numbers_is_doubted_where_its_column_is_used() -> None:
+    read = _parsed("Time;U;I\n", lambda k: f"{k};{U[k] if k != 9 else '12.x'};{I[k]}")
+    assert "has '12.x' in line 11" in read.doubts["U"] == read.doubts["#2"]
+    assert "I" not in read.doubts
