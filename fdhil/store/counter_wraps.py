@@ -1,4 +1,4 @@
-"""Counters of 16 or 32 bits that pass the end of their range, unwrapped where nothing else explains the jump."""
+"""Counters that pass the end of the range of their bits, unwrapped where nothing else explains the jump."""
 
 from __future__ import annotations
 
@@ -6,19 +6,22 @@ import numpy as np
 
 from fdhil.records import Float
 
-BITS = (16, 32)
+BITS = range(10, 33)
+MOST_DECIMALS = 6
+MOST_COUNTS = 2.0**32
 
 
 def unwrap_counter(values: Float) -> tuple[Float, int | None]:
-    """Return the counts (n,) without the jumps of a counter that begins again, and its bits; None where it does not.
+    """Return the values (n,) without the jumps of a counter that begins again, and its bits; None where it does not.
 
-    It must count in whole numbers within the range of its bits, signed or not, come within a step of that range's end
-    where it jumps, and go on after the jump as before it. Lost values may be ``nan``.
+    It must count in whole numbers, or in a decimal fraction of them, within the range of its bits, signed or not, come
+    within a step of that range's end where it jumps, and go on after the jump as before it. Lost ones may be ``nan``.
     """
     known = np.flatnonzero(np.isfinite(values))
-    counts = values[known]
-    if counts.size < 3 or not np.array_equal(counts, np.rint(counts)):
+    scale = _scale(values[known])
+    if known.size < 3 or scale is None:
         return values, None
+    counts = np.rint(values[known] * scale)
     jumps = np.abs(np.diff(counts))
     for bits in BITS:
         period = 2.0**bits
@@ -31,9 +34,20 @@ def unwrap_counter(values: Float) -> tuple[Float, int | None]:
         nearby = _nearby(np.where(is_wrap, 0.0, steps))
         if (steps[is_wrap] <= 2 * nearby[is_wrap] + 2).all() and steps.max() < period / 8:
             unwrapped = values.copy()
-            unwrapped[known] = whole
+            unwrapped[known] = whole / scale
             return unwrapped, bits
     return values, None
+
+
+def _scale(values: Float) -> float | None:
+    """Return the power of ten that makes whole numbers of all values; None without one."""
+    if not (np.abs(values) < MOST_COUNTS).all():
+        return None
+    for decimals in range(MOST_DECIMALS + 1):
+        scaled = values * 10.0**decimals
+        if (np.abs(scaled - np.rint(scaled)) <= 1e-6 + 1e-12 * np.abs(scaled)).all():
+            return 10.0**decimals
+    return None
 
 
 def _nearby(steps: Float, reach: int = 3) -> Float:

@@ -129,7 +129,10 @@ def check_headers(headers: Mapping[str, str], columns: Mapping[str, object], sou
     required = (*REQUIRED, SAMPLING) if VOLTAGE in columns else REQUIRED
     missing = [key for key in required if not headers.get(key)]
     if missing:
-        raise RecordingError(f"{source} has no header {', '.join(missing)}: add a line such as '# {missing[0]}: ...'")
+        raise RecordingError(
+            f"{source} has no header {', '.join(missing)}: add a line such as '# {missing[0]}: ...', or give "
+            "--columns with a column map where another program wrote it"
+        )
     if headers["format"] != FORMAT:
         raise RecordingError(
             f"{source} has format {shown(headers['format'])}, which is not {FORMAT!r}: convert it first"

@@ -67,6 +67,11 @@ def is_number(cell: str) -> bool:
     return any(is_written_by(text, mark) for mark in DECIMALS) or _clock(text) is not None
 
 
+def is_clock(cell: str) -> bool:
+    """Whether a cell is a time of day, with a date or without."""
+    return _clock(plain(cell)) is not None
+
+
 def is_written_by(text: str, decimal: str) -> bool:
     """Whether a plain text is a number with this decimal mark."""
     return _NUMBERS[decimal].fullmatch(text) is not None

@@ -43,6 +43,7 @@ def _fits(row: Row, layout: Layout) -> bool:
 def _places(row: Row) -> dict[str, list[int]]:
     places: dict[str, list[int]] = {}
     for j, cell in enumerate(row.cells):
-        if name := " ".join(plain(cell).split()):
+        text = plain(cell)
+        for name in {text, " ".join(text.split())} - {""}:
             places.setdefault(name, []).append(j)
     return places

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from fdhil.csv_text import shown
 from fdhil.errors import RecordingError
-from fdhil.store.trace_cells import is_number, is_void, plain
+from fdhil.store.trace_cells import is_clock, is_number, is_void, plain
 
 HEAD_LINES = 400  # of a file's beginning, in which the first row of numbers is searched
 SAME_WIDTH = 3  # rows of numbers in succession that show where they begin
@@ -44,7 +44,9 @@ class Layout:
 
     def is_short(self, row: Row) -> bool:
         """Whether a record is a row of numbers whose last cells are missing."""
-        return len(row.cells) < self.width and self._begins(row) and len(self._found(row)) > 1 and self._is_clean(row)
+        if len(row.cells) >= self.width or not self._begins(row) or is_clock(row.cells[self.numbers[0]]):
+            return False
+        return len(self._found(row)) > 1 and self._is_clean(row)
 
     def begins_rows(self, rows: Sequence[Row]) -> bool:
         """Whether these records are all rows of two numbers or more, without a text among them."""

@@ -26,6 +26,7 @@ from fdhil.store.trace_rows import SAMPLE_ROWS, Body, Row, find_body
 
 SEPARATORS = "\t;,| "  # a blank stands for a run of blanks
 MOST_LINES_IN_ROW = 8
+ENCODINGS = ("utf-8-sig", "cp1252", "cp932")  # tried in turn; of Western and of Japanese programs
 _EXCEL = re.compile(r"\"?sep=(.)\"?\s*", re.IGNORECASE)
 _COMMENT = re.compile(r"\s*(?:#+|%+|//+)\s*")
 _WIDE_BLANKS = re.compile(r"\t|\s{2,}")
@@ -36,7 +37,7 @@ class TraceText(Section):
 
     separator: str | None = Field(None, min_length=1, max_length=1, description="between cells; left out: it shows")
     decimal: str | None = Field(None, pattern="^[.,]$", description="of numbers; left out: it shows")
-    encoding: str | None = Field(None, max_length=20, description="left out: UTF-16 or UTF-8 where it is, else cp1252")
+    encoding: str | None = Field(None, max_length=20, description="left out: UTF-16, UTF-8, cp1252, else cp932")
 
 
 def parse_trace(content: bytes, told: TraceText, source: str) -> RecordingTable:
@@ -69,10 +70,12 @@ def _text(content: bytes, told: TraceText, source: str) -> str:
         return text_of(content, source, "utf-16")
     if b"\0" in content[:2]:  # UTF-16 without its mark
         return text_of(content, source, "utf-16-be" if content[:1] == b"\0" else "utf-16-le")
-    try:
-        content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return text_of(content, source, "cp1252")
+    for encoding in ENCODINGS:
+        try:
+            content.decode(encoding)
+        except UnicodeDecodeError:
+            continue
+        return text_of(content, source, encoding)
     return text_of(content, source)
 
 

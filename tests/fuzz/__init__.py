@@ -10,6 +10,6 @@ from __future__ import annotations
 # way in -> the module with its ``target()``; the cheapest first
 TARGETS = (
     "guard_socket", "guard_can", "modbus_rtu", "modbus_tcp", "hearing", "nc_lines", "gcode", "fault_script", "eds",
-    "machine_toml", "status_told", "kept_documents", "offer", "recording_csv", "recording_parquet", "recording_hdf5",
-    "recording_mat", "recording_mdf4", "daemon_socket", "web",
+    "machine_toml", "status_told", "kept_documents", "offer", "recording_csv", "trace_text", "recording_parquet",
+    "recording_hdf5", "recording_mat", "recording_mdf4", "daemon_socket", "web",
 )  # fmt: skip

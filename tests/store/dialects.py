@@ -88,7 +88,7 @@ def write(dialect: Dialect, values: dict[str, Float]) -> bytes:
     has_time = dialect.time != "none"
     names = [*(["Time"] if has_time else []), *(name_of(dialect, signal) for signal in values)]
     records = []
-    for k in range(ROWS):
+    for k in range(len(values["Voltage"])):
         cells = [time_cell(k, dialect)] if has_time else []
         for signal in values:
             is_lost = dialect.lost and k in (20, 21) and signal == "Current"

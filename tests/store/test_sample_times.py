@@ -80,9 +80,22 @@ def test_a_counter_that_passes_the_end_of_its_range_is_unwrapped(bits: int, sign
     np.testing.assert_array_equal(unwrapped - unwrapped[0], counts - counts[0])
 
 
+def test_a_counter_written_in_thousandths_is_unwrapped() -> None:
+    unwrapped, bits = unwrap_counter(((COUNTS + 32768) % 65536 - 32768) / 1000)
+    assert bits == 16
+    np.testing.assert_allclose(unwrapped - unwrapped[0], (COUNTS - COUNTS[0]) / 1000, atol=1e-9)
+
+
+def test_an_encoder_of_one_turn_is_unwrapped() -> None:
+    turns = np.concatenate([np.zeros(50), np.cumsum(np.rint(np.linspace(0, 120, 200)))])
+    unwrapped, bits = unwrap_counter(turns % 4096)
+    assert bits == 12
+    np.testing.assert_array_equal(unwrapped, turns)
+
+
 @pytest.mark.parametrize(
     "counts",
-    [COUNTS, COUNTS % 65536 + 0.5, np.where(COUNTS > 40_000, COUNTS - 40_000, COUNTS), COUNTS * 90 % 65536],
+    [COUNTS, COUNTS % 65536 + np.pi, np.where(COUNTS > 40_000, COUNTS - 40_000, COUNTS), COUNTS * 90 % 65536],
     ids=["no wrap", "no whole numbers", "another period", "too fast"],
 )
 def test_another_jump_is_left_to_the_checks(counts: Float) -> None:
