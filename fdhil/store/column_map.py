@@ -6,6 +6,7 @@ Without a speed, it is the difference of positions; without a demand, none can b
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
@@ -46,6 +47,9 @@ FACTORS: Mapping[str, Mapping[str, float]] = {
     "table_m_s2": {"m/s2": 1.0, "mm/s2": 1e-3, "g": 9.80665},
 }  # fmt: skip
 COUNTED = ("time_s", "position_m", "demand_m")  # what a counter may count
+SYNONYMS = {"sec": "s", "msec": "ms", "U/min": "rpm", "r/min": "rpm", "min-1": "rpm", "m/s^2": "m/s2", "m/s²": "m/s2"}
+_MICRO = str.maketrans({"\u00b5": "u", "\u03bc": "u"})
+_IN_NAME = re.compile(r"[\[(]([^\[\]()]+)[\])]$")  # a unit at the end of a name
 Signal = Literal[
     "time_s", "voltage_V", "current_A", "speed_rad_per_s", "position_m", "demand_m", "table_mm", "table_m_s2"
 ]
@@ -168,29 +172,56 @@ def _signals(raw: RecordingTable, told: ColumnMap, pitch_m: float, source: str) 
     """Return the signals that the map gives, and what was done to them."""
     signals: dict[str, Float] = {}
     notes: dict[str, None] = {}  # in order, each once
-    found: dict[int, str] = {}
+    _check_places(raw, told, source)
     for signal, of in told.columns.items():
-        parts = []
-        for column in _as_tuple(of):
+        parts: dict[str, Float] = {}
+        for k, column in enumerate(_as_tuple(of)):
             values = _column(raw, column.name, source)
-            other = found.setdefault(id(values), column.name)
-            if other != column.name and not {other[0], column.name[0]} & {"#"}:
-                raise RecordingError(
-                    f"{source} has {shown(other)} and {shown(column.name)} above one column: its head "
-                    "lists signals one a line; say by #1, #2 ... from the left which column each is"
-                )
+            bits = None
             if signal in COUNTED:
                 values, bits = unwrap_counter(values)
-                if bits is not None:
-                    text = f"{column.name} jumps by 2^{bits} as a counter of {bits} bits does, and was unwrapped"
-                    notes[text] = None
+            if bits is not None:
+                notes[f"{column.name} jumps by 2^{bits} as a counter of {bits} bits does, and was unwrapped"] = None
             factor = 1.0 if column.name in raw.clocks and signal == "time_s" else _factor(signal, column.unit, pitch_m)
-            parts.append((values * column.factor + column.offset) * factor)
-        if len({part.size for part in parts}) == 1:
-            signals[signal] = np.sum(parts, axis=0)
-        else:
-            _check_lengths({c.name: part for c, part in zip(_as_tuple(of), parts, strict=True)}, source)
+            _check_unit(raw, signal, column, source)
+            parts[f"{column.name} ({k + 1})"] = (values * column.factor + column.offset) * factor
+        _check_lengths(parts, source)
+        signals[signal] = np.sum([*parts.values()], axis=0)
     return signals, [*notes]
+
+
+def _check_places(raw: RecordingTable, told: ColumnMap, source: str) -> None:
+    """Refuse two names of one column: a head that lists its signals one a line."""
+    found: dict[int, str] = {}
+    for column in (column for columns in told.columns.values() for column in _as_tuple(columns)):
+        if column.name.startswith("#") or column.name not in raw.columns:
+            continue
+        other = found.setdefault(id(raw.columns[column.name]), column.name)
+        if other != column.name:
+            raise RecordingError(
+                f"{source} has {shown(other)} and {shown(column.name)} above one column: its head lists signals one a "
+                "line; say by #1, #2 ... from the left which column each is"
+            )
+
+
+def _check_unit(raw: RecordingTable, signal: str, column: Column, source: str) -> None:
+    """Refuse a unit that is not the one that stands above the column, where the map scales nothing itself."""
+    known = {**FACTORS[signal], **(PER_REVOLUTION if signal == "speed_rad_per_s" else {})}
+    in_name = _IN_NAME.search(column.name)
+    texts = [*raw.texts.get(column.name, ()), *([in_name[1]] if in_name else [])]
+    units = [unit for unit in map(_unit, texts) if unit in known]
+    wrong = units and not any(math.isclose(known[unit], known[column.unit]) for unit in units)
+    if wrong and "factor" not in column.model_fields_set and column.name not in raw.clocks:
+        raise RecordingError(
+            f"{source} has {shown(column.name)} in {units[0]}, the column map says {column.unit}: correct unit in the "
+            "map, or give factor = 1 where the file is wrong"
+        )
+
+
+def _unit(text: str) -> str:
+    """Return a text as a unit of the map, where it is one."""
+    unit = text.strip("[]() ").translate(_MICRO)
+    return SYNONYMS.get(unit, unit)
 
 
 def _time(raw: RecordingTable, rate_hz: float | None, rows: int, source: str) -> Float:

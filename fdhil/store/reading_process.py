@@ -216,7 +216,8 @@ def _parts(reader: Any, content: bytes, source: str) -> Iterator[bytes]:
     yield json.dumps({"tables": 1 + len(table.others)}).encode()
     for each in (table, *table.others):
         told = {"headers": dict(each.headers), "columns": [*each.columns], "clocks": [*each.clocks]}
-        yield json.dumps({**told, "doubts": dict(each.doubts)}).encode()
+        texts = {name: [*found] for name, found in each.texts.items()}
+        yield json.dumps({**told, "doubts": dict(each.doubts), "texts": texts}).encode()
         for values in each.columns.values():
             yield np.asarray(values, dtype=np.float64).tobytes()
 
@@ -234,7 +235,7 @@ def receive(asked: Connection) -> RecordingTable | FdhilError:
 def _table(asked: Connection) -> RecordingTable:
     told = json.loads(asked.recv_bytes())
     columns = {name: np.frombuffer(asked.recv_bytes()).copy() for name in told["columns"]}
-    return RecordingTable(told["headers"], columns, frozenset(told["clocks"]), told["doubts"])
+    return RecordingTable(told["headers"], columns, frozenset(told["clocks"]), told["doubts"], texts=told["texts"])
 
 
 if __name__ == "__main__":

@@ -62,7 +62,11 @@ def read(content: bytes, source: str) -> RecordingTable:
             rows = [group.channel_group.cycles_nr for group in file.groups]
             check_size(max(rows, default=0), sum(len(group.channels) for group in file.groups), source)
             headers = _headers(str(file.header.comment))
-            tables = [RecordingTable(headers, columns, frozenset(), doubts) for columns, doubts in _groups(file, rows)]
+            units = {
+                c.name: (str(c.unit or ""),) for g in file.groups for c in g.channels if c.channel_type not in MASTER
+            }
+            groups = _groups(file, rows)
+            tables = [RecordingTable(headers, c, frozenset(), doubts, texts=units) for c, doubts in groups]
     except UnboundLocalError:  # the library's own, where a file says that it is unfinished and has no block to finish
         raise unreadable(source, KIND, ValueError("it is unfinished, or damaged")) from None
     except (asammdf.blocks.utils.MdfException, ExpatError, *UNREADABLE) as error:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -61,8 +61,8 @@ class RecordingTable:
     """``headers`` and ``columns`` (n,) of a recording; a lost sample is a missing row.
 
     Of another program's file further: ``clocks``, the columns that are times in seconds by their kind; ``doubts``, why
-    a column of that name cannot be used; ``interruption``, what keeps the number of a row from being a time; and the
-    ``others``, its columns that were sampled at other times.
+    a column of that name cannot be used; ``interruption``, what keeps the number of a row from being a time; the
+    ``others``, its columns that were sampled at other times; and ``texts``, what the file says of a column.
     """
 
     headers: Mapping[str, str]
@@ -71,6 +71,7 @@ class RecordingTable:
     doubts: Mapping[str, str] = field(default_factory=dict)
     interruption: str = ""
     others: tuple[RecordingTable, ...] = ()
+    texts: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
 
 def recording_of(table: RecordingTable, source: str = "recording") -> Recording:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 from fdhil.store.trace_cells import plain
 from fdhil.store.trace_rows import Layout, Row
@@ -10,26 +11,40 @@ from fdhil.store.trace_rows import Layout, Row
 UNFILLED = ("comment", "comments", "kommentar", "remark")  # a last column whose cells are left out where it has none
 
 
-def find_names(head: Sequence[Sequence[Row]], layout: Layout) -> tuple[dict[str, int], dict[str, str]]:
-    """Return the column (from 0) of each name, and why another text of the head names none.
+@dataclass(frozen=True, slots=True)
+class Head:
+    """The texts above the columns (from 0).
 
-    ``head`` has each line, from the top, in the ways in which it may be taken apart.
+    ``columns`` is the column of each name, ``twice`` those of a name that stands above several, with its line,
+    ``uneven`` why a text stands above none, and ``texts`` what stands above each column.
     """
+
+    columns: Mapping[str, int]
+    twice: Mapping[str, tuple[int, Sequence[int]]]
+    uneven: Mapping[str, str]
+    texts: Mapping[int, Sequence[str]]
+
+
+def read_head(lines: Sequence[Sequence[Row]], layout: Layout) -> Head:
+    """Return the names of a head; ``lines`` has each line, from the top, in the ways in which it may be taken apart."""
     columns: dict[str, int] = {}
-    twice: dict[str, str] = {}
+    twice: dict[str, tuple[int, Sequence[int]]] = {}
     uneven: dict[str, str] = {}
-    for ways in reversed(head):
+    texts: dict[int, list[str]] = {}
+    for ways in reversed(lines):
         row = next((row for row in ways if _fits(row, layout)), None)
         for name, places in _places(row or ways[0]).items():
             if row is None:
                 count = f"{len(ways[0].cells)} cells of line {ways[0].line}, the rows have {layout.width}"
                 uneven.setdefault(name, f"stands among the {count}: say by #1, #2 ... from the left which column it is")
-            elif name not in columns and len(places) > 1:
-                stands = " and ".join(f"#{j + 1}" for j in places)
-                twice.setdefault(name, f"stands above {stands} (line {row.line}): give one of these as its name")
+                continue
+            for j in places:
+                texts.setdefault(j, []).append(name)
+            if name not in columns and len(places) > 1:
+                twice.setdefault(name, (row.line, places))
             elif name not in twice and places[0] < layout.width:
                 columns.setdefault(name, places[0])
-    return columns, {name: why for name, why in {**uneven, **twice}.items() if name not in columns}
+    return Head(columns, twice, uneven, texts)
 
 
 def _fits(row: Row, layout: Layout) -> bool:

@@ -10,9 +10,10 @@ from __future__ import annotations
 import codecs
 import csv
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 
+import numpy as np
 from pydantic import Field
 
 from fdhil.config.section import Section
@@ -21,7 +22,7 @@ from fdhil.errors import RecordingError
 from fdhil.records import Float
 from fdhil.store.recording_table import RecordingTable, check_size
 from fdhil.store.trace_cells import DECIMALS, is_number, is_void, is_written_by, parse_column, plain
-from fdhil.store.trace_head import find_names
+from fdhil.store.trace_head import Head, read_head
 from fdhil.store.trace_rows import SAMPLE_ROWS, Body, Row, find_body
 
 SEPARATORS = "\t;,| "  # a blank stands for a run of blanks
@@ -56,7 +57,7 @@ def parse_trace(content: bytes, told: TraceText, source: str) -> RecordingTable:
         raise _no_rows(lines, separator, source)
     check_size(len(body.rows), body.layout.width, source)
     decimal = told.decimal or _decimal(body, separator, source)
-    return _table(body, _head(lines, body, separator), decimal)
+    return _table(body, read_head(_head_lines(lines, body, separator), body.layout), decimal)
 
 
 def _text(content: bytes, told: TraceText, source: str) -> str:
@@ -153,7 +154,7 @@ def _decimal(body: Body, separator: str, source: str) -> str:
     return "."
 
 
-def _head(lines: Sequence[str], body: Body, separator: str) -> list[list[Row]]:
+def _head_lines(lines: Sequence[str], body: Body, separator: str) -> list[list[Row]]:
     """Return the lines above the rows in the ways in which they may be taken apart."""
     head: list[list[Row]] = []
     for row in body.head:
@@ -167,21 +168,40 @@ def _head(lines: Sequence[str], body: Body, separator: str) -> list[list[Row]]:
     return head
 
 
-def _table(body: Body, head: Sequence[Sequence[Row]], decimal: str) -> RecordingTable:
+def _table(body: Body, head: Head, decimal: str) -> RecordingTable:
+    named: dict[int, list[str]] = {j: [f"#{j + 1}"] for j in range(body.layout.width)}
+    for name, j in head.columns.items():
+        named[j].append(name)
     columns: dict[str, Float] = {}
     doubts: dict[str, str] = {}
     clocks: set[str] = set()
-    names, unclear = find_names(head, body.layout)
-    named: dict[int, list[str]] = {j: [f"#{j + 1}"] for j in range(body.layout.width)}
-    for name, j in names.items():
-        named[j].append(name)
+    texts: dict[str, Sequence[str]] = {}
     for j, cells in enumerate(zip(*(row.cells for row in body.rows), strict=True)):
         read = parse_column(cells, decimal)
         columns |= dict.fromkeys(named[j], read.values)
+        texts |= dict.fromkeys(named[j], head.texts.get(j, ()))
         if read.bad is not None:
             text = f"has {shown(cells[read.bad])} in line {body.rows[read.bad].line}, where a number belongs"
             doubts |= dict.fromkeys(named[j], f"{text}: correct it there, or export the file again")
         if read.is_clock:
             clocks.update(named[j])
+    unclear = dict(head.uneven)
+    for name, (line, places) in head.twice.items():
+        stands = " and ".join(f"#{j + 1}" for j in places)
+        unclear[name] = f"stands above {stands} (line {line}): give one of these as its name"
+        doubts |= _uneven_times(name, [f"#{j + 1}" for j in places if j < body.layout.width], columns)
     doubts |= {name: why for name, why in unclear.items() if name not in columns}
-    return RecordingTable({}, columns, frozenset(clocks), doubts, body.interruption)
+    return RecordingTable({}, columns, frozenset(clocks), doubts, body.interruption, texts=texts)
+
+
+def _uneven_times(name: str, places: Sequence[str], columns: Mapping[str, Float]) -> dict[str, str]:
+    """Return the doubt about columns of one name that are all times and differ: each channel has times of its own."""
+    every = [columns[place][np.isfinite(columns[place])] for place in places]
+    is_time = all(
+        values.size > 2 and np.diff(values).min() > 0 and np.ptp(np.diff(values)) < 0.01 * np.diff(values).mean()
+        for values in every
+    )
+    if not is_time or all(np.array_equal(values, every[0]) for values in every):
+        return {}
+    text = f"is a time beside each channel ({name}), and they differ: export all channels with one sample time"
+    return dict.fromkeys(places, text)

@@ -83,6 +83,11 @@ def time_cell(k: int, dialect: Dialect) -> str:
     return number(float(format(seconds * form[0], form[1])), Dialect(decimal=dialect.decimal, form=form[1]))
 
 
+def time_unit(dialect: Dialect) -> str:
+    """Return the unit of its times."""
+    return dialect.time if dialect.time in ("ms", "us") else "s"
+
+
 def write(dialect: Dialect, values: dict[str, Float]) -> bytes:
     """Return the file."""
     has_time = dialect.time != "none"
@@ -94,7 +99,7 @@ def write(dialect: Dialect, values: dict[str, Float]) -> bytes:
             is_lost = dialect.lost and k in (20, 21) and signal == "Current"
             cells.append(dialect.lost.replace("empty", "") if is_lost else number(values[signal][k], dialect))
         records.append(cells)
-    units = [*(["s"] if has_time else []), *("x" for _ in values)]
+    units = [*([time_unit(dialect)] if has_time else []), *("x" for _ in values)]
     if dialect.extra:
         names, units = [*names, "State"], [*units, "-"]
         records = [[*cells, "OK" if dialect.extra == "text" else str(k)] for k, cells in enumerate(records)]
@@ -145,7 +150,6 @@ def _joined(cells: list[str], dialect: Dialect, is_name: bool = False) -> str:
 
 def column_map(dialect: Dialect) -> dict[str, Any]:
     """Return the map of the file as a document."""
-    units = {"ms": "ms", "us": "us"}
     of = dict(zip(("voltage_V", "current_A", "speed_rad_per_s", "position_m", "demand_m"), SIGNALS, strict=True))
     columns: dict[str, Any] = {
         signal: {"name": name_of(dialect, name), "unit": {"V": "V", "A": "A", "s": "rad/s", "m": "m"}[signal[-1]]}
@@ -155,7 +159,7 @@ def column_map(dialect: Dialect) -> dict[str, Any]:
     if dialect.time == "none":
         headers["sample_rate_hz"] = 1000.0
     else:
-        columns["time_s"] = {"name": "Time", "unit": units.get(dialect.time, "s")}
+        columns["time_s"] = {"name": "Time", "unit": time_unit(dialect)}
     return {"headers": headers, "columns": columns}
 
 

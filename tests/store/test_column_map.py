@@ -140,3 +140,28 @@ def test_a_trace_that_is_not_what_the_map_says_is_one_sentence(content: bytes, w
     told.write_text(HEADERS + MAP % CASES["quoted"][1])
     with pytest.raises(RecordingError, match=words):
         read_recording(trace, read_column_map(told))
+
+
+@pytest.mark.parametrize(
+    ("units", "name", "old", "new", "words"),
+    [
+        ("ms;A;rpm;mm;um", "Strom", "", "", "'Strom' in A, the column map says mA"),
+        ("s;mA;rpm;mm;um", "Strom", "", "", "'Time' in s, the column map says ms"),
+        ("ms;;rpm;mm;um", "Strom [A]", '"Strom"', '"Strom [A]"', r"'Strom \[A\]' in A, the column map says mA"),
+        ("ms;A;rpm;mm;um", "Strom", 'unit = "mA"', 'unit = "mA", factor = 1', ""),
+        ("[ms];(mA);U/min;mm;\u00b5m", "Strom", "", "", ""),
+        ("V;V;V;V;V", "Strom", "", "", ""),
+    ],
+)
+def test_a_unit_that_the_file_contradicts_is_refused(
+    units: str, name: str, old: str, new: str, words: str, tmp_path: Path
+) -> None:
+    trace, told = tmp_path / "trace.csv", tmp_path / "map.toml"
+    text = _semicolon(_columns()).decode("utf-16").replace("ms;[];[];[];[]", units).replace("Strom", name)
+    trace.write_bytes(text.encode())
+    told.write_text((HEADERS + MAP % CASES["semicolon"][1]).replace(old, new))
+    if not words:
+        assert read_recording(trace, read_column_map(told)).current_a.size == N
+        return
+    with pytest.raises(RecordingError, match=words):
+        read_recording(trace, read_column_map(told))

@@ -146,3 +146,16 @@ def test_a_text_among_numbers_is_doubted_where_its_column_is_used() -> None:
     read = _parsed("Time;U;I\n", lambda k: f"{k};{U[k] if k != 9 else '12.x'};{I[k]}")
     assert "has '12.x' in line 11" in read.doubts["U"] == read.doubts["#2"]
     assert "I" not in read.doubts
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        (lambda k: f"{k};{U[k]};{2 * k};{I[k]}", "is a time beside each channel"),
+        (lambda k: f"{k};{U[k]};{k};{I[k]}", "stands above #1 and #3"),
+    ],
+)
+def test_times_beside_each_channel_must_agree(row: Row, words: str) -> None:
+    read = _parsed("Name;U;Name;I\n", row)
+    assert words in read.doubts.get("#1", read.doubts["Name"])
+    assert ("#1" in read.doubts) == ("beside" in words)
