@@ -21,7 +21,8 @@ OBJECT = "is an object that only MATLAB can read (timeseries, table, Dataset): s
 def matlab_table(variables: Mapping[str, Any], headers: Mapping[str, str], source: str) -> RecordingTable:
     """Return the vectors within variables: scalar structures as mappings, cells and arrays of structures as lists.
 
-    A field has also its last name alone, and a signal of a Simulink scope its label, where no other has it.
+    A field has also its last name alone, and a signal of a Simulink scope its label, where no other has it. The one
+    ``time`` of a scope is ``time_s`` too.
     """
     columns: dict[str, Float] = {}
     doubts: dict[str, str] = {}
@@ -47,6 +48,9 @@ def matlab_table(variables: Mapping[str, Any], headers: Mapping[str, str], sourc
             )
         elif name in columns:
             columns[alias] = columns[name]
+    times = [name for name in columns if name.endswith(".time")]
+    if len(times) == 1:
+        columns.setdefault("time_s", columns[times[0]])
     return RecordingTable(headers, columns, frozenset(), doubts)
 
 
@@ -63,14 +67,13 @@ def _leaves(name: str, alias: str, value: Any, depth: int) -> Iterator[tuple[str
     if depth > MOST_DEPTH:
         return
     if isinstance(value, Mapping):
+        label = value.get("label")  # of a signal of a scope
         for field, part in value.items():
-            yield from _leaves(f"{name}.{field}" if name else field, field, part, depth + 1)
+            own = label if field == "values" and isinstance(label, str) and label else field
+            yield from _leaves(f"{name}.{field}" if name else field, own, part, depth + 1)
     elif isinstance(value, list):
         for k, part in enumerate(value[:MOST_COLUMNS], 1):
-            label = part.get("label") if isinstance(part, Mapping) else None
-            for inner, short, leaf in _leaves(f"{name}({k})", "", part, depth + 1):
-                is_signal = isinstance(label, str) and label and inner.endswith(".values")
-                yield inner, str(label) if is_signal else short, leaf
+            yield from _leaves(f"{name}({k})", "", part, depth + 1)
     elif isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
         yield from _vectors(name, alias, value)
     elif not isinstance(value, (str, bytes, int, float, np.generic)):

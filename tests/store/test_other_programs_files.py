@@ -82,7 +82,11 @@ def _matlab_73(path: Path, variables: Mapping[str, Any]) -> None:
         raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(116) + b"\0" * 8 + b"\0\2IM")
 
 
-SCOPE = {"time": TIME, "signals": [{"values": v, "label": name} for name, v in VALUES.items()], "blockName": "axis"}
+SCOPE: dict[str, Any] = {
+    "time": TIME,
+    "signals": [{"values": v, "label": name} for name, v in VALUES.items()],
+    "blockName": "axis",
+}
 MATRIX = {name: f"data(:,{k})" for k, name in enumerate("tuiwxr", 1)}
 # layout of a MATLAB file -> its variables, and the names of a map
 LAYOUTS: dict[str, tuple[Mapping[str, Any], Mapping[str, str]]] = {
@@ -108,6 +112,24 @@ def test_a_matlab_file_is_read_by_the_names_that_matlab_has(layout: str, write: 
     variables, names = LAYOUTS[layout]
     write(tmp_path / "r.mat", variables)
     _assert_read(tmp_path / "r.mat", _map(names))
+
+
+@pytest.mark.parametrize("write", [_matlab_5, _matlab_73])
+def test_a_scope_has_its_own_time_and_one_signal_its_label(write: Any, tmp_path: Path) -> None:
+    write(tmp_path / "r.mat", {"ScopeData": SCOPE})
+    _assert_read(tmp_path / "r.mat", _map(time=False))
+    wide = {"time": TIME, "signals": {"values": np.column_stack([*VALUES.values()]), "label": "all"}}
+    write(tmp_path / "wide.mat", {"ScopeData": wide})
+    _assert_read(tmp_path / "wide.mat", _map({n: f"all(:,{k})" for k, n in enumerate(VALUES, 1)}, time=False))
+
+
+def test_two_signals_of_one_label_are_refused(tmp_path: Path) -> None:
+    signals = [*SCOPE["signals"], {"values": TIME, "label": "u"}]
+    _matlab_5(tmp_path / "r.mat", {"ScopeData": {**SCOPE, "signals": signals}})
+    with pytest.raises(
+        RecordingError, match=r"'u' stands for ScopeData.signals\(1\).values and ScopeData.signals\(6\)"
+    ):
+        read_table(tmp_path / "r.mat", _map(time=False))
 
 
 def test_the_headers_of_a_matlab_7_3_file_are_read(tmp_path: Path) -> None:
@@ -182,6 +204,17 @@ GROUPS: dict[str, list[tuple[Float, Mapping[str, Float]]]] = {
 def test_the_group_of_an_mdf_file_that_has_the_columns_is_read(groups: str, tmp_path: Path) -> None:
     _mdf(tmp_path / "r.mf4", *GROUPS[groups])
     _assert_read(tmp_path / "r.mf4", _map(time=False))
+
+
+def test_a_unit_of_an_mdf_channel_is_not_overruled(tmp_path: Path) -> None:
+    import asammdf
+
+    with asammdf.MDF(version="4.10") as file:
+        units = {"i": "mA"}
+        file.append([asammdf.Signal(v, TIME, name=n, unit=units.get(n, "")) for n, v in VALUES.items()])
+        file.save(tmp_path / "r.mf4")
+    with pytest.raises(RecordingError, match="'i' in mA, the column map says A"):
+        read_table(tmp_path / "r.mf4", _map(time=False))
 
 
 def test_invalid_samples_of_an_mdf_file_are_gaps(tmp_path: Path) -> None:
