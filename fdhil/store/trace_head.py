@@ -32,18 +32,17 @@ def read_head(lines: Sequence[Sequence[Row]], layout: Layout) -> Head:
     uneven: dict[str, str] = {}
     texts: dict[int, list[str]] = {}
     for ways in reversed(lines):
-        row = next((row for row in ways if _fits(row, layout)), None)
-        for name, places in _places(row or ways[0]).items():
-            if row is None:
-                count = f"{len(ways[0].cells)} cells of line {ways[0].line}, the rows have {layout.width}"
-                uneven.setdefault(name, f"stands among the {count}: say by #1, #2 ... from the left which column it is")
-                continue
+        fitting = [row for row in ways if _fits(row, layout)]
+        for name, places in [each for row in fitting for each in _places(row).items()]:
             for j in places:
                 texts.setdefault(j, []).append(name)
             if name not in columns and len(places) > 1:
-                twice.setdefault(name, (row.line, places))
+                twice.setdefault(name, (ways[0].line, places))
             elif name not in twice and places[0] < layout.width:
                 columns.setdefault(name, places[0])
+        for name in () if fitting else _places(ways[0]):
+            count = f"{len(ways[0].cells)} cells of line {ways[0].line}, the rows have {layout.width}"
+            uneven.setdefault(name, f"stands among the {count}: say by #1, #2 ... from the left which column it is")
     return Head(columns, twice, uneven, texts)
 
 

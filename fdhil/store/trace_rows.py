@@ -13,6 +13,7 @@ from fdhil.store.trace_cells import is_clock, is_number, is_void, plain
 HEAD_LINES = 400  # of a file's beginning, in which the first row of numbers is searched
 SAME_WIDTH = 3  # rows of numbers in succession that show where they begin
 SAMPLE_ROWS = 600  # that show which columns are numbers
+MOST_FOOTER_ROWS = 12  # with numbers, as a mean and a maximum
 COMMENTS = ("#", "%", "//")
 COMMENT_MARKS = "#%/ "
 
@@ -48,9 +49,17 @@ class Layout:
             return False
         return len(self._found(row)) > 1 and self._is_clean(row)
 
+    def has_numbers(self, row: Row) -> bool:
+        """Whether a record is as long as a row and has two numbers or more, after a text."""
+        return len(row.cells) == self.width and len(self._found(row)) > 1
+
     def begins_rows(self, rows: Sequence[Row]) -> bool:
         """Whether these records are all rows of two numbers or more, without a text among them."""
         return all(self.is_row(row) and len(self._found(row)) > 1 and self._is_clean(row) for row in rows)
+
+    def is_doubtful(self, row: Row) -> bool:
+        """Whether a record is a row of two numbers or more, whatever its other cells are."""
+        return self.is_row(row) and len(self._found(row)) > 1
 
     def has_label(self, row: Row) -> bool:
         """Whether a row of numbers has a text where the others have nothing."""
@@ -94,6 +103,8 @@ def find_body(rows: Sequence[Row], source: str, is_complete: bool) -> Body | Non
         rows = rows[:-1]
     is_any = [layout.is_row(row) or layout.is_short(row) for row in rows]
     end = len(rows) - is_any[::-1].index(True)
+    if (left := sum(layout.has_numbers(row) for row in rows[end:])) > MOST_FOOTER_ROWS:
+        raise _no_row(rows[end], source, f"and {left} rows of numbers follow")
     head = {_words(row) for row in rows[:first]}
     body: list[Row] = []
     interruption = ""
@@ -115,16 +126,20 @@ def find_body(rows: Sequence[Row], source: str, is_complete: bool) -> Body | Non
             body.append(row)
             continue
         if not is_empty and _words(row) not in head and not row.cells[0].strip().startswith(COMMENTS):
-            text = shown(" ".join(row.cells))
-            raise RecordingError(
-                f"{source} has a line that is no row of numbers: line {row.line}, {text}; export it again"
-            )
+            raise _no_row(row, source)
         interruption = interruption or f"line {row.line} between the rows is no row"
     return Body(rows[:first], body, layout, interruption)
 
 
 def _words(row: Row) -> str:
     return " ".join(map(plain, row.cells)).lstrip(COMMENT_MARKS)
+
+
+def _no_row(row: Row, source: str, more: str = "") -> RecordingError:
+    text = shown(" ".join(row.cells))
+    return RecordingError(
+        f"{source} has a line that is no row of numbers: line {row.line}, {text}{more and f', {more}'}; export it again"
+    )
 
 
 def _uneven(row: Row, layout: Layout, source: str) -> RecordingError:
@@ -159,5 +174,12 @@ def _first_row(rows: Sequence[Row], layout: Layout) -> int | None:
         if layout.begins_rows(rows[k : k + SAME_WIDTH]):
             after = next((row for row in rows[k:] if not layout.is_row(row) or not layout.has_label(row)), None)
             if after is not None and layout.is_row(after):
-                return k
+                return _with_doubtful(rows, k, layout)
     return None
+
+
+def _with_doubtful(rows: Sequence[Row], first: int, layout: Layout) -> int:
+    """Return where the rows begin that have a text among their numbers, which is doubted where it is used."""
+    while first and layout.is_doubtful(rows[first - 1]):
+        first -= 1
+    return first

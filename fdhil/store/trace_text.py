@@ -29,6 +29,7 @@ SEPARATORS = "\t;,| "  # a blank stands for a run of blanks
 MOST_LINES_IN_ROW = 8
 ENCODINGS = ("utf-8-sig", "cp1252", "cp932")  # tried in turn; of Western and of Japanese programs
 _EXCEL = re.compile(r"\"?sep=(.)\"?\s*", re.IGNORECASE)
+_WHOLE_LINE = re.compile(r'"((?:[^"]|"")*)"\s*')
 _COMMENT = re.compile(r"\s*(?:#+|%+|//+)\s*")
 _WIDE_BLANKS = re.compile(r"\t|\s{2,}")
 
@@ -48,6 +49,7 @@ def parse_trace(content: bytes, told: TraceText, source: str) -> RecordingTable:
     """
     lines = _text(content, told, source).replace("\r\r\n", "\n").splitlines(keepends=True)
     check_lengths(lines, 1, source)
+    lines = _without_outer_quotes(lines)
     separator = told.separator
     if lines and (stated := _EXCEL.fullmatch(lines[0])):
         separator, lines[0] = separator or stated[1], "\n"
@@ -78,6 +80,16 @@ def _text(content: bytes, told: TraceText, source: str) -> str:
             continue
         return text_of(content, source, encoding)
     return text_of(content, source)
+
+
+def _without_outer_quotes(lines: list[str]) -> list[str]:
+    """Return the lines of a file whose rows a spreadsheet took for one cell each, as they were before."""
+    quoted = [_WHOLE_LINE.fullmatch(line) for line in lines]
+    if 2 * sum(match is not None for match in quoted) <= len(lines):
+        return lines
+    if any(match is None and '"' in line for match, line in zip(quoted, lines, strict=True)):
+        return lines
+    return [match[1].replace('""', '"') + "\n" if match else line for match, line in zip(quoted, lines, strict=True)]
 
 
 def _separator(lines: Sequence[str]) -> str:
@@ -161,7 +173,7 @@ def _head_lines(lines: Sequence[str], body: Body, separator: str) -> list[list[R
         cells = row.cells
         if cells and (mark := _COMMENT.match(cells[0])):
             cells = cells[1:] if mark[0] == cells[0] and separator == " " else [cells[0][mark.end() :], *cells[1:]]
-        ways = [Row(row.line, cells)]
+        ways = [Row(row.line, cells), row]
         if separator == " ":
             ways.append(Row(row.line, _WIDE_BLANKS.split(_COMMENT.sub("", lines[row.line - 1], count=1).strip())))
         head.append(ways)

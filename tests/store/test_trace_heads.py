@@ -87,6 +87,11 @@ HEADS: dict[str, tuple[str, Row, tuple[str, str, str]]] = {
         lambda k: f"{TIME[k]:.4f},{U[k]},{I[k]}",
         ("Time", "U", "I"),
     ),
+    "rows as one quoted cell each": (
+        "Time;U;I\n",
+        lambda k: _comma(f'"{TIME[k]:.4f};{U[k]};{I[k]}"'),
+        ("Time", "U", "I"),
+    ),
     "a table of Markdown": (
         "| Time | U | I |\n|------|---|---|\n",
         lambda k: f"| {TIME[k]:.4f} | {U[k]} | {I[k]} |",
@@ -134,6 +139,7 @@ def test_a_name_without_one_column_is_doubted(head: str, name: str, words: str) 
         (lambda k: f"{k};{U[k]};{I[k]}" if k != 9 else "9;1.5", "2 cells in line 10 where the other rows have 3"),
         (lambda k: f"{k};{U[k]};{I[k]}" if k != 9 else "9;1;5;2", "4 cells in line 10 where the other rows have 3"),
         (lambda k: f"{k} {U[k]} {I[k]}" + ("\noverrun" if k == 9 else ""), "line 11, 'overrun'"),
+        (lambda k: f"{k if k < 20 else 'late'};{U[k]};{I[k]}", "line 21, .*, and 20 rows of numbers follow"),
         (lambda k: f"{k} ms;{U[k]} V;{I[k]} A", "no rows of numbers"),
     ],
 )
@@ -159,3 +165,14 @@ def test_times_beside_each_channel_must_agree(row: Row, words: str) -> None:
     read = _parsed("Name;U;Name;I\n", row)
     assert words in read.doubts.get("#1", read.doubts["Name"])
     assert ("#1" in read.doubts) == ("beside" in words)
+
+
+def test_a_text_in_the_first_row_is_no_head() -> None:
+    read = _parsed("Time;U;I\n", lambda k: f"{k};{U[k] if k > 1 else 'start'};{I[k]}")
+    assert read.columns["I"].size == N
+    assert "has 'start' in line 2" in read.doubts["U"]
+
+
+def test_a_name_may_begin_as_a_comment_does() -> None:
+    read = _parsed("% duty;# Time;U\n", lambda k: f"{I[k]};{TIME[k]:.3f};{U[k]}")
+    assert {"% duty", "duty", "# Time", "U"} <= read.columns.keys()
