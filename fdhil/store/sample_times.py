@@ -48,10 +48,11 @@ def even_times(time_s: Float, rate_hz: float | None, source: str) -> tuple[Float
 
 
 def usual_step(time_s: Float) -> float:
-    """Return the mean of the steps that are as long as most are, s."""
+    """Return the mean of the steps that are as long as most are, s; their median where none are."""
     steps = np.diff(time_s)
     usual = np.median(steps)
-    return float(steps[np.abs(steps - usual) <= STEP_TOLERANCE * abs(usual)].mean())
+    alike = steps[np.abs(steps - usual) <= STEP_TOLERANCE * abs(usual)]
+    return float(alike.mean() if alike.size else usual)
 
 
 def _with_gaps(time_s: Float, steps: Float, rounding_s: float, rate_hz: float | None) -> tuple[Float, str]:

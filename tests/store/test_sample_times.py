@@ -8,7 +8,7 @@ import pytest
 from fdhil.errors import RecordingError
 from fdhil.records import Float
 from fdhil.store.counter_wraps import unwrap_counter
-from fdhil.store.sample_times import even_times
+from fdhil.store.sample_times import even_times, usual_step
 
 K = np.arange(1000.0)
 
@@ -102,3 +102,8 @@ def test_another_jump_is_left_to_the_checks(counts: Float) -> None:
     unwrapped, found = unwrap_counter(counts)
     assert found is None
     assert np.array_equal(unwrapped, counts)
+
+
+def test_the_usual_step_is_the_mean_of_like_ones_or_the_median() -> None:
+    assert usual_step(np.array([0.0, 0.333e-3, 0.667e-3, 1e-3, 9.0])) == pytest.approx(1e-3 / 3)
+    assert usual_step(np.array([0.0, 1.0, 3.0])) == 1.5
