@@ -226,7 +226,8 @@ def _unit(text: str) -> str:
 
 def _time(raw: RecordingTable, rate_hz: float | None, rows: int, source: str) -> Float:
     """Return the file's own time, else the rows' numbers by their rate."""
-    if "time_s" in raw.columns or "time_s" in raw.doubts:
+    is_doubtful = "time_s" in raw.doubts
+    if ("time_s" in raw.columns and not is_doubtful) or (is_doubtful and rate_hz is None):
         return _column(raw, "time_s", source)
     if rate_hz is None:
         raise RecordingError(

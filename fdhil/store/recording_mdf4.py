@@ -23,6 +23,7 @@ from fdhil.store.reading_process import read_apart
 from fdhil.store.recording_table import COLUMNS, UNITS, UNREADABLE, RecordingTable, check_size, unreadable
 
 KIND = "MDF 4 file"
+TIME = 1  # what a master channel counts; others are an angle, a distance, an index
 MASTER = (2, 3)  # channel types of MDF 4 that give the time, as recorded or by the number of the sample
 _COMMENT = re.compile(r"<TX>(.*?)</TX>", re.DOTALL)
 
@@ -91,6 +92,8 @@ def _groups(file: Any, rows: list[int]) -> list[tuple[dict[str, Float], dict[str
         columns, doubts = next((g for g in groups if np.array_equal(g[0]["time_s"], time_s)), ({"time_s": time_s}, {}))
         if len(columns) == 1:
             groups.append((columns, doubts))
+        if not any(c.channel_type in MASTER and c.sync_type == TIME for c in group.channels):
+            doubts["time_s"] = "is no time in this file, its samples have none: give sample_rate_hz under [headers]"
         for j, channel in enumerate(group.channels):
             samples, invalid = file.get(group=k, index=j, samples_only=True, ignore_invalidation_bits=True)
             values = np.asarray(samples)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from fdhil.csv_text import shown
@@ -101,34 +101,44 @@ def find_body(rows: Sequence[Row], source: str, is_complete: bool) -> Body | Non
         return None
     if not is_complete and len(rows[-1].cells) < layout.width:
         rows = rows[:-1]
-    is_any = [layout.is_row(row) or layout.is_short(row) for row in rows]
-    end = len(rows) - is_any[::-1].index(True)
-    if (left := sum(layout.has_numbers(row) for row in rows[end:])) > MOST_FOOTER_ROWS:
+    last_full = _last(rows, layout.is_row)
+    end = 1 + max(last_full, _last(rows, layout.is_short))
+    if (left := sum(map(layout.has_numbers, rows[end:]))) > MOST_FOOTER_ROWS:
         raise _no_row(rows[end], source, f"and {left} rows of numbers follow")
     head = {_words(row) for row in rows[:first]}
     body: list[Row] = []
     interruption = ""
     for k in range(first, end):
-        row = rows[k]
-        missing = layout.width - len(row.cells)
-        if is_any[k] and missing and any(layout.is_row(later) for later in rows[k + 1 : end]):
-            raise _uneven(row, layout, source)
-        if is_any[k]:
-            body.append(Row(row.line, row.cells + [""] * missing) if missing else row)
+        row, cells = rows[k], _as_wide(rows[k], layout, k < last_full, source)
+        if cells is not None:
+            body.append(row if cells is row.cells else Row(row.line, cells))
             continue
-        if missing < 0 and layout.is_row(cut := Row(row.line, row.cells[: layout.width])):
-            if any(cell.strip() for cell in row.cells[layout.width :]):
-                raise _uneven(row, layout, source)
-            body.append(cut)
-            continue
-        is_empty = not any(cell.strip() for cell in row.cells)
-        if is_empty and not missing:
-            body.append(row)
-            continue
-        if not is_empty and _words(row) not in head and not row.cells[0].strip().startswith(COMMENTS):
+        words = _words(row)
+        if words and words not in head and not row.cells[0].strip().startswith(COMMENTS):
             raise _no_row(row, source)
         interruption = interruption or f"line {row.line} between the rows is no row"
     return Body(rows[:first], body, layout, interruption)
+
+
+def _last(rows: Sequence[Row], is_one: Callable[[Row], bool]) -> int:
+    return next((k for k in range(len(rows) - 1, -1, -1) if is_one(rows[k])), -1)
+
+
+def _as_wide(row: Row, layout: Layout, is_before_full: bool, source: str) -> list[str] | None:
+    """Return as many cells as the other rows have; None of a record that is no row.
+
+    RecordingError where some are missing and full rows follow, or where there are more than the others have.
+    """
+    missing = layout.width - len(row.cells)
+    if layout.is_row(row) or (not missing and not any(cell.strip() for cell in row.cells)):
+        return row.cells
+    is_short, cut = layout.is_short(row), row.cells[: layout.width]
+    is_wide = missing < 0 and layout.is_row(Row(row.line, cut))
+    if (is_short and is_before_full) or (is_wide and any(cell.strip() for cell in row.cells[layout.width :])):
+        raise _uneven(row, layout, source)
+    if is_short:
+        return row.cells + [""] * missing
+    return cut if is_wide else None
 
 
 def _words(row: Row) -> str:

@@ -217,6 +217,20 @@ def test_a_unit_of_an_mdf_channel_is_not_overruled(tmp_path: Path) -> None:
         read_table(tmp_path / "r.mf4", _map(time=False))
 
 
+@pytest.mark.parametrize("kind", [{"sync_type": 2}, {"sync_type": 0, "channel_type": 0}])
+def test_a_group_over_an_angle_or_over_nothing_has_no_time(kind: Mapping[str, int], tmp_path: Path) -> None:
+    import asammdf
+
+    with asammdf.MDF(version="4.10") as file:
+        file.append([asammdf.Signal(v, TIME, name=n) for n, v in VALUES.items()], common_timebase=True)
+        for key, value in kind.items():
+            setattr(file.groups[0].channels[0], key, value)
+        file.save(tmp_path / "r.mf4")
+    with pytest.raises(RecordingError, match="'time_s' is no time in this file"):
+        read_table(tmp_path / "r.mf4", _map(time=False))
+    _assert_read(tmp_path / "r.mf4", _map(rate_hz=1000.0, time=False))
+
+
 def test_invalid_samples_of_an_mdf_file_are_gaps(tmp_path: Path) -> None:
     _mdf(tmp_path / "r.mf4", (TIME, VALUES), invalid=(20, 21, 22))
     _assert_read(tmp_path / "r.mf4", _map(time=False), lost=(20, 21, 22))
