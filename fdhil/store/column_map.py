@@ -133,8 +133,8 @@ def mapped(raw: RecordingTable, told: ColumnMap, source: str) -> RecordingTable:
         raise RecordingError(f"{source} has no row in which every mapped column has a number: correct the column map")
     time_s, note = even_times(np.round(columns["time_s"] - columns["time_s"][0], 9), rate_hz, source)
     columns["time_s"] = np.round(time_s, 9)
-    if rate_hz is None and (period_s := usual_step(columns["time_s"])) > 0:
-        headers["sample_rate_hz"] = f"{1 / period_s:.9g}"
+    if rate_hz is None:
+        headers["sample_rate_hz"] = f"{1 / _period(columns['time_s'], source):.9g}"
     if "speed_rad_per_s" not in columns:
         turned = np.diff(columns["position_m"]) / np.diff(columns["time_s"]) * 2 * math.pi / pitch_m
         columns["speed_rad_per_s"] = np.concatenate([[0.0], turned])
@@ -240,6 +240,20 @@ def _time(raw: RecordingTable, rate_hz: float | None, rows: int, source: str) ->
             "with a time"
         )
     return np.arange(rows) / rate_hz
+
+
+def _period(time_s: Float, source: str) -> float:
+    """Return the time between samples; RecordingError where times do not rise."""
+    period_s, steps = usual_step(time_s), np.diff(time_s)
+    if period_s > 0:
+        return period_s
+    at_s = time_s[1 + int(np.argmax(steps <= 0))]
+    if (steps < 0).any():
+        raise RecordingError(f"{source}: time runs back at {at_s:g} s: sort or record it again")
+    raise RecordingError(
+        f"{source}: time stands still at {at_s:g} s: where its digits are too few, leave time_s out of the map "
+        "and give sample_rate_hz"
+    )
 
 
 def _check_lengths(columns: Mapping[str, Float], source: str) -> None:

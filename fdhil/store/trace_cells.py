@@ -15,7 +15,7 @@ DECIMALS = ".,"
 _NOTHING = """
 nan -nan nan(ind) -nan(ind) na n/a #n/a #na #nv null none nil nat inf +inf -inf infinity -infinity
 1.#qnan 1.#ind -1.#ind 1.#inf -1.#inf - -- --- ---- ? * *** **** ovl ovr ovf over overflow overload
-invalid error err #error #value! #div/0! missing lost
+invalid overrange underrange nodata error err #error #value! #div/0! missing lost
 """
 VOID = frozenset(["", *_NOTHING.split()])  # what programs write where there is no value
 DAY_S, HALF_DAY_S = 86400.0, 43200.0

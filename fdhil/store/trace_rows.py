@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 from fdhil.csv_text import shown
 from fdhil.errors import RecordingError
@@ -95,29 +97,54 @@ def find_body(rows: Sequence[Row], source: str, is_complete: bool) -> Body | Non
     Between rows may stand nothing but empty lines, comments, the names again, and rows without a value: RecordingError
     for any other, and for a row of more or fewer cells than the others.
     """
+    rows = [row for row in rows if len(row.cells) > 1 or any(cell.strip() for cell in row.cells)]
     layout = _layout(rows)
     first = None if layout is None else _first_row(rows, layout)
     if layout is None or first is None:
         return None
-    if not is_complete and len(rows[-1].cells) < layout.width:
+    if not is_complete and _is_cut_off(rows, layout):
         rows = rows[:-1]
     last_full = _last(rows, layout.is_row)
     end = 1 + max(last_full, _last(rows, layout.is_short))
     if (left := sum(map(layout.has_numbers, rows[end:]))) > MOST_FOOTER_ROWS:
         raise _no_row(rows[end], source, f"and {left} rows of numbers follow")
     head = {_words(row) for row in rows[:first]}
+    spare = _spare(rows[:first], layout)
     body: list[Row] = []
-    interruption = ""
     for k in range(first, end):
         row, cells = rows[k], _as_wide(rows[k], layout, k < last_full, source)
+        is_wide = len(row.cells) > layout.width
+        if cells is not None and any(is_number(cells[j]) or (is_wide and not is_void(cells[j])) for j in spare):
+            raise _uneven(row, layout, source)
         if cells is not None:
             body.append(row if cells is row.cells else Row(row.line, cells))
             continue
         words = _words(row)
         if words and words not in head and not row.cells[0].strip().startswith(COMMENTS):
             raise _no_row(row, source)
-        interruption = interruption or f"line {row.line} between the rows is no row"
-    return Body(rows[:first], body, layout, interruption)
+    return Body(rows[:first], body, layout, _interruption(body))
+
+
+def _interruption(body: Sequence[Row]) -> str:
+    """Return where something else stands between rows; an empty line after each of them is nothing."""
+    steps = [below.line - above.line for above, below in pairwise(body)]
+    k = next((k for k, step in enumerate(steps) if step != min(steps)), None)
+    return "" if k is None else f"line {body[k].line + 1} between the rows is no row"
+
+
+def _spare(head: Sequence[Row], layout: Layout) -> list[int]:
+    """Return the empty columns after the last number that have no name: a number there was moved out of its column."""
+    after = [j for j in layout.empty if j >= layout.filled]
+    return [j for j in after if not any(len(row.cells) > j and plain(row.cells[j]) for row in head)]
+
+
+def _is_cut_off(rows: Sequence[Row], layout: Layout) -> bool:
+    """Whether the last row lacks cells, or has in its last one another number of digits than all rows before it."""
+    if len(rows[-1].cells) < layout.width:
+        return True
+    last = [row.cells[-1].strip() for row in rows[-SAMPLE_ROWS:] if layout.is_row(row)]
+    endings = [len(re.split("[.,]", cell)[-1]) for cell in last]
+    return len(set(endings[:-1])) == 1 and endings[-1] < endings[0]
 
 
 def _last(rows: Sequence[Row], is_one: Callable[[Row], bool]) -> int:
@@ -153,9 +180,11 @@ def _no_row(row: Row, source: str, more: str = "") -> RecordingError:
 
 
 def _uneven(row: Row, layout: Layout, source: str) -> RecordingError:
+    filled = len(row.cells) if len(row.cells) != layout.width else sum(not is_void(cell) for cell in row.cells)
+    most = layout.width if len(row.cells) != layout.width else layout.filled
     return RecordingError(
-        f"{source} has {len(row.cells)} cells in line {row.line} where the other rows have {layout.width}: its numbers "
-        "may stand in wrong columns; quote cells with decimal commas, or export it again"
+        f"{source} has {filled} cells in line {row.line} where the other rows have {most}: its numbers may stand in "
+        "wrong columns; quote cells with commas in them, or export it again"
     )
 
 

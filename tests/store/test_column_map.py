@@ -165,3 +165,21 @@ def test_a_unit_that_the_file_contradicts_is_refused(
         return
     with pytest.raises(RecordingError, match=words):
         read_recording(trace, read_column_map(told))
+
+
+@pytest.mark.parametrize(
+    ("time_ms", "words"),
+    [
+        (lambda k: N - k, "time runs back"),
+        (lambda k: k if k != 200 else 199, "time stands still or runs back at 0.199 s"),
+        (lambda k: 5, "time stands still at .* give sample_rate_hz"),
+    ],
+)
+def test_times_that_do_not_rise_are_refused(time_ms: Callable[[int], int], words: str, tmp_path: Path) -> None:
+    trace, told = tmp_path / "trace.csv", tmp_path / "map.toml"
+    head, rows = _semicolon(_columns()).decode("utf-16").split("[]\r\n", 1)
+    cells = [row.partition(";")[2] for row in rows.splitlines()]
+    trace.write_text("\n".join([f"{head}[]", *(f"{time_ms(k)};{row}" for k, row in enumerate(cells)), ""]))
+    told.write_text(HEADERS + MAP % CASES["semicolon"][1])
+    with pytest.raises(RecordingError, match=words):
+        read_recording(trace, read_column_map(told))

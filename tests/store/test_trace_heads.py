@@ -138,6 +138,9 @@ def test_a_name_without_one_column_is_doubted(head: str, name: str, words: str) 
         (lambda k: f"{k};{k + 1}.125;{k + 2}.250", "may be decimal or stand between thousands"),
         (lambda k: f"{k};{U[k]};{I[k]}" if k != 9 else "9;1.5", "2 cells in line 10 where the other rows have 3"),
         (lambda k: f"{k};{U[k]};{I[k]}" if k != 9 else "9;1;5;2", "4 cells in line 10 where the other rows have 3"),
+        (lambda k: f"{k},{U[k]}," if k != 9 else "9,1,051.5,", "4 cells in line 10 where the other rows have 3"),
+        (lambda k: f"{k},{U[k]},OK," if k != 9 else "9,1,051.5,OK,", "5 cells in line 10 where the other rows have 4"),
+        (lambda k: f"{k},{U[k]},," if k != 9 else "9,1,051.5,", "3 cells in line 10 where the other rows have 2"),
         (lambda k: f"{k} {U[k]} {I[k]}" + ("\noverrun" if k == 9 else ""), "line 11, 'overrun'"),
         (lambda k: f"{k if k < 20 else 'late'};{U[k]};{I[k]}", "line 21, .*, and 20 rows of numbers follow"),
         (lambda k: f"{k} ms;{U[k]} V;{I[k]} A", "no rows of numbers"),
@@ -176,3 +179,16 @@ def test_a_text_in_the_first_row_is_no_head() -> None:
 def test_a_name_may_begin_as_a_comment_does() -> None:
     read = _parsed("% duty;# Time;U\n", lambda k: f"{I[k]};{TIME[k]:.3f};{U[k]}")
     assert {"% duty", "duty", "# Time", "U"} <= read.columns.keys()
+
+
+@pytest.mark.parametrize(("cut", "kept"), [(0, N), (1, N - 1), (3, N - 1), (9, N - 1)])
+def test_a_row_that_was_not_written_to_its_end_is_left_out(cut: int, kept: int) -> None:
+    text = "Time;U;I\n" + "\n".join(f"{TIME[k]:.4f};{U[k]:.4f};{I[k]:.4f}" for k in range(N))
+    read = parse_trace(text[: len(text) - cut].encode(), TraceText(), "trace")
+    assert read.columns["I"].size == kept
+    np.testing.assert_allclose(read.columns["I"], I[:kept])
+
+
+def test_an_empty_line_after_each_row_is_no_interruption() -> None:
+    assert _parsed("Time;U;I\n\n", lambda k: f"{k};{U[k]};{I[k]}\n").interruption == ""
+    assert "line 11" in _parsed("", lambda k: f"{k};{U[k]};{I[k]}" + ("\n" if k == 9 else "")).interruption
