@@ -182,7 +182,10 @@ def _signals(raw: RecordingTable, told: ColumnMap, pitch_m: float, source: str) 
                 values, bits = unwrap_counter(values)
             if bits is not None:
                 notes[f"{column.name} jumps by 2^{bits} as a counter of {bits} bits does, and was unwrapped"] = None
-            factor = 1.0 if column.name in raw.clocks and signal == "time_s" else _factor(signal, column.unit, pitch_m)
+            is_clock = column.name in raw.clocks
+            if is_clock and signal != "time_s":
+                raise RecordingError(f"{source}: {shown(column.name)} is a time, no {signal}: correct the column map")
+            factor = 1.0 if is_clock else _factor(signal, column.unit, pitch_m)
             _check_unit(raw, signal, column, source)
             parts[f"{column.name} ({k + 1})"] = (values * column.factor + column.offset) * factor
         _check_lengths(parts, source)

@@ -277,6 +277,12 @@ def test_every_type_of_time_of_parquet_is_read(kind: str, tmp_path: Path) -> Non
     _assert_read(tmp_path / "own.parquet", _map(time=False))
 
 
+def test_a_time_is_no_other_signal() -> None:
+    table = RecordingTable({}, {"t": TIME, **VALUES}, frozenset({"t", "i"}))
+    with pytest.raises(RecordingError, match="'i' is a time, no current_A"):
+        mapped(table, _map(), "trace")
+
+
 def test_structures_and_nulls_of_parquet_are_columns_and_gaps(tmp_path: Path) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
