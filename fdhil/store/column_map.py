@@ -126,22 +126,32 @@ def mapped(raw: RecordingTable, told: ColumnMap, source: str) -> RecordingTable:
     columns, notes = _signals(raw, told, pitch_m, source)
     if "time_s" not in columns:
         columns = {"time_s": _time(raw, rate_hz, len(columns["position_m"]), source), **columns}
-    _check_lengths(columns, source)
-    whole = np.isfinite(np.column_stack([columns[name] for name in columns if not name.startswith("table_")])).all(1)
-    columns = {name: values[whole] for name, values in columns.items()}
-    if columns["time_s"].size < 2:
-        raise RecordingError(f"{source} has no row in which every mapped column has a number: correct the column map")
+    columns = _whole_rows(columns, source)
     time_s, note = even_times(np.round(columns["time_s"] - columns["time_s"][0], 9), rate_hz, source)
     columns["time_s"] = np.round(time_s, 9)
+    _check_rising(columns["time_s"], source)
     if rate_hz is None:
-        headers["sample_rate_hz"] = f"{1 / _period(columns['time_s'], source):.9g}"
+        headers["sample_rate_hz"] = f"{1 / usual_step(columns['time_s']):.9g}"
     if "speed_rad_per_s" not in columns:
-        turned = np.diff(columns["position_m"]) / np.diff(columns["time_s"]) * 2 * math.pi / pitch_m
-        columns["speed_rad_per_s"] = np.concatenate([[0.0], turned])
+        columns["speed_rad_per_s"] = _difference(columns) * 2 * math.pi / pitch_m
         headers["speed_source"] = "difference"
     if notes := [*notes, *([note] if note else [])]:
         headers[NOTES] = "; ".join(notes)
     return RecordingTable(headers, columns)
+
+
+def _whole_rows(columns: Mapping[str, Float], source: str) -> dict[str, Float]:
+    """Return the rows in which all but the sensors at the table have a value."""
+    _check_lengths(columns, source)
+    whole = np.isfinite(np.column_stack([columns[name] for name in columns if not name.startswith("table_")])).all(1)
+    if np.count_nonzero(whole) < 2:
+        raise RecordingError(f"{source} has no row in which every mapped column has a number: correct the column map")
+    return {name: values[whole] for name, values in columns.items()}
+
+
+def _difference(columns: Mapping[str, Float]) -> Float:
+    """Return the speed of the table, m/s, by the positions; 0 in the first row."""
+    return np.concatenate([[0.0], np.diff(columns["position_m"]) / np.diff(columns["time_s"])])
 
 
 def _sampled_together(raw: RecordingTable, told: ColumnMap, source: str) -> RecordingTable:
@@ -245,18 +255,16 @@ def _time(raw: RecordingTable, rate_hz: float | None, rows: int, source: str) ->
     return np.arange(rows) / rate_hz
 
 
-def _period(time_s: Float, source: str) -> float:
-    """Return the time between samples; RecordingError where times do not rise."""
-    period_s, steps = usual_step(time_s), np.diff(time_s)
-    if period_s > 0:
-        return period_s
+def _check_rising(time_s: Float, source: str) -> None:
+    """Refuse times that do not rise from sample to sample."""
+    steps = np.diff(time_s)
+    if (steps > 0).all():
+        return
     at_s = time_s[1 + int(np.argmax(steps <= 0))]
-    if (steps < 0).any():
-        raise RecordingError(f"{source}: time runs back at {at_s:g} s: sort or record it again")
-    raise RecordingError(
-        f"{source}: time stands still at {at_s:g} s: where its digits are too few, leave time_s out of the map "
-        "and give sample_rate_hz"
-    )
+    todo = "sort or record it again"
+    if not (steps < 0).any() and 2 * np.count_nonzero(steps) < steps.size:
+        todo = "its digits are too few; leave time_s out of the map and give sample_rate_hz"
+    raise RecordingError(f"{source}: time stands still or runs back at {at_s:g} s: {todo}")
 
 
 def _check_lengths(columns: Mapping[str, Float], source: str) -> None:

@@ -273,6 +273,7 @@ def test_a_rapid_recorded_too_slowly_is_refused_by_its_rate(tmp_path: Path) -> N
     assert pooled["reasons"][0] == "LowExcitation: 20 Hz is too slow to follow how a drive accelerates"
 
 
+@pytest.mark.usefixtures("processes")
 def test_columns_of_unlike_lengths_are_json_as_well(tmp_path: Path) -> None:
     from scipy import io
 

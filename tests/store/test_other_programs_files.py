@@ -6,14 +6,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import h5py  # on import it starts a process, which no test of the fast tier may
 import numpy as np
 import pytest
 
 from fdhil.errors import RecordingError
 from fdhil.records import Float
+from fdhil.store import recording_hdf5, recording_mat, recording_mdf4, recording_parquet
 from fdhil.store.column_map import ColumnMap, mapped
-from fdhil.store.recording_table import NOTES, RecordingTable
-from fdhil.store.recordings import read_recording, read_table
+from fdhil.store.recording_table import NOTES, RecordingTable, recording_of
+from fdhil.store.recordings import read_table
 
 N = 60
 TIME = np.arange(N * 1.0) * 1e-3
@@ -21,6 +23,14 @@ BELL = np.sin(np.pi * np.arange(N) / (N - 1)) ** 2
 VALUES: Mapping[str, Float] = {"u": 90 * BELL, "i": 12 * BELL + 1, "w": 120 * BELL, "x": 0.4 * BELL, "r": 0.41 * BELL}
 LETTERS = {"time_s": ("t", "s"), "voltage_V": ("u", "V"), "current_A": ("i", "A"), "speed_rad_per_s": ("w", "rad/s"),
            "position_m": ("x", "m"), "demand_m": ("r", "m")}  # fmt: skip
+
+
+READERS = {
+    ".mat": recording_mat.read,
+    ".h5": recording_hdf5.read,
+    ".mf4": recording_mdf4.read,
+    ".parquet": recording_parquet.decode,
+}
 
 
 def _map(names: Mapping[str, str] | None = None, rate_hz: float | None = None, time: bool = True) -> ColumnMap:
@@ -34,8 +44,13 @@ def _map(names: Mapping[str, str] | None = None, rate_hz: float | None = None, t
     return ColumnMap.model_validate({"headers": headers, "columns": columns})
 
 
+def _table(path: Path, told: ColumnMap) -> RecordingTable:
+    """Read a file in this process; that a process of its own gives the same is tested once."""
+    return mapped(READERS[path.suffix](path.read_bytes(), path.name), told, path.name)
+
+
 def _assert_read(path: Path, told: ColumnMap, lost: tuple[int, ...] = ()) -> None:
-    read = read_table(path, told)
+    read = _table(path, told)
     kept = np.delete(np.arange(N), lost)
     for signal, (name, _) in LETTERS.items():
         expected = TIME if name == "t" else VALUES[name]
@@ -50,8 +65,6 @@ def _matlab_5(path: Path, variables: Mapping[str, Any]) -> None:
 
 def _put(group: Any, name: str, value: Any) -> Any:
     """Store a variable as MATLAB 7.3 does: transposed, texts as numbers, structures as groups."""
-    import h5py
-
     if isinstance(value, dict):
         group = group.create_group(name)
         group.attrs["MATLAB_class"] = np.bytes_("struct")
@@ -73,8 +86,6 @@ def _put(group: Any, name: str, value: Any) -> Any:
 
 
 def _matlab_73(path: Path, variables: Mapping[str, Any]) -> None:
-    import h5py
-
     with h5py.File(path, "w", userblock_size=512) as file:
         for name, value in variables.items():
             _put(file, name, value)
@@ -129,7 +140,7 @@ def test_two_signals_of_one_label_are_refused(tmp_path: Path) -> None:
     with pytest.raises(
         RecordingError, match=r"'u' stands for ScopeData.signals\(1\).values and ScopeData.signals\(6\)"
     ):
-        read_table(tmp_path / "r.mat", _map(time=False))
+        _table(tmp_path / "r.mat", _map(time=False))
 
 
 def test_the_headers_of_a_matlab_7_3_file_are_read(tmp_path: Path) -> None:
@@ -137,7 +148,7 @@ def test_the_headers_of_a_matlab_7_3_file_are_read(tmp_path: Path) -> None:
                "pitch_m_per_rev": "0.02", "voltage_sampling": "instant"}  # fmt: skip
     columns = {signal: TIME if name == "t" else VALUES[name] for signal, (name, _) in LETTERS.items()}
     _matlab_73(tmp_path / "r.mat", {"headers": headers, **columns})
-    read = read_recording(tmp_path / "r.mat")
+    read = recording_of(recording_mat.read((tmp_path / "r.mat").read_bytes(), "r.mat"))
     assert (read.axis, read.dt_s, read.time_s.size) == ("Y", 0.001, N)
 
 
@@ -154,18 +165,16 @@ def test_the_headers_of_a_matlab_7_3_file_are_read(tmp_path: Path) -> None:
 def test_what_a_matlab_file_lacks_is_named(variables: Any, words: str, write: Any, tmp_path: Path) -> None:
     write(tmp_path / "r.mat", variables)
     with pytest.raises(RecordingError, match=words):
-        read_table(tmp_path / "r.mat", _map())
+        _table(tmp_path / "r.mat", _map())
 
 
 def test_complex_numbers_are_no_signal(tmp_path: Path) -> None:
     _matlab_5(tmp_path / "r.mat", {"t": TIME, **VALUES, "i": VALUES["i"] + 1j})
     with pytest.raises(RecordingError, match="'i' is no vector of real numbers"):
-        read_table(tmp_path / "r.mat", _map())
+        _table(tmp_path / "r.mat", _map())
 
 
 def test_matrices_and_tables_of_hdf5_have_columns(tmp_path: Path) -> None:
-    import h5py
-
     with h5py.File(tmp_path / "r.h5", "w") as file:
         file["data"] = np.column_stack([TIME, *VALUES.values()])
         table = np.zeros(N, [(name, "f8") for name in "tuiwxr"])
@@ -214,7 +223,7 @@ def test_a_unit_of_an_mdf_channel_is_not_overruled(tmp_path: Path) -> None:
         file.append([asammdf.Signal(v, TIME, name=n, unit=units.get(n, "")) for n, v in VALUES.items()])
         file.save(tmp_path / "r.mf4")
     with pytest.raises(RecordingError, match="'i' in mA, the column map says A"):
-        read_table(tmp_path / "r.mf4", _map(time=False))
+        _table(tmp_path / "r.mf4", _map(time=False))
 
 
 @pytest.mark.parametrize("kind", [{"sync_type": 2}, {"sync_type": 0, "channel_type": 0}])
@@ -227,7 +236,7 @@ def test_a_group_over_an_angle_or_over_nothing_has_no_time(kind: Mapping[str, in
             setattr(file.groups[0].channels[0], key, value)
         file.save(tmp_path / "r.mf4")
     with pytest.raises(RecordingError, match="'time_s' is no time in this file"):
-        read_table(tmp_path / "r.mf4", _map(time=False))
+        _table(tmp_path / "r.mf4", _map(time=False))
     _assert_read(tmp_path / "r.mf4", _map(rate_hz=1000.0, time=False))
 
 
@@ -247,7 +256,7 @@ def test_invalid_samples_of_an_mdf_file_are_gaps(tmp_path: Path) -> None:
 def test_groups_of_an_mdf_file_without_one_answer_are_refused(groups: Any, words: str, tmp_path: Path) -> None:
     _mdf(tmp_path / "r.mf4", *groups)
     with pytest.raises(RecordingError, match=words):
-        read_table(tmp_path / "r.mf4", _map(time=False))
+        _table(tmp_path / "r.mf4", _map(time=False))
 
 
 def _times() -> dict[str, Any]:
@@ -300,7 +309,7 @@ def test_a_column_of_texts_of_parquet_is_named_by_its_type(tmp_path: Path) -> No
 
     pq.write_table(pa.table({"t": [str(t) for t in TIME], **VALUES}), tmp_path / "r.parquet")
     with pytest.raises(RecordingError, match="'t' is of type string"):
-        read_table(tmp_path / "r.parquet", _map())
+        _table(tmp_path / "r.parquet", _map())
 
 
 @pytest.mark.parametrize(
@@ -333,3 +342,15 @@ def test_two_names_of_one_column_are_refused() -> None:
     table = RecordingTable({}, {"t": TIME, **VALUES, "r": VALUES["x"]})
     with pytest.raises(RecordingError, match="'x' and 'r' above one column"):
         mapped(table, _map(), "trace")
+
+
+@pytest.mark.usefixtures("processes")
+def test_a_process_of_its_own_reads_all_that_a_map_may_use(tmp_path: Path) -> None:
+    _mdf(tmp_path / "r.mf4", *GROUPS["one name again"], invalid=(20,))
+    through, direct = read_table(tmp_path / "r.mf4", _map(time=False)), _table(tmp_path / "r.mf4", _map(time=False))
+    assert dict(through.headers) == dict(direct.headers)
+    for name, values in direct.columns.items():
+        assert np.array_equal(through.columns[name], values)
+    _matlab_5(tmp_path / "r.mat", {"a": {"t": TIME, **VALUES}, "b": {"t": TIME}})
+    with pytest.raises(RecordingError, match=r"'t' stands for a\.t and b\.t"):
+        read_table(tmp_path / "r.mat", _map())
