@@ -350,7 +350,8 @@ def heard(config: MachineConfig, wire: Wire, *more: Row) -> dict[str, Finding]:
 def test_what_an_ncs_traffic_shows_is_compared() -> None:
     found = heard(machine(), Wire(400), *((int(k * 1e8), 0x701, b"\x05") for k in range(4)))
     assert {point for point, finding in found.items() if finding.ok} == {
-        "drive", "heartbeat", "identifiers", "offset writers", "TPDO1", "TPDO2", "TPDO3", "TPDO4", "RPDO1", "rapid signal",
+        "drive", "heartbeat", "identifiers", "offset writers",
+        "TPDO1", "TPDO2", "TPDO3", "TPDO4", "RPDO1", "rapid signal",
     }  # fmt: skip
     assert not [point for point, finding in found.items() if finding.ok is False]
 
