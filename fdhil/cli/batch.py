@@ -27,6 +27,7 @@ from fdhil.store.column_map import ColumnMap
 from fdhil.store.recording_parquet import stored_window
 from fdhil.store.recording_table import NOTES, RECORD_HZ, SLOW_HZ, SOURCES
 from fdhil.store.recordings import read_recording
+from fdhil.validation.signal_consistency import missing_move
 
 MANY_FILES = 16  # from here on further processes pay for their start
 MANY_WINDOWS = 48
@@ -120,6 +121,8 @@ def analyse_file(
     step = partial(progress, 1.0 / (len(windows) + 1))
     outcomes, loops = analyse_windows(windows, settings, axis, period_s, _outcomes, step)
     estimate, verdict = pool(outcomes, settings)
+    if not windows and isinstance(recorded, Recording) and (hidden := missing_move(recorded)) is not None:
+        verdict = replace(verdict, reasons=(*verdict.reasons, hidden))
     step()
     return FileResult(str(path), recorded.axis, tuple(outcomes), estimate, _of_reading(recorded, verdict), loops=loops)
 

@@ -24,6 +24,16 @@ PHYSICAL: Mapping[str, tuple[float, float]] = {
     "Cd": (-1e3, 1e3),  # in one direction with a load, which may help
 }
 
+CURRENT_AND_SPEED = "current and speed"
+ESTIMATED_FROM: Mapping[str, str] = {  # the signals of [1] and [2] that determine a parameter
+    "R": "voltage and current",
+    "L": "voltage and current",
+    "K": "voltage and speed",
+    "Jt": CURRENT_AND_SPEED,
+    "ft": CURRENT_AND_SPEED,
+    "Cd": CURRENT_AND_SPEED,
+}
+
 
 def admissible(theta: Float) -> bool:
     """Return whether R, L, K and Jt of ``theta`` = [R, L, K, Jt, ...] are above 0 and all is finite."""
@@ -81,7 +91,8 @@ def _unknown(estimate: Estimate, top_rad_s: float, top_nm: float) -> dict[str, R
         share = std / size if size else np.inf
         if share > limit:
             text = f"the standard deviation of {name} is {100 * share:.0f} % of its size, limit {100 * limit:.0f} %"
-            missing[name] = Reason("LowExcitation", text, "record rapids at other speeds and in both directions")
+            advice = f"record rapids at other speeds and in both directions, or check {ESTIMATED_FROM[name]}"
+            missing[name] = Reason("LowExcitation", text, advice)
     return missing
 
 
@@ -106,14 +117,14 @@ def unphysical(estimate: Estimate, *, one_way: bool = False) -> list[Reason]:
     for name, (low, high) in PHYSICAL.items():
         value = estimate.value(name)
         if np.isfinite(value) and not low <= value <= high:
-            text = f"{name} = {value:.4g} lies outside {max(low, 0):.3g} to {high:.3g}"
+            text = f"{name} = {value:.4g} lies outside {max(low, 0):.3g} to {high:.3g}: {ESTIMATED_FROM[name]} disagree"
             reasons.append(Reason("Unphysical", text, SIGNALS))
     for bound, value in beyond_chance(estimate.names, estimate.values, estimate.covariance):
         if one_way and "Cd" in bound.weights:
             continue
         name = " + ".join(bound.weights)
         high = PHYSICAL[name][1] if name in PHYSICAL else np.inf
-        text = f"{name} = {value:.4g} lies outside {bound.least:.3g} to {high:.3g}"
+        text = f"{name} = {value:.4g} lies outside {bound.least:.3g} to {high:.3g}: {CURRENT_AND_SPEED} disagree"
         advice = f"record rapids in both directions, as a weight may move the axis; else {SIGNALS}"
         reasons.append(Reason("Unphysical", text, advice))
     return reasons

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -14,9 +15,10 @@ from fdhil.identification.identifiability import empty_estimate
 from fdhil.identification.signals import mended
 from fdhil.identification.spring import sprung
 from fdhil.identification.without_voltage import told
-from fdhil.records import Estimate, Reason, Result, Verdict, Window, WindowOutcome
+from fdhil.records import Estimate, Parameters, Reason, Result, Verdict, Window, WindowOutcome
 from fdhil.validation import BEFORE_ANY_FIT, LEAST_ROWS, OF_THE_FIT, WEIGHED, Evidence, Findings, ask
 from fdhil.validation.at_the_table import at_the_table
+from fdhil.validation.data_sheet import gain_error
 
 # what solvers raise; scipy's raise ValueError for what is not finite
 GAVE_UP = (np.linalg.LinAlgError, FloatingPointError, ZeroDivisionError, OverflowError, ValueError)
@@ -24,6 +26,7 @@ SAME_PITCH = 0.01  # to which a recording and the section of its axis agree
 OVERRIDE = 2.0  # by which their rapid speeds may differ: an override slows what is recorded
 NOTICED = 0.2  # of what a model may leave: with less left no resonance is sought
 UNFIT = "NotFinite"
+LAG_ROWS = 0.75  # a speed that is a difference of positions is half a row late
 
 
 def analyse(
@@ -140,15 +143,34 @@ def _listed(found: Findings) -> tuple[Reason, ...]:
     return tuple(reason for reasons in found.values() for reason in reasons)
 
 
+def _speed_lag(window: Window) -> Reason | None:
+    """Return by how much the speed was moved to agree with the position, where a position that is early may be why."""
+    late = window.speed_late_s
+    if late is None or late < LAG_ROWS * window.dt_s:
+        return None
+    text = f"speed was taken {1e3 * late:.2f} ms earlier to agree with the position, or the position is early by that"
+    return Reason("SampleTiming", text, "take speed and position from one SYNC, or set [identification] speed_source")
+
+
+def _gain(evidence: Evidence) -> Iterator[Reason]:
+    """Yield the signal whose gain may be why the configured loops do not explain the rapid."""
+    if evidence.axis is not None and evidence.estimate is not None:
+        found = gain_error(evidence.estimate, Parameters(**evidence.axis.nominal.model_dump()))
+        if found is not None:
+            yield found
+
+
 def _outcome(evidence: Evidence, found: Findings) -> WindowOutcome:
     """Return the verdict: what is weighed refuses only where it does harm at the table, and warns else."""
     weight, weighed = evidence.weight, [r for name, told in found.items() if name in WEIGHED for r in told]
     reasons = [r for name, told in found.items() if name not in WEIGHED for r in told]
     # through ordinary loops only a share is known: what has a name says more
     if weight is not None and not weight.believed and (weight.in_um or not (reasons or weighed)):
-        reasons.append(weight.reason())
+        reasons += [weight.reason(), *_gain(evidence)]
     if not evidence.harmless:
         reasons, weighed = [*reasons, *weighed], []
+    if reasons and (lag := _speed_lag(evidence.window)) is not None:
+        reasons.append(lag)
     unexplained = weight.unexplained_um if weight is not None and weight.in_um else None
     verdict = Verdict(not reasons, evidence.fit_percent, tuple(reasons), unexplained, tuple(weighed))
     return WindowOutcome(evidence.window, evidence.told, verdict)

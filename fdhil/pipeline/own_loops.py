@@ -18,6 +18,7 @@ from fdhil.validation.weight import LOOPS_DIFFER
 
 ENOUGH = 4  # windows, both directions twice
 KEPT = 6
+SIGNALS_AT_FAULT = frozenset({"StuckValue", "Implausible", "NotFinite", "StaleData", "EpisodeAborted"})
 # of a motor whose data sheet is not known: fast enough to be no part of what is sought
 UNKNOWN_R, UNKNOWN_L = 1.0, 5e-3
 
@@ -60,8 +61,12 @@ def mechanics_of(outcome: WindowOutcome, axis: Axis | None) -> Parameters | None
 
 
 def suspected(outcomes: Sequence[WindowOutcome]) -> bool:
-    """Return whether some window is refused for its loops: the model explains its torque, and not its replay."""
-    return any(reason.code == LOOPS_DIFFER for o in outcomes for reason in o.verdict.reasons)
+    """Return whether some window is refused for its loops: the model explains its torque, and not its replay.
+
+    A window whose signals are at fault tells of no loops.
+    """
+    codes = ({reason.code for reason in o.verdict.reasons} for o in outcomes)
+    return any(LOOPS_DIFFER in found and not found & SIGNALS_AT_FAULT for found in codes)
 
 
 def better_axis(axis: Axis | None, found: LoopEstimate | None) -> Axis | None:

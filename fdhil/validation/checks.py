@@ -14,6 +14,7 @@ from fdhil.validation.evidence import LEAST_ROWS, Evidence
 from fdhil.validation.interruptions import interruptions
 from fdhil.validation.plausibility import clipped, gaps, missing_stages, not_finite, position_parted
 from fdhil.validation.rest import friction_at_rest, rest_faults
+from fdhil.validation.signal_consistency import copied_signals, dead_signals, unrelated_signals
 from fdhil.validation.simulation import expected_fit_percent
 from fdhil.validation.slow_fitted import slow_faults_beside
 from fdhil.validation.slow_readings import slow_voltage_faults
@@ -200,6 +201,9 @@ BEFORE_ANY_FIT: Sequence[Check] = (
     Check("stages", missing_stages),
     Check("gaps", gaps, _enough_rows, ("finite",)),
     Check("range", clipped, _enough_rows, ("finite",)),
+    Check("dead signal", dead_signals, _enough_rows, ("finite",)),
+    Check("copied signal", copied_signals, _enough_rows, ("finite",)),
+    Check("unrelated signal", unrelated_signals, _enough_rows, ("finite", "dead signal")),
     Check("position", position_parted, _enough_rows, ("finite",)),
     # what position tells of the move's course is worth nothing where it contradicts the speed
     Check("whole move", interruptions, _enough_rows, ("finite", "position")),

@@ -16,46 +16,53 @@ from fdhil.validation.agreement import GAINS
 from fdhil.validation.significance import BUDGET
 
 TOLERANCE = 0.15  # of a data sheet's R (cold), L, K, and of an inertia that was computed
-COMPARED = ("R", "L", "K", "Jt")  # friction is no value of a data sheet
+FRICTION_TOLERANCE = 0.30  # the same, where friction has to tell too
+WINDING, TORQUES = ("R", "L", "K"), ("Jt", "ft", "Cd")
+COMPARED = (*WINDING, "Jt")  # friction is no value of a data sheet
 LEAST_BEYOND = 2  # one alone is a warm winding, a saturated core, another load
 
 
 def gain_error(estimate: Estimate, nominal: Parameters) -> Reason | None:
-    """Return the signal whose constant gain explains how the estimate differs from the data sheet, None for none."""
-    known = [name for name in COMPARED if name not in estimate.given]  # what is given tells of no sensor
-    told = [name for name in known if estimate.value(name) > 0 and np.isfinite(estimate.std(name))]
+    """Return the signals whose constant gain explains how the estimate differs from the data sheet, None for none.
+
+    Without a voltage the estimate has K from there: then inertia and friction tell of the current.
+    """
+    blind = set(WINDING) <= set(estimate.given)  # what is given tells of no sensor
+    compared, tolerance = (TORQUES, FRICTION_TOLERANCE) if blind else (COMPARED, TOLERANCE)
+    told = [name for name in compared if estimate.value(name) > 0 and np.isfinite(estimate.std(name))]
+    told = [name for name in told if name not in estimate.given and getattr(nominal, name) > 0]
     if len(told) < LEAST_BEYOND:
         return None
     rows = [PARAMETERS.index(name) for name in told]
     values = np.array([estimate.value(name) for name in told])
     apart = np.log(values / [getattr(nominal, name) for name in told])
     sure = BUDGET["data sheet"].deviations
-    allowed = math.log1p(TOLERANCE) + sure * np.array([estimate.std(name) for name in told]) / values
+    allowed = math.log1p(tolerance) + sure * np.array([estimate.std(name) for name in told]) / values
     if np.count_nonzero(np.abs(apart) > allowed) < LEAST_BEYOND:
         return None
-    explained = {signal: _amplitude(apart, allowed, powers[rows]) for signal, powers in GAINS.items()}
-    found = [(rest, signal, amplitude) for signal, (amplitude, rest) in explained.items() if amplitude != 0.0]
-    if not found:
+    suspects = [("current",)] if blind else [*((signal,) for signal in GAINS), ("voltage", "current")]
+    found = [
+        (signals, _gains(apart, allowed, np.column_stack([GAINS[s][rows] for s in signals]))) for signals in suspects
+    ]
+    known = [(len(signals), rest, signals, gains) for signals, (gains, rest) in found if gains is not None]
+    if not known:
         return None
-    _, signal, amplitude = min(found)
+    _, _, signals, gains = min(known)
     shifts = ", ".join(f"{name} {math.expm1(shift):+.0%}" for name, shift in zip(told, apart, strict=True))
-    text = (
-        f"the {signal} is read {math.exp(amplitude):.2f} times as large as it is: that alone explains {shifts} against "
-        f"the data sheet, which may be {TOLERANCE:.0%} off"
-    )
-    return Reason("CalibrationSuspect", text, f"check the scale of the {signal}, or correct the nominal values")
+    read = " and ".join(f"the {s} is read {g:.2f} times as large as it is" for s, g in zip(signals, gains, strict=True))
+    text = f"{read}: that alone explains {shifts} against the data sheet, which may be {tolerance:.0%} off"
+    advice = f"check the scale of the {' and the '.join(signals)}, or correct the nominal values"
+    return Reason("CalibrationSuspect", text, advice)
 
 
-def _amplitude(apart: Float, allowed: Float, pattern: Float) -> tuple[float, float]:
-    """Return the logarithm of the gain that explains what is apart, and what it leaves; 0 when it does not explain it.
+def _gains(apart: Float, allowed: Float, patterns: Float) -> tuple[tuple[float, ...] | None, float]:
+    """Return the gains (q,) that explain what is apart, and what they leave; None where they do not explain it.
 
-    It must be more than values within what is allowed can make.
+    Each must be more than values within what is allowed can make.
     """
-    square = float(pattern @ pattern)
-    if square == 0.0:
-        return 0.0, math.inf
-    amplitude = float(pattern @ apart) / square
-    rest = np.abs(apart - amplitude * pattern)
-    if (rest > allowed).any() or abs(amplitude) * square <= float(np.abs(pattern) @ allowed):
-        return 0.0, math.inf
-    return amplitude, float(np.linalg.norm(rest))
+    inverse = np.linalg.pinv(patterns / allowed[:, None]) / allowed
+    amplitudes = inverse @ apart
+    rest = np.abs(apart - patterns @ amplitudes) / allowed
+    if (rest > 1.0).any() or (np.abs(amplitudes) <= np.abs(inverse) @ allowed).any():
+        return None, math.inf
+    return tuple(np.exp(amplitudes).tolist()), float(np.linalg.norm(rest))

@@ -12,6 +12,7 @@ from fdhil.identification.windows import bridged, carried, longest
 from fdhil.records import Float, Reason, Window
 from fdhil.validation.evidence import STILL_MM, Evidence, signals_of
 from fdhil.validation.repeated_readings import beyond_chance
+from fdhil.validation.signal_consistency import travel_mm
 from fdhil.validation.significance import BUDGET
 
 TOLERATED_GAP = 3  # rows: a longer gap hides what the drive did
@@ -125,11 +126,9 @@ def position_parted(evidence: Evidence) -> Iterator[Reason]:
     window, play = evidence.window, evidence.play
     if not np.isfinite(window.position_mm).any() or np.ptp(carried(window.position_mm)) == 0.0:
         return
-    to_mm = window.pitch_mm / (2 * math.pi)
     # lost rows are bridged for this comparison alone
-    speed, position = bridged(window.speed_rad_s), bridged(window.position_mm)
-    travel = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2)]) * window.dt_s * to_mm
-    noise = evidence.noise.speed_rad_s * window.dt_s * to_mm
+    position, travel = bridged(window.position_mm), travel_mm(window.speed_rad_s, window.dt_s, window.pitch_mm)
+    noise = evidence.noise.speed_rad_s * window.dt_s * window.pitch_mm / (2 * math.pi)
     quantum = max(resolution(position), 1e-6)
     error = position - position[0] - travel
     unit = _unit(travel, error)

@@ -70,7 +70,7 @@ def _load(bench: Bench, edges: npt.NDArray[np.int_], drift: Float) -> Finding:
     return Finding(
         "LoadDetected",
         f"a torque of {{:+.3g}} N.m that is no friction {span}",
-        "identify from moves without cutting, clamping or collision",
+        "identify from moves without cutting, clamping or collision, or check current and position",
         LEAST_TORQUE * bench.peak_torque,
         *found,
         direction,

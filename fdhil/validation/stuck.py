@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from fdhil.identification.windows import runs_of
-from fdhil.records import Float, Reason
+from fdhil.records import Bool, Float, Reason
 from fdhil.validation.evidence import Evidence, Signal
 from fdhil.validation.plausibility import RAIL_SAMPLES
 from fdhil.validation.repeated_readings import LEAST_NOISE_ROWS, SIDE, alike, beyond_chance, wakes_with_a_jump
@@ -71,6 +71,13 @@ def stuck_values(evidence: Evidence) -> Iterator[Reason]:
             continue
         readings = Readings(signal, begin, end, evidence.window.dt_s)
         same = np.diff(signal.values[begin:end]) == 0.0
+        held = _update_rows(same)
+        if held * readings.dt_s >= TOLD_S:
+            text = (
+                f"{signal.name} changes only every {1e3 * held * readings.dt_s:.3g} ms: the samples between repeat it"
+            )
+            yield Reason("StuckValue", text, "record it at the drive's own rate, or at the rate at which it changes")
+            continue
         limit = BUDGET["stuck"].log_chance - math.log(np.count_nonzero(~same) + 2)
         runs = ((begin + start, begin + last) for start, last in runs_of(same)[:LONGEST_RUNS])
         stuck = next((run for run in runs if _is_stuck(evidence, readings, *run, limit)), None)
@@ -81,6 +88,14 @@ def stuck_values(evidence: Evidence) -> Iterator[Reason]:
                 f"from {evidence.time_s(stuck[0]):.3f} s while the axis moves"
             )
             yield Reason("StuckValue", text, "check the sensor or the object's mapping")
+
+
+def _update_rows(same: Bool) -> int:
+    """Return after how many rows readings change, where that is the same number too often for chance; else 1."""
+    changes = np.flatnonzero(~same)
+    rows = int(np.gcd.reduce(np.diff(changes))) if changes.size > 1 else 1
+    surely = rows > 1 and -(changes.size - 1) * math.log(rows) < BUDGET["stuck"].log_chance
+    return rows if surely else 1
 
 
 def clipped_peaks(evidence: Evidence) -> Iterator[Reason]:

@@ -69,7 +69,7 @@ class Weight:
 
     def reason(self) -> Reason:
         """Return why the model is not believed."""
-        advice = "the drive does what the model does not have"
+        advice = "the drive does what the model does not have, or current and speed are not of one instant"
         if self.through != "replay":
             text = f"the torque that the model leaves unexplained makes {self.told(self.unexplained_um)} at the table"
             return Reason("ValidationFailed", f"{text}, limit {self.told(self.limit_um)}", advice)
@@ -82,7 +82,10 @@ class Weight:
                 "ValidationFailed", text, "without resonance_hz the model explains it: it is another, or none"
             )
         if self.allows(self.torque_um):
-            advice = "the torque is explained, so the drive's loops are not as configured: fdhil identify --loops"
+            advice = (
+                "the torque is explained, so the drive's loops are not as configured (fdhil identify --loops), or demand "
+                "and position are not what the drive follows: held, late, or of other samples"
+            )
             return Reason(LOOPS_DIFFER, text, advice)
         return Reason("ValidationFailed", text, advice)
 

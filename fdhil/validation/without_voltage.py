@@ -53,7 +53,11 @@ def load_comes_and_goes(evidence: Evidence) -> Iterator[Reason]:
         rows = np.flatnonzero(fitted.rows.usable)
         a, b = (evidence.time_s(int(row)) for row in rows[[load.begin, load.end - 1]])
         text = f"a torque as of {load.amplitude:+.3g} A that is no friction acts from {a:.3f} to {b:.3f} s"
-        yield Reason("LoadDetected", text, "identify from moves without cutting, clamping or collision")
+        yield Reason(
+            "LoadDetected",
+            text,
+            "identify from moves without cutting, clamping or collision, or check current and position",
+        )
 
 
 def surest_load(fitted: TorqueFit) -> Load:
@@ -87,4 +91,5 @@ def torque_unexplained(evidence: Evidence) -> Iterator[Reason]:
     if fitted is None or not fitted.unexplained > LARGEST_SHARE:
         return
     text = f"the model leaves {fitted.unexplained:.1%} of the torque unexplained, limit {LARGEST_SHARE:.0%}"
-    yield Reason("ValidationFailed", text, "the drive does what the model does not have")
+    advice = "the drive does what the model does not have, or current and speed are not of one instant"
+    yield Reason("ValidationFailed", text, advice)

@@ -154,7 +154,7 @@ def test_a_drive_without_feed_forward_is_weighed_by_its_following_error() -> Non
     waves = 0.04 * np.abs(window.current_a).max() * np.sin(np.arange(window.n) / 15.0 + rng.uniform(0, 6))
     rough = replace(window, current_a=frozen(window.current_a + waves))
     assert analyse(rough, SETTINGS).verdict.accepted
-    unled = replace(rough, demand_mm=frozen(np.zeros(window.n)))
+    unled = replace(rough, demand_mm=frozen(np.full(window.n, np.nan)))
     assert "ValidationFailed" in [reason.code for reason in analyse(unled, SETTINGS).verdict.reasons]
 
 

@@ -1,0 +1,144 @@
+"""Checks that the signals of a rapid belong together, whatever the drive's parameters are.
+
+Every rapid accelerates, cruises and brakes. So each signal changes; position and demand travel as far as the speed
+says; the current makes acceleration and friction, and the voltage overcomes the back-EMF and drives that current: both
+follow the speed and its rate. No two signals are the same column.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from itertools import combinations
+
+import numpy as np
+
+from fdhil.identification.motion import resolution
+from fdhil.identification.normal import solve
+from fdhil.identification.windows import bridged, carried, smooth
+from fdhil.records import Float, Reason, Recording, Window
+from fdhil.validation.evidence import Evidence
+
+UNITS: Mapping[str, str] = {"voltage": "V", "current": "A", "speed": "rad/s", "position": "mm", "demand": "mm"}
+LEAST_FOLLOWED: Mapping[str, float] = {"voltage": 0.5, "current": 0.3}  # of their variance, by a rapid of any drive
+LEAST_SAMPLES = 12  # of a signal, by which it may be compared with the motion
+SAME = 1e-9  # of the peak, to which one column is a multiple of another
+LONGEST_CYCLE_S = 0.012  # of an NC, in which its demand changes once
+STILL_MM = 1.0  # of travel, from which on a recording shows a move
+
+
+def recorded_signals(window: Window) -> dict[str, Float]:
+    """Return the signals (n,) that were recorded, by name; one that is missing throughout is left out."""
+    signals = {
+        "voltage": window.voltage_v,
+        "current": window.current_a,
+        "speed": window.speed_rad_s,
+        "position": window.position_mm,
+        "demand": window.demand_mm,
+    }
+    return {name: values for name, values in signals.items() if values is not None and np.isfinite(values).any()}
+
+
+def travel_mm(speed_rad_s: Float, dt_s: float, pitch_mm: float) -> Float:
+    """Return the integral (n,) of the speed in mm of the table; lost samples are bridged."""
+    speed = bridged(speed_rad_s)
+    steps = (speed[1:] + speed[:-1]) * (dt_s * pitch_mm / (4 * math.pi))
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def dead_signals(evidence: Evidence) -> Iterator[Reason]:
+    """Yield a reason for each signal that does not change while the axis moves, and for a demand that jumps."""
+    window, (begin, end) = evidence.recorded or evidence.window, evidence.moving
+    if not np.isfinite(window.speed_rad_s).any():
+        return
+    travel = travel_mm(window.speed_rad_s, window.dt_s, window.pitch_mm)
+    for name, values in recorded_signals(window).items():
+        moving = values[begin:end][np.isfinite(values[begin:end])]
+        if moving.size >= LEAST_SAMPLES and np.ptp(moving) == 0.0:
+            yield _stands_still(name, float(moving[0]), float(travel[end - 1] - travel[begin]))
+        elif name == "demand":
+            yield from _jump_of_demand(evidence, values)
+
+
+def _stands_still(name: str, value: float, moved_mm: float) -> Reason:
+    text = f"{name} stands still at {value:.6g} {UNITS[name]} while the integral of speed travels {moved_mm:.4g} mm"
+    return Reason("StuckValue", text, f"check the {name} sensor or the object's mapping")
+
+
+def _jump_of_demand(evidence: Evidence, demand: Float) -> Iterator[Reason]:
+    """Yield a reason where the demand goes farther from sample to sample than a rapid does in an NC's longest cycle."""
+    window = evidence.window
+    speed_mm_s = float(np.abs(smooth(window.speed_rad_s, window.dt_s)).max()) * window.pitch_mm / (2 * math.pi)
+    steps = np.abs(np.diff(bridged(demand)))
+    row = int(np.argmax(steps))
+    if steps[row] > speed_mm_s * max(LONGEST_CYCLE_S, 2.0 * window.dt_s) + resolution(demand[np.isfinite(demand)]):
+        text = (
+            f"demand jumps by {steps[row]:.4g} mm at {evidence.time_s(row):.3f} s, as after a pause or lost samples: "
+            f"the axis takes {1e3 * steps[row] / speed_mm_s:.0f} ms for that"
+        )
+        yield Reason("StuckValue", text, "check where the demand is recorded, or the object's mapping")
+
+
+def copied_signals(evidence: Evidence) -> Iterator[Reason]:
+    """Yield a reason for each two signals of which one is the other times a constant in every row."""
+    begin, end = evidence.moving
+    moving = {name: carried(values)[begin:end] for name, values in recorded_signals(evidence.window).items()}
+    for (one, values), (other, others) in combinations(moving.items(), 2):
+        power = float(others @ others)
+        if values.size < LEAST_SAMPLES or np.ptp(values) == 0.0 or not 0.0 < power < math.inf:
+            continue
+        factor = float(values @ others) / power
+        if np.abs(values - factor * others).max() <= SAME * np.abs(values).max():
+            text = f"{one} and {other} are one signal: in every sample {one} is {factor:.6g} times {other}"
+            yield Reason("Implausible", text, "correct which column or object is which signal")
+
+
+def unrelated_signals(evidence: Evidence) -> Iterator[Reason]:
+    """Yield a reason for voltage and current where speed and acceleration explain too little of them."""
+    window = evidence.window
+    begin, end = evidence.moving
+    speed = smooth(window.speed_rad_s, window.dt_s)
+    motion = np.stack([np.ones(window.n), speed, np.gradient(speed, window.dt_s)])
+    signals = {k: v for k, v in recorded_signals(window).items() if k in LEAST_FOLLOWED}
+    parts = {name: (motion[:, begin:end], smooth(v, window.dt_s)[begin:end]) for name, v in signals.items()}
+    slow = window.slow_voltage
+    if slow is not None:
+        rows = slow.begin_s / window.dt_s + (np.arange(slow.voltage_v.size) + 0.5) * slow.period_s / window.dt_s
+        known = np.isfinite(slow.voltage_v) & (rows >= begin) & (rows < end)
+        courses = [np.interp(rows[known], np.arange(window.n), course) for course in motion]
+        parts["voltage"] = np.stack(courses), slow.voltage_v[known]
+    for name, (courses_of_motion, values) in parts.items():
+        share = _explained(values, courses_of_motion)
+        if share < LEAST_FOLLOWED[name]:
+            text = (
+                f"{name} does not follow the speed: speed and acceleration explain {max(0.0, share):.0%} of it, in "
+                f"any rapid {LEAST_FOLLOWED[name]:.0%} at least"
+            )
+            yield Reason("Implausible", text, f"check which column or object is the {name}, and of which axis it is")
+
+
+def _explained(values: Float, courses: Float) -> float:
+    """Return the share of the variance of ``values`` (m,) that ``courses`` (q, m) explain; 1 where nothing varies."""
+    size = values.size
+    variance = float(np.var(values)) if size >= LEAST_SAMPLES else 0.0
+    scale = np.abs(courses).max(axis=1, keepdims=True) if size else np.ones((len(courses), 1))
+    if not 0.0 < variance < math.inf or not (scale > 0.0).all():
+        return 1.0
+    columns = (courses / scale).T
+    weights, _ = solve(columns, values)
+    return 1.0 - float(np.mean((values - columns @ weights) ** 2)) / variance
+
+
+def missing_move(recording: Recording) -> Reason | None:
+    """Return which signal hides the rapids of a recording in which none was found; None where there is no move."""
+    position = recording.position_mm[np.isfinite(recording.position_mm)]
+    speed = recording.speed_rad_s
+    if position.size < 2 or not np.isfinite(speed).any():
+        return None
+    travel = travel_mm(speed, recording.dt_s, recording.pitch_mm)
+    moved, integral = float(np.ptp(position)), float(np.ptp(travel))
+    if max(moved, integral) < STILL_MM or abs(moved - integral) < 0.1 * max(moved, integral):
+        return None
+    top = float(np.abs(smooth(speed, recording.dt_s)).max())
+    text = f"speed reaches {top:.3g} rad/s and its integral {integral:.3g} mm, the position travels {moved:.4g} mm"
+    return Reason("Implausible", text, "check the sensor, the unit and the mapping of speed and position")
