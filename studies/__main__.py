@@ -17,6 +17,7 @@ STUDIES = (
     "drift",
     "sisters",
     "verdicts",
+    "wrong_signals",
     "slow_sensor",
     "reality",
     "guard_invariants",

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from fdhil.config import Axis, Identification, Regulators
 from fdhil.identification import loop_fit
@@ -262,8 +263,21 @@ def _verdict(made: Fit, tolerance_um: float, following_um: float, configured_um:
 
 
 def better_loops(loops: LoopEstimate) -> bool:
-    """Return whether loops are believed and explain more than the configured ones, so that they are used instead."""
-    return loops.verdict.accepted and any(warning.code == DIFFER for warning in loops.verdict.warnings)
+    """Return whether loops are believed and explain more than the configured ones, so that they are used instead.
+
+    What no configuration may hold is no drive's: a demand that is not what the drive follows gives such values.
+    """
+    differ = any(warning.code == DIFFER for warning in loops.verdict.warnings)
+    return loops.verdict.accepted and differ and _may_be_configured(loops)
+
+
+def _may_be_configured(loops: LoopEstimate) -> bool:
+    others = dict.fromkeys(name for name, field in Regulators.model_fields.items() if field.is_required())
+    try:
+        Regulators.model_validate({**dict.fromkeys(others, 1.0), **regulators_of(loops)})
+    except ValidationError:
+        return False
+    return True
 
 
 def with_loops(axis: Axis, loops: LoopEstimate) -> Axis:

@@ -12,7 +12,7 @@ from fdhil.identification.windows import bridged, carried, longest
 from fdhil.records import Float, Reason, Window
 from fdhil.validation.evidence import STILL_MM, Evidence, signals_of
 from fdhil.validation.repeated_readings import beyond_chance
-from fdhil.validation.signal_consistency import travel_mm
+from fdhil.validation.signal_consistency import position_confirms, travel_mm
 from fdhil.validation.significance import BUDGET
 
 TOLERATED_GAP = 3  # rows: a longer gap hides what the drive did
@@ -111,6 +111,8 @@ def clipped(evidence: Evidence) -> Iterator[Reason]:
             start, end = longest(values == rail)
             if rail == 0.0 or end - start < RAIL_SAMPLES or not beyond_chance(values, start, end - 1):
                 continue
+            if position_confirms(evidence, signal, start, end):
+                continue
             text = (
                 f"{signal.name} stays at its {side} extreme {rail:.6g} {signal.unit} for {end - start} samples "
                 f"from {evidence.time_s(start):.3f} s"
@@ -128,7 +130,9 @@ def position_parted(evidence: Evidence) -> Iterator[Reason]:
         return
     # lost rows are bridged for this comparison alone
     position, travel = bridged(window.position_mm), travel_mm(window.speed_rad_s, window.dt_s, window.pitch_mm)
-    noise = evidence.noise.speed_rad_s * window.dt_s * window.pitch_mm / (2 * math.pi)
+    to_mm = window.dt_s * window.pitch_mm / (2 * math.pi)
+    noise = evidence.noise.speed_rad_s * to_mm
+    rounding = resolution(window.speed_rad_s[np.isfinite(window.speed_rad_s)]) / 2 * to_mm
     quantum = max(resolution(position), 1e-6)
     error = position - position[0] - travel
     unit = _unit(travel, error)
@@ -136,12 +140,17 @@ def position_parted(evidence: Evidence) -> Iterator[Reason]:
         yield unit
         return
     elastic = 1e-3 * (ELASTIC_UM + 1.5 * (play.um if play is not None else 0.0))
-    yield from _jump(evidence, error, noise, quantum, elastic)
-    yield from _scale(travel, error, noise, quantum, elastic)
+    yield from _jump(evidence, error, noise, quantum, elastic, rounding)
+    yield from _scale(travel, error, noise, quantum, elastic + rounding * error.size)
 
 
-def _jump(evidence: Evidence, error: Float, noise: float, quantum: float, elastic: float) -> Iterator[Reason]:
-    """Find the stretch over which position and integral part most beyond noise, at any length up to 100 ms."""
+def _jump(
+    evidence: Evidence, error: Float, noise: float, quantum: float, elastic: float, rounding: float
+) -> Iterator[Reason]:
+    """Find the stretch over which position and integral part most beyond noise, at any length up to 100 ms.
+
+    A speed that is read in steps may be off by ``rounding`` mm in each sample, always to one side.
+    """
     worst, where, amount = 0.0, 0, 0.0
     for seconds in (0.0, 0.005, 0.02, 0.05, 0.1):
         length = max(1, round(seconds / evidence.window.dt_s))
@@ -149,6 +158,7 @@ def _jump(evidence: Evidence, error: Float, noise: float, quantum: float, elasti
             continue
         change = np.abs(error[length:] - error[:-length])
         allowed = BUDGET["position"].deviations * np.hypot(noise * np.sqrt(length + 1), quantum) + elastic
+        allowed += rounding * length
         k = int(np.argmax(change))
         if change[k] / allowed > worst:
             worst, where, amount = float(change[k] / allowed), k, float(change[k])

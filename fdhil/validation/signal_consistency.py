@@ -17,11 +17,12 @@ from fdhil.identification.motion import resolution
 from fdhil.identification.normal import solve
 from fdhil.identification.windows import bridged, carried, smooth
 from fdhil.records import Float, Reason, Recording, Window
-from fdhil.validation.evidence import Evidence
+from fdhil.validation.evidence import Evidence, Signal
 
 UNITS: Mapping[str, str] = {"voltage": "V", "current": "A", "speed": "rad/s", "position": "mm", "demand": "mm"}
 LEAST_FOLLOWED: Mapping[str, float] = {"voltage": 0.5, "current": 0.3}  # of their variance, by a rapid of any drive
 LEAST_SAMPLES = 12  # of a signal, by which it may be compared with the motion
+STEPS_BESIDE = 1.5  # of a position, by which two readings of it are off together
 SAME = 1e-9  # of the peak, to which one column is a multiple of another
 LONGEST_CYCLE_S = 0.012  # of an NC, in which its demand changes once
 STILL_MM = 1.0  # of travel, from which on a recording shows a move
@@ -127,6 +128,22 @@ def _explained(values: Float, courses: Float) -> float:
     columns = (courses / scale).T
     weights, _ = solve(columns, values)
     return 1.0 - float(np.mean((values - columns @ weights) ** 2)) / variance
+
+
+def position_confirms(evidence: Evidence, signal: Signal, start: int, end: int) -> bool:
+    """Return whether the position travels as the speed says that repeats one reading in rows ``start`` to ``end`` - 1.
+
+    A speed that is read in steps may lie half a step beside its reading, and the position one of its own.
+    """
+    position = evidence.window.position_mm[start:end]
+    known = np.isfinite(position)
+    if signal.name != "speed" or np.count_nonzero(known) < 3 or np.ptp(position[known]) == 0.0:
+        return False
+    to_mm = evidence.window.pitch_mm / (2 * math.pi) * evidence.window.dt_s
+    rows = np.flatnonzero(known) - np.flatnonzero(known)[0]
+    beside = position[known] - position[known][0] - signal.values[start] * to_mm * rows
+    steps = STEPS_BESIDE * resolution(evidence.window.position_mm[np.isfinite(evidence.window.position_mm)])
+    return bool((np.abs(beside) <= signal.step / 2 * to_mm * rows + steps).all())
 
 
 def missing_move(recording: Recording) -> Reason | None:

@@ -21,6 +21,7 @@ from fdhil.validation.evidence import Evidence, Signal
 from fdhil.validation.plausibility import RAIL_SAMPLES
 from fdhil.validation.repeated_readings import LEAST_NOISE_ROWS, SIDE, alike, beyond_chance, wakes_with_a_jump
 from fdhil.validation.sensor_reconstruction import Bridge
+from fdhil.validation.signal_consistency import position_confirms
 from fdhil.validation.significance import BUDGET
 
 NOISES = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"}
@@ -30,6 +31,8 @@ COMPUTED = 2.0  # times that, of a speed that a drive computes from positions: i
 LONGEST_RUNS = 2  # of a signal that are judged: a sensor sticks longer than chance repeats
 LEAST_NOISE = 0.2  # steps: what hides in the resolution
 TOLD_NOISE = 0.6  # steps: below it, how readings scatter depends on where in its step the signal lies
+MOST_NOISE = 3.0  # steps: with more, a living sensor repeats no reading, whatever the position says
+LEAST_CHANGES = 6  # after equal numbers of rows, of a reading that is held between them
 PARTS = 4  # of a run: its first and its last one are judged alone too
 WITHIN_STEP = 0.3  # of a step: how far from its middle a constant may lie that is read there for long
 
@@ -93,7 +96,7 @@ def stuck_values(evidence: Evidence) -> Iterator[Reason]:
 def _update_rows(same: Bool) -> int:
     """Return after how many rows readings change, where that is the same number too often for chance; else 1."""
     changes = np.flatnonzero(~same)
-    rows = int(np.gcd.reduce(np.diff(changes))) if changes.size > 1 else 1
+    rows = int(np.gcd.reduce(np.diff(changes))) if changes.size >= LEAST_CHANGES else 1
     surely = rows > 1 and -(changes.size - 1) * math.log(rows) < BUDGET["stuck"].log_chance
     return rows if surely else 1
 
@@ -116,6 +119,8 @@ def clipped_peaks(evidence: Evidence) -> Iterator[Reason]:
                 crossing = bridge.crossing(signal.name, start, end)
                 if crossing is None:
                     continue
+                if position_confirms(evidence, signal, start, end):
+                    continue
                 if crossing.log_chance(start, end, float(rail), float(noise)) >= BUDGET["cut off"].log_chance:
                     continue
                 text = (
@@ -132,6 +137,8 @@ def _is_stuck(evidence: Evidence, readings: Readings, start: int, last: int, lim
         return False
     if readings.steps[start] in readings.rails:
         return False  # that is for saturation to explain
+    if readings.noise < MOST_NOISE and position_confirms(evidence, readings.signal, start, last + 1):
+        return False
     computed = readings.signal.name == "speed" and evidence.window.speed_late_s is not None
     if not computed and _quieter_than_noise(readings, start, last, limit):
         return True

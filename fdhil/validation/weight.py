@@ -83,8 +83,8 @@ class Weight:
             )
         if self.allows(self.torque_um):
             advice = (
-                "the torque is explained, so the drive's loops are not as configured (fdhil identify --loops), or demand "
-                "and position are not what the drive follows: held, late, or of other samples"
+                "the torque is explained, so the drive's loops are not as configured (fdhil identify --loops), or "
+                "demand and position are not what the drive follows: held, late, or of other samples"
             )
             return Reason(LOOPS_DIFFER, text, advice)
         return Reason("ValidationFailed", text, advice)
