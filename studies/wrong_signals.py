@@ -347,7 +347,7 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> Iterator[list[str]]:
 def main() -> None:
     """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--pairs", type=int, default=200, help="draws of two faults at once, for each row of the table")
+    parser.add_argument("--pairs", type=int, default=100, help="draws of two faults at once, for each row of the table")
     parser.add_argument("--seed", type=int, default=1)
     pages.conduct("wrong_signals", parser, lambda o: f"{o.seed}", measured)
 
