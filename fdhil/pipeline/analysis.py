@@ -19,6 +19,7 @@ from fdhil.records import Estimate, Parameters, Reason, Result, Verdict, Window,
 from fdhil.validation import BEFORE_ANY_FIT, LEAST_ROWS, OF_THE_FIT, WEIGHED, Evidence, Findings, ask
 from fdhil.validation.at_the_table import at_the_table
 from fdhil.validation.data_sheet import gain_error
+from fdhil.validation.signal_consistency import table_faults
 
 # what solvers raise; scipy's raise ValueError for what is not finite
 GAVE_UP = (np.linalg.LinAlgError, FloatingPointError, ZeroDivisionError, OverflowError, ValueError)
@@ -46,11 +47,18 @@ def analyse(
 def _with_table(outcome: WindowOutcome, signals: Evidence) -> WindowOutcome:
     """Return the outcome with what sensors at the table show: its true error, and a resonance.
 
-    That takes the place of a configured one, or of one that the motor shows, and the window is analysed with it.
+    That takes the place of a configured one, or of one that the motor shows, and the window is analysed with it. A
+    sensor that does not move as the motor does is left out, with a warning.
     """
     window, estimate, axis = signals.window, outcome.estimate, signals.axis
     if estimate is None or (window.table_mm is None and window.table_m_s2 is None):
         return outcome
+    with np.errstate(over="ignore", invalid="ignore"):
+        faults = table_faults(window, signals.moving)
+    if faults:
+        signals = replace(signals, window=replace(window, **dict.fromkeys(faults)))
+        warnings = (*outcome.verdict.warnings, *faults.values())
+        return _with_table(replace(outcome, verdict=replace(outcome.verdict, warnings=warnings)), signals)
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             found = compliance(window, estimate.parameters())

@@ -22,6 +22,8 @@ from fdhil.validation.evidence import Evidence, Signal
 UNITS: Mapping[str, str] = {"voltage": "V", "current": "A", "speed": "rad/s", "position": "mm", "demand": "mm"}
 LEAST_FOLLOWED: Mapping[str, float] = {"voltage": 0.5, "current": 0.3}  # of their variance, by a rapid of any drive
 LEAST_SAMPLES = 12  # of a signal, by which it may be compared with the motion
+TABLE_MM, TABLE_SHARE = 1.0, 0.05  # by which a table may part from the motor: play, a screw that gives, a late sensor
+TABLE_GAIN, TABLE_FOLLOWS = 1.5, 0.3  # of an accelerometer's scale, and its share that the motor explains, to tell it
 STEPS_BESIDE = 1.5  # of a position, by which two readings of it are off together
 SAME = 1e-9  # of the peak, to which one column is a multiple of another
 LONGEST_CYCLE_S = 0.012  # of an NC, in which its demand changes once
@@ -128,6 +130,37 @@ def _explained(values: Float, courses: Float) -> float:
     columns = (courses / scale).T
     weights, _ = solve(columns, values)
     return 1.0 - float(np.mean((values - columns @ weights) ** 2)) / variance
+
+
+def table_faults(window: Window, moving: tuple[int, int]) -> Mapping[str, Reason]:
+    """Return why the sensors at the table are not used, by the window's field: they do not move as the motor does.
+
+    What the screw gives and how late a sensor is stays below the tolerance, and so is no fault.
+    """
+    rows = slice(*moving)
+    found = {}
+    if window.table_mm is not None and np.isfinite(window.position_mm).any():
+        motor = bridged(window.position_mm)[rows]
+        beside = (window.table_mm[rows] - motor)[np.isfinite(window.table_mm[rows])]
+        apart, travel = float(np.ptp(beside)) if beside.size else 0.0, float(np.ptp(motor))
+        if apart > TABLE_MM + TABLE_SHARE * travel:
+            text = f"table sensor and position part by {apart:.4g} mm over a travel of {travel:.4g} mm: it is not used"
+            found["table_mm"] = Reason("Implausible", text, "check the table sensor, its scale, sign and axis")
+    if window.table_m_s2 is not None:
+        known = np.isfinite(window.table_m_s2[rows])
+        told = window.table_m_s2[rows][known]
+        speed = smooth(window.speed_rad_s, window.dt_s)
+        own = np.gradient(speed, window.dt_s)[rows][known] * window.pitch_mm / (2e3 * math.pi)
+        if told.size >= LEAST_SAMPLES and not np.ptp(told) > 0.0:
+            text = f"table acceleration stands still at {told[0]:.4g} m/s2: it is not used"
+            found["table_m_s2"] = Reason("StuckValue", text, "check the accelerometer")
+        elif told.size >= LEAST_SAMPLES and float(np.var(own)) > 0.0:
+            courses = np.stack([np.ones(told.size), own])
+            gain = float(solve(courses.T, told)[0][1])
+            if _explained(told, courses) > TABLE_FOLLOWS and not 1.0 / TABLE_GAIN < gain < TABLE_GAIN:
+                text = f"table acceleration is {gain:.3g} times that of the motor: it is not used"
+                found["table_m_s2"] = Reason("CalibrationSuspect", text, "check the accelerometer's scale and sign")
+    return found
 
 
 def position_confirms(evidence: Evidence, signal: Signal, start: int, end: int) -> bool:

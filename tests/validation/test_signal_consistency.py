@@ -133,3 +133,43 @@ def test_current_that_changes_every_tenth_of_a_second_is_named_with_its_period()
     recording = plant("bench").recording(voltage=False)
     held = changed(recording, "current", lambda values: values[np.arange(values.size) // 50 * 50])
     assert "current changes only every 50 ms" in refusals(held)
+
+
+@pytest.fixture(scope="module")
+def at_table() -> Window:
+    """Return a rapid with an encoder and an accelerometer at the table, which hangs on a spring."""
+    soft = replace(SLOW, resonance_hz=60.0)
+    moved = real_plant.run(soft, shuttle(0.1, 0.2, 2.0), SLOW_LOOPS)
+    recording = real_plant.recording(moved, soft, Sensors(), 0.2)
+    rate = np.gradient(np.gradient(moved.table_m, moved.dt_s), moved.dt_s)
+    table = frozen(moved.table_m * 1e3 + 7.0)
+    (window,) = find_windows(replace(recording, table_mm=table, table_m_s2=frozen(rate)))
+    return window
+
+
+@pytest.mark.parametrize(
+    ("field", "change", "text"),
+    [
+        ("table_mm", lambda v: 0 * v, "table sensor and position part by"),
+        ("table_mm", lambda v: -v, "table sensor and position part by"),
+        ("table_mm", lambda v: 2 * v, "table sensor and position part by"),
+        ("table_m_s2", lambda v: 0 * v, "table acceleration stands still"),
+        ("table_m_s2", lambda v: -v, "table acceleration is -"),
+        ("table_m_s2", lambda v: v / 9.81, "table acceleration is 0.1"),
+    ],
+)
+def test_wrong_table_sensor_is_named_and_not_used(
+    at_table: Window, field: str, change: Callable[[Array], Array], text: str
+) -> None:
+    good = analyse(at_table, SETTINGS)
+    assert good.at_table is not None
+    spoilt: Window = replace(at_table, **{field: frozen(change(np.array(getattr(at_table, field))))})  # type: ignore[arg-type]
+    without: Window = replace(at_table, **{field: None})  # type: ignore[arg-type]
+    found, expected = (analyse(window, SETTINGS) for window in (spoilt, without))
+    assert any(text in warning.text for warning in found.verdict.warnings)
+    assert not any("table" in warning.text for warning in good.verdict.warnings)
+    assert found.at_table == expected.at_table
+    assert found.estimate is not None
+    assert expected.estimate is not None
+    assert found.estimate.names == expected.estimate.names
+    assert np.array_equal(found.estimate.values, expected.estimate.values)
