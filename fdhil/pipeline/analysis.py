@@ -56,7 +56,9 @@ def _with_table(outcome: WindowOutcome, signals: Evidence) -> WindowOutcome:
     with np.errstate(over="ignore", invalid="ignore"):
         faults = table_faults(window, signals.moving)
     if faults:
-        signals = replace(signals, window=replace(window, **dict.fromkeys(faults)))
+        place = None if "table_mm" in faults else window.table_mm
+        rate = None if "table_m_s2" in faults else window.table_m_s2
+        signals = replace(signals, window=replace(window, table_mm=place, table_m_s2=rate))
         warnings = (*outcome.verdict.warnings, *faults.values())
         return _with_table(replace(outcome, verdict=replace(outcome.verdict, warnings=warnings)), signals)
     try:

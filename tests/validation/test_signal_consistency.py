@@ -103,7 +103,7 @@ def test_recording_at_rest_hides_no_rapid() -> None:
 def _coarse(counts: int, kind: str) -> list[Window]:
     """Return a rapid at a constant speed, as an encoder of so many counts a turn shows it."""
     moved = real_plant.run(SLOW, shuttle(0.1, 0.126, 2.0), SLOW_LOOPS)
-    sensors = Sensors(speed="difference" if kind == "difference" else "sensor", encoder_bits=np.log2(counts))  # type: ignore[arg-type]
+    sensors = Sensors(speed="difference" if kind == "difference" else "sensor", encoder_bits=np.log2(counts))
     recording = real_plant.recording(moved, SLOW, sensors, 0.126, 3)
     turn_mm = 20.0 / counts
     if kind == "rounded":
