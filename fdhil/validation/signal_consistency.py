@@ -55,10 +55,16 @@ def dead_signals(evidence: Evidence) -> Iterator[Reason]:
     if not np.isfinite(window.speed_rad_s).any():
         return
     travel = travel_mm(window.speed_rad_s, window.dt_s, window.pitch_mm)
+    part = travel[begin:end]
+    moved_mm = float(part[-1] - part[0]) if part.size else 0.0
+    if window.slow_voltage is not None:
+        told = window.slow_voltage.voltage_v[np.isfinite(window.slow_voltage.voltage_v)]
+        if told.size >= LEAST_SAMPLES and np.ptp(told) == 0.0:
+            yield _stands_still("voltage", float(told[0]), moved_mm)
     for name, values in recorded_signals(window).items():
         moving = values[begin:end][np.isfinite(values[begin:end])]
         if moving.size >= LEAST_SAMPLES and np.ptp(moving) == 0.0:
-            yield _stands_still(name, float(moving[0]), float(travel[end - 1] - travel[begin]))
+            yield _stands_still(name, float(moving[0]), moved_mm)
         elif name == "demand":
             yield from _jump_of_demand(evidence, values)
 

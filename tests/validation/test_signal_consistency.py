@@ -6,10 +6,12 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from fdhil.cli.batch import analyse_file
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
@@ -19,6 +21,7 @@ from fdhil.validation.signal_consistency import missing_move
 from studies import real_plant
 from studies.bench import Array, shuttle
 from studies.real_plant import SLOW, SLOW_LOOPS, Sensors
+from studies.slow_sensor import slow_windows
 from studies.wrong_signals import FIELDS, NAMED, PLANTS, Fault, Plant, faults_of, judge
 
 SETTINGS = Identification()
@@ -135,6 +138,24 @@ def test_current_that_changes_every_tenth_of_a_second_is_named_with_its_period()
     assert "current changes only every 50 ms" in refusals(held)
 
 
+def test_slow_voltage_that_stands_still_is_named() -> None:
+    (window,) = slow_windows()
+    slow = window.slow_voltage
+    assert slow is not None
+    dead = replace(window, slow_voltage=replace(slow, voltage_v=frozen(0.0 * slow.voltage_v)))
+    assert "voltage stands still at 0 V" in analyse(dead, SETTINGS).verdict.reasons[0].text
+
+
+def test_identify_names_the_speed_that_hides_a_rapid(tmp_path: Path) -> None:
+    own = plant("bench")
+    run = replace(own.move, speed=0.0 * own.move.speed)
+    text = real_plant.as_csv(run, own.machine.mechanics, Sensors(noise=0.0), own.rapid_m_s)
+    (tmp_path / "dead.csv").write_text(text)
+    result = analyse_file(tmp_path / "dead.csv", SETTINGS)
+    assert [reason.code for reason in result.verdict.reasons] == ["NoWindow", "Implausible"]
+    assert "the position travels 400 mm" in result.verdict.reasons[1].text
+
+
 @pytest.fixture(scope="module")
 def at_table() -> Window:
     """Return a rapid with an encoder and an accelerometer at the table, which hangs on a spring."""
@@ -145,6 +166,12 @@ def at_table() -> Window:
     table = frozen(moved.table_m * 1e3 + 7.0)
     (window,) = find_windows(replace(recording, table_mm=table, table_m_s2=frozen(rate)))
     return window
+
+
+def test_good_table_sensors_are_used_without_a_warning(at_table: Window) -> None:
+    good = analyse(at_table, SETTINGS)
+    assert good.at_table is not None
+    assert not any("table" in warning.text for warning in good.verdict.warnings)
 
 
 @pytest.mark.parametrize(
@@ -161,13 +188,10 @@ def at_table() -> Window:
 def test_wrong_table_sensor_is_named_and_not_used(
     at_table: Window, field: str, change: Callable[[Array], Array], text: str
 ) -> None:
-    good = analyse(at_table, SETTINGS)
-    assert good.at_table is not None
     spoilt: Window = replace(at_table, **{field: frozen(change(np.array(getattr(at_table, field))))})  # type: ignore[arg-type]
     without: Window = replace(at_table, **{field: None})  # type: ignore[arg-type]
     found, expected = (analyse(window, SETTINGS) for window in (spoilt, without))
     assert any(text in warning.text for warning in found.verdict.warnings)
-    assert not any("table" in warning.text for warning in good.verdict.warnings)
     assert found.at_table == expected.at_table
     assert found.estimate is not None
     assert expected.estimate is not None
