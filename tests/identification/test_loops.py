@@ -10,10 +10,10 @@ import pytest
 
 from fdhil import config as configuration
 from fdhil.config import Axis, Identification
-from fdhil.identification.loops import better_loops, differences, identify_loops, with_loops
+from fdhil.identification.loops import DIFFER, better_loops, differences, identify_loops, with_loops
 from fdhil.identification.windows import find_windows
 from fdhil.model import closed_loop
-from fdhil.records import Float, LoopEstimate, Parameters, Recording, Window, frozen
+from fdhil.records import Float, LoopEstimate, Parameters, Reason, Recording, Verdict, Window, frozen
 from studies import real_plant as real
 from tests.bench import bench_document
 from tests.model.slow_drive import SlowDrive
@@ -189,3 +189,10 @@ def test_slow_rows_show_the_loops(row_s: float) -> None:
     (window,) = observed(axis, shuttle(1, 0.25, 0.5, step_s=row_s), row_s)
     for name, value in gains(found([window], None)).items():
         assert value == pytest.approx(getattr(axis.regulators, name), rel=0.02), name
+
+
+@pytest.mark.parametrize(("gain", "used"), [(50.0, True), (0.0078, False)])
+def test_loops_that_no_configuration_may_hold_are_not_used(gain: float, used: bool) -> None:
+    verdict = Verdict(True, None, (), 1.0, (Reason(DIFFER, "they differ"),))
+    values, covariance = np.array([gain]), np.eye(1)
+    assert better_loops(LoopEstimate("X", "p_pi_pi", ("position_gain_per_s",), values, covariance, verdict)) is used
