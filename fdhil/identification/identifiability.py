@@ -13,7 +13,7 @@ from fdhil.records import PARAMETERS, Estimate, Float, Reason, Result
 CONDITION_LIMIT = 1e6
 RELATIVE_STD_LIMIT: Mapping[str, float] = {"R": 0.10, "L": 0.25, "K": 0.05, "Jt": 0.10, "ft": 0.5, "Cd": 0.5}
 FRICTION_SHARE, TORQUE_SHARE = 0.25, 0.02
-SIGNALS = "check the scale, sign and order of the signals"
+SIGNALS = "check the scale, sign, timing and order of these signals"
 TOLD_BY_VOLTAGE = frozenset({"R", "L"})
 PHYSICAL: Mapping[str, tuple[float, float]] = {
     "R": (1e-3, 1e3),
