@@ -234,6 +234,15 @@ def pack(entries: Sequence[PdoEntry], values: Sequence[int]) -> bytes:
     return whole.to_bytes(pdo_length(entries), "little")
 
 
+INTEGER32 = (-(1 << 31), (1 << 31) - 1)
+
+
+def target_range(offset: int) -> tuple[int, int]:
+    """Return the lowest and the highest target (0x607A) whose sum with an offset of either sign is an INTEGER32."""
+    low, high = INTEGER32
+    return low + offset, high - offset
+
+
 @dataclass(frozen=True, slots=True)
 class Scaling:
     """Between an axis' millimetres and its drive's position increments.

@@ -49,11 +49,21 @@ class _Found:
 class FirstBlock:
     """The first rows of an inverse correction, as they are in force, and what is needed to find them anew."""
 
-    def __init__(self, begin: Piece, program: Path, models: Mapping[str, Parameters], config: MachineConfig) -> None:
-        """Prepare for a checked program that begins with ``begin``; ProgramError when it can no longer be read."""
+    def __init__(
+        self,
+        begin: Piece,
+        program: Path,
+        models: Mapping[str, Parameters],
+        config: MachineConfig,
+        sha256: str | None = None,
+    ) -> None:
+        """Prepare for a checked program that begins with ``begin``.
+
+        ProgramError when it can no longer be read, or is not the one with the digest ``sha256``.
+        """
         self.begin = self._checked = begin
         self._models, self._config, self._period_s = models, config, config.machine.sync_period_s
-        self._path = _first_rows(program, config)
+        self._path = _first_rows(program, config, sha256)
         rapid = {axis: config.axis[axis].rapid_speed_mm_s for axis in begin.offset}
         # rows that lag on purpose lag by what the whole path asks for
         self._fits = set(begin.offset) <= set(self._path) and common_delay_s(rapid, models, config)[0] == 0.0
@@ -163,12 +173,12 @@ class FirstBlock:
         return new_um < old_um
 
 
-def _first_rows(program: Path, config: MachineConfig) -> dict[str, Float]:
+def _first_rows(program: Path, config: MachineConfig, sha256: str | None) -> dict[str, Float]:
     """Return the path's first block, what is looked at behind it, and a row that tells whether it goes on."""
     block, ahead = block_rows(config.machine.sync_period_s)
     pieces: list[Mapping[str, Float]] = []
     rows = 0
-    for part in reference_blocks(program, config):
+    for part in reference_blocks(program, config, sha256):
         pieces.append(part.position_mm)
         rows += part.time_s.size
         if rows > block + ahead:

@@ -123,7 +123,7 @@ def prepare(
         return found
     models = {axis: with_resonance(model, config.axis[axis]) for axis, model in found[0].items()}
     digest = program_digest(program)
-    ahead = method in (None, "inverse") and _longer_than_ring(program, config)
+    ahead = method in (None, "inverse") and _longer_than_ring(program, config, digest)
     if ahead and (off := gate.writing_off(list(config.axis), config)):
         return Refused(off)
     return ArmRequest(program, digest, models, found[1], method, ahead)
@@ -152,10 +152,10 @@ def _not_validated(axis: str) -> Refused:
     return Refused((Reason("ModelNotValidated", text, "let the machine make a few rapids of this axis"),))
 
 
-def _longer_than_ring(program: Path, config: MachineConfig) -> bool:
+def _longer_than_ring(program: Path, config: MachineConfig, sha256: str) -> bool:
     """Whether a program is longer than what the guard is given at first; no more of it is read than that takes."""
     rows = 0
-    for block in reference_blocks(program, config):
+    for block in reference_blocks(program, config, sha256):
         rows += block.time_s.size
         if rows * config.machine.sync_period_s > FIRST_S:
             return True
@@ -194,7 +194,7 @@ def prepare_armament(
         half_um = skill_of({axis: found.skills for axis, found in known.items()}, stream.axes)
     begin, first = stream.take(FIRST_S), None
     if checked.method == "inverse":
-        first = FirstBlock(begin, request.program, request.models, request.config)
+        first = FirstBlock(begin, request.program, request.models, request.config, request.program_digest)
         if (rows := first.expect(rest or {})) is not None:
             first.take(rows)
         begin = first.begin

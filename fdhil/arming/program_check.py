@@ -29,9 +29,9 @@ from fdhil.config import MachineConfig
 from fdhil.correction import gate
 from fdhil.correction.streaming import StreamBlock, stream
 from fdhil.errors import FdhilError, ProgramError, StoreError
-from fdhil.program import Budget, planner, program_digest
-from fdhil.program.demand_csv import read_demand_csv
-from fdhil.program.interpreter import Interpreter
+from fdhil.program import planner, program_digest
+from fdhil.program.demand_csv import read_demand_csv, require_digest
+from fdhil.program.loading import is_demand, open_program
 from fdhil.records import Float, Parameters, Reason, Trajectory
 from fdhil.store.atomic import keep_newest, make_folder, store_error, sync_folder, write_file
 
@@ -48,34 +48,39 @@ INT32_END = 2**31
 Tell = Callable[[Mapping[str, Any]], None]
 
 
-def reference_blocks(program: Path, config: MachineConfig) -> Iterator[Trajectory]:
-    """Return what the NC will order, in blocks; ProgramError, RecordingError or ConfigError where it cannot be used."""
-    return _opened(program, config)[0]
+Opened = Callable[[], list[tuple[Path, str]]]  # which files were opened so far, with their digests
 
 
-def _opened(program: Path, config: MachineConfig) -> tuple[Iterator[Trajectory], Callable[[], list[Path]]]:
-    """Return the blocks, and what tells which files were opened for them so far."""
-    if program.suffix.lower() == ".csv":
-        return iter([read_demand_csv(program, config)]), lambda: [program]
-    interpreter = Interpreter(program, Budget.of(config.nc), block_delete=False)
+def reference_blocks(program: Path, config: MachineConfig, sha256: str | None = None) -> Iterator[Trajectory]:
+    """Return what the NC will order, in blocks; ProgramError, RecordingError or ConfigError where it cannot be used.
+
+    ``sha256`` is the program's digest: blocks of another content are a ProgramError.
+    """
+    return _opened(program, config, sha256)[0]
+
+
+def _opened(program: Path, config: MachineConfig, sha256: str | None) -> tuple[Iterator[Trajectory], Opened]:
+    if is_demand(program):
+        return iter([read_demand_csv(program, config, sha256)]), list
+    interpreter = open_program(program, config, sha256)
     return planner.stream(interpreter.run(), config, PIECE_ROWS), lambda: interpreter.files
 
 
 class _Files:
-    """The digests of a program's files when they were first used: its subroutines may lie beside it."""
+    """The digests of a program's files as they were read: its subroutines may lie in the same folder."""
 
     def __init__(self, program: Path, digest: str) -> None:
         self._digests = {program: digest}
 
-    def take(self, files: Sequence[Path]) -> None:
-        """Note the files that are new."""
-        self._digests |= {file: program_digest(file) for file in files if file not in self._digests}
+    def take(self, files: Sequence[tuple[Path, str]]) -> None:
+        """Note the files that are new; ProgramError when one is opened again with another content."""
+        for file, digest in files:
+            require_digest(file, digest, self._digests.setdefault(file, digest))
 
     def unchanged(self) -> dict[str, str]:
         """Return the digest of each subroutine's file by its name; ProgramError when one, or the program, changed."""
         for file, digest in self._digests.items():
-            if program_digest(file) != digest:
-                raise ProgramError(0, "", f"{file} was changed while it was checked; arm it again")
+            require_digest(file, program_digest(file), digest)
         return {file.name: digest for file, digest in list(self._digests.items())[1:]}
 
 
@@ -172,7 +177,7 @@ def check(
     rows are written), of each place that is refused ({"refused": ...}), and now and then how far it is
     ({"progress": ...}). ProgramError, RecordingError or ConfigError when the program cannot be used.
     """
-    source, opened = _opened(program, config)
+    source, opened = _opened(program, config, sha256)
     path, findings, files = _Path(source), _Findings(), _Files(program, sha256)
     code, blocks, pace = code_digest(), list[list[Any]](), _Pace(config.machine.sync_period_s)
     for block in stream(path.pieces(), models, config, goes_on=True):
@@ -215,7 +220,7 @@ class _Pace:
 
 
 def encoded(demand_mm: Mapping[str, Float], offset_um: Mapping[str, Float], config: MachineConfig) -> bytes:
-    """Return rows of demand and offset in increments, in the drives' own sign. ValueError where one is no int32."""
+    """Return rows of demand and offset in increments, in the drives' own sign. ProgramError where one is no int32."""
     columns = []
     for values, per_mm in ((demand_mm, 1.0), (offset_um, 1e-3)):
         for axis, settings in config.axis.items():
@@ -223,7 +228,7 @@ def encoded(demand_mm: Mapping[str, Float], offset_um: Mapping[str, Float], conf
             columns.append(np.rint(values[axis] * scale))
     rows = np.column_stack(columns)
     if not np.all(np.abs(rows) < INT32_END):
-        raise ValueError("a row is not finite, or too large for the guard's table")
+        raise ProgramError(0, "", "a row is not finite, or too large for the guard's table; give another program")
     return rows.astype("<i4").tobytes()
 
 

@@ -28,7 +28,7 @@ def plan_whole(request: ArmRequest, known: Mapping[str, AxisKnowledge]) -> Check
     ProgramError, RecordingError or ConfigError when the program cannot be used; StoreError when memory is short.
     """
     config = request.config
-    reference = load_trajectory(request.program, config)
+    reference = load_trajectory(request.program, config, request.program_digest)
     planned = correction.plan(reference, request.models, config, request.method)
     if planned.refused:
         return Refused(planned.refused)

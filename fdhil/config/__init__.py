@@ -21,6 +21,7 @@ from fdhil.config.bus import CanBus
 from fdhil.config.controller import Identification, Nc
 from fdhil.config.machine import MachineConfig
 from fdhil.config.offset_bounds import VARIATION_MM, OffsetBounds, share_fault
+from fdhil.config.position_range import PositionRange
 from fdhil.config.reading import load, parse, read_toml, toml_document, unlikely
 from fdhil.config.reality import Reality
 from fdhil.config.regulators import Regulators
@@ -49,6 +50,7 @@ __all__ = [
     "Noise",
     "Nominal",
     "OffsetBounds",
+    "PositionRange",
     "Reality",
     "Regulators",
     "Section",

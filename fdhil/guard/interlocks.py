@@ -120,6 +120,7 @@ CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
     "OffsetRate": (_R, "an offset changes too fast", "plan the correction inside the limits"),
     "OffsetEnergy": (_R, "the offsets travel more than allowed in one second", "plan a smoother correction"),
     "SoftwareLimit": (_N, "the path is too near to a software limit", "lower max_offset_um, or move the work"),
+    "PositionRange": (_N, "the path is too near to the end of 32 bits", "move the work, or coarsen the increments"),
     "CorruptFile": (_N, "the correction table cannot be read", "plan it again"),
     "TableBusy": (_N, "a whole table cannot be changed while a correction runs", "disarm, or adopt first"),
     "ProgramMismatch": (_N, "no table of this program is loaded", "plan and load the correction of this program"),

@@ -14,6 +14,7 @@ from array import array
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from fdhil.cia402 import target_range
 from fdhil.errors import StoreError
 from fdhil.guard.limits import OffsetLimits, violation
 from fdhil.guard.path import CorrectedPath
@@ -172,10 +173,24 @@ def _variation_fits(limits: OffsetLimits, offsets: Sequence[int], start: int, st
     return True
 
 
-def near_no_end(travel: tuple[int, int], limits: OffsetLimits, demand: Sequence[int]) -> bool:
-    """Whether these rows keep twice the largest offset away from both software limits."""
-    low, high = travel
-    return not demand or (low + 2 * limits.offset <= min(demand) and max(demand) <= high - 2 * limits.offset)
+def check_demand(travel: Travel, limits: OffsetLimits, demand: Sequence[int]) -> None:
+    """Raise TableRefused unless these rows keep away from both ends of the axis.
+
+    The largest offset from the ends of 32 bits (``PositionRange``), twice that from the software limits
+    (``SoftwareLimit``).
+    """
+    if not demand:
+        return
+    lowest, highest = min(demand), max(demand)
+    if travel is not None and not (
+        travel[0] + 2 * limits.offset <= lowest and highest <= travel[1] - 2 * limits.offset
+    ):
+        text = "the path comes nearer to a software limit of the drive than twice the largest offset"
+        raise TableRefused("SoftwareLimit", f"{text}; lower max_offset_um, or move the work away from the end")
+    low, high = target_range(limits.offset)
+    if not (low <= lowest and highest <= high):
+        text = "the path comes nearer to the end of the drive's 32 bit positions than the largest offset"
+        raise TableRefused("PositionRange", f"{text}; move the work, or set the drive to coarser increments")
 
 
 @dataclass(slots=True)
@@ -206,11 +221,9 @@ class Loading:
         """Check the next rows of all axes; TableRefused with the class of the first limit that is broken."""
         first = self.joined.first
         stop = min(self.next_row + rows, self.last)
-        for limits, travel, demand in zip(self.limits, self.travel, self.joined.demand, strict=False):
-            rows_now = demand[self.next_row - first : stop - first]
-            if travel is not None and not near_no_end(travel, limits, rows_now):
-                text = "the path comes nearer to a software limit of the drive than twice the largest offset"
-                raise TableRefused("SoftwareLimit", f"{text}; lower max_offset_um, or move the work away from the end")
+        travels = self.travel or (None,) * len(self.limits)
+        for limits, travel, demand in zip(self.limits, travels, self.joined.demand, strict=True):
+            check_demand(travel, limits, demand[self.next_row - first : stop - first])
         for limits, offsets in zip(self.limits, self.joined.offset, strict=True):
             broken = check_rows(limits, offsets, self.next_row - first, stop - first)
             if broken is not None:

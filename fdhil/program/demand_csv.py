@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import math
 from collections.abc import Mapping, Sequence
@@ -11,8 +12,9 @@ from typing import IO
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.csv_text import check_lengths, read_csv_text, shown
-from fdhil.errors import ConfigError, ConfigFault, RecordingError
+from fdhil.csv_text import check_lengths, read_content, shown, text_of
+from fdhil.errors import ConfigError, ConfigFault, ProgramError, RecordingError
+from fdhil.program.reach import first_beyond
 from fdhil.records import Float, Trajectory, frozen, frozen_ints
 
 _STEP_TOLERANCE = 1e-3  # of the SYNC period, for the period itself
@@ -25,14 +27,22 @@ _TOO_SLOW, _SMALL_MM = 2e-3, 2.0  # of the rapid speed, and of travel: both is n
 _OTHER_MARKS = {";": "semicolons", "\t": "tabs", "|": "bars", '"': "quotes"}  # of other kinds of CSV
 
 
-def read_demand_csv(path: Path, config: MachineConfig) -> Trajectory:
+def require_digest(path: Path, found: str, sha256: str | None) -> None:
+    """Raise ProgramError when what is read of a file is not what ``sha256`` was given for."""
+    if sha256 is not None and found != sha256:
+        raise ProgramError(0, "", f"{path} was changed while it was checked; nothing is armed, arm it again")
+
+
+def read_demand_csv(path: Path, config: MachineConfig, sha256: str | None = None) -> Trajectory:
     """Read a demand CSV as the reference of a machine.
 
     RecordingError when it cannot be read: a column is missing or there twice, the file was cut off, text or nothing
     stands where a number belongs, times are not uniform, or an axis moves that the machine lacks. ConfigError when its
-    step is not the SYNC period.
+    step is not the SYNC period. ProgramError when the file does not have the digest ``sha256``.
     """
-    text = read_csv_text(path)
+    content = read_content(path)
+    require_digest(path, hashlib.sha256(content).hexdigest(), sha256)
+    text = text_of(content, str(path))
     lines = text.splitlines() or [""]
     check_lengths(lines, 1, str(path))
     names = [name.strip() for name in lines[0].split(",")]
@@ -59,6 +69,8 @@ def read_demand_csv(path: Path, config: MachineConfig) -> Trajectory:
     rapid = still.astype(np.bool_)
     rapid.setflags(write=False)
     position_mm = {axis: frozen(moved.get(axis, still)) for axis in config.axis}
+    if (beyond := first_beyond(position_mm, config)) is not None:
+        raise RecordingError(f"{path} line {_line_of(lines, beyond.row)}: {beyond.text}")
     time_s = frozen(columns["time_s"])
     return Trajectory(config.machine.sync_period_s, time_s, position_mm, rapid, frozen_ints(still))
 
@@ -105,9 +117,14 @@ def _check_times(path: Path, lines: Sequence[str], time_s: Float, sync_period_s:
         raise ConfigError(str(path), [fault])
     off = np.flatnonzero(np.abs(steps - sync_period_s) > _JITTER_TOLERANCE * sync_period_s + 2 * _ROUNDING_S)
     if off.size:
-        number = [number for number, line in enumerate(lines, 1) if line.strip()][off[0] + 2]  # the names, one row more
+        number = _line_of(lines, int(off[0]) + 1)
         text = f"{path} line {number} is {steps[off[0]]:g} s after the row before it; rows must be one SYNC apart"
         raise RecordingError(text)
+
+
+def _line_of(lines: Sequence[str], row: int) -> int:
+    """Return the 1-based line of a row; the names stand above them."""
+    return [number for number, line in enumerate(lines, 1) if line.strip()][row + 1]
 
 
 def _check_speeds(path: Path, columns: Mapping[str, Float], config: MachineConfig) -> None:

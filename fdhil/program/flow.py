@@ -62,9 +62,9 @@ class Flow:
         return self._skip is not None
 
     @property
-    def files(self) -> list[Path]:
-        """The files that were opened so far, the program first."""
-        return [source.folder / source.name for source in self._files if source.folder is not None]
+    def files(self) -> list[tuple[Path, str]]:
+        """The files that were opened so far and the digest of what is read of each, the program first."""
+        return [(source.folder / source.name, source.sha256) for source in self._files if source.folder is not None]
 
     def close(self) -> None:
         """Close every source that is open."""

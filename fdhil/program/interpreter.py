@@ -81,9 +81,13 @@ class Interpreter:
         self._ended = False
 
     @property
-    def files(self) -> list[Path]:
-        """The files that were opened so far, the program first."""
+    def files(self) -> list[tuple[Path, str]]:
+        """The files that were opened so far and the digest of what is read of each, the program first."""
         return self._flow.files
+
+    def close(self) -> None:
+        """Close the files; not needed once the motions were taken."""
+        self._flow.close()
 
     def run(self) -> Iterator[Motion]:
         """Yield the motions until the program ends."""

@@ -10,8 +10,8 @@ from pathlib import Path
 from fdhil.config import MachineConfig
 from fdhil.errors import ProgramError
 from fdhil.program.budget import Budget
-from fdhil.program.demand_csv import read_demand_csv
-from fdhil.program.interpreter import interpret
+from fdhil.program.demand_csv import read_demand_csv, require_digest
+from fdhil.program.interpreter import Interpreter
 from fdhil.program.planner import plan
 from fdhil.records import Trajectory
 
@@ -19,14 +19,31 @@ MAX_BYTES = 1 << 30  # ten million lines of a hundred characters
 _PIECE_BYTES = 1 << 20
 
 
-def load_trajectory(path: Path, config: MachineConfig) -> Trajectory:
+def load_trajectory(path: Path, config: MachineConfig, sha256: str | None = None) -> Trajectory:
     """Return the reference that a file orders of the machine.
 
-    ``.csv`` is a demand CSV (RecordingError, ConfigError), anything else an NC program (ProgramError).
+    ``.csv`` is a demand CSV (RecordingError, ConfigError), anything else an NC program (ProgramError). ``sha256``: the
+    digest that the program must have; ProgramError where what is read has another.
     """
-    if path.suffix.lower() == ".csv":
-        return read_demand_csv(path, config)
-    return plan(interpret(path, Budget.of(config.nc)), config)
+    if is_demand(path):
+        return read_demand_csv(path, config, sha256)
+    return plan(open_program(path, config, sha256).run(), config)
+
+
+def is_demand(path: Path) -> bool:
+    """Return whether a file is a demand CSV, by its suffix."""
+    return path.suffix.lower() == ".csv"
+
+
+def open_program(path: Path, config: MachineConfig, sha256: str | None = None) -> Interpreter:
+    """Return the interpreter of an NC program as the machine reads it; ``sha256`` as in :func:`load_trajectory`."""
+    interpreter = Interpreter(path, Budget.of(config.nc), block_delete=False)
+    try:
+        require_digest(path, interpreter.files[0][1], sha256)
+    except ProgramError:
+        interpreter.close()
+        raise
+    return interpreter
 
 
 def program_digest(path: Path) -> str:

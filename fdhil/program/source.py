@@ -6,6 +6,9 @@ Only what a loop or a call may come back to is kept: a place in the file. Memory
 from __future__ import annotations
 
 import codecs
+import hashlib
+import os
+import stat
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -32,9 +35,23 @@ class Source:
     """A program that is read line by line and can go back to a place; ProgramError when it cannot be read.
 
     ``line`` is the 1-based number of the line last read; ``folder`` is where its subroutines lie, None for an iterable.
+    ``sha256`` is the digest of the file that is open, whatever its name becomes; empty for what is no plain file.
     """
 
-    __slots__ = ("_begin", "_end", "_feed", "_file", "_kept", "_max_chars", "_moved", "_open", "folder", "line", "name")
+    __slots__ = (
+        "_begin",
+        "_end",
+        "_feed",
+        "_file",
+        "_kept",
+        "_max_chars",
+        "_moved",
+        "_open",
+        "folder",
+        "line",
+        "name",
+        "sha256",
+    )
 
     def __init__(self, program: Path | Iterable[str], max_line_chars: int) -> None:
         self._max_chars = max_line_chars
@@ -46,10 +63,17 @@ class Source:
         self.line = 0
         self.name = ""
         self.folder: Path | None = None
+        self.sha256 = ""
         if isinstance(program, Path):
             self.name, self.folder = program.name, program.parent
             try:
                 file = self._open.enter_context(program.open("rb", buffering=_READ_AHEAD_BYTES))
+                if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                    digest = hashlib.sha256()
+                    while piece := file.read(_READ_AHEAD_BYTES):
+                        digest.update(piece)
+                    self.sha256 = digest.hexdigest()
+                    file.seek(0)
             except OSError as error:
                 raise ProgramError(0, "", f"{program} cannot be read ({error.strerror}); check the path") from None
             self._file: IO[bytes] = file

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import copy
+import io
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fdhil import correction
-from fdhil.arming.preparing import Refused
-from fdhil.arming.program_check import encoded
+from fdhil.arming.checked_program import Piece
+from fdhil.arming.first_block import FirstBlock
+from fdhil.arming.preparing import ArmRequest, Refused
+from fdhil.arming.program_check import check, encoded
+from fdhil.arming.whole_plan import plan_whole
 from fdhil.config import MachineConfig, parse
+from fdhil.errors import ProgramError
 from fdhil.prediction.models import nominal_models
+from fdhil.program import program_digest
 from tests.arming.test_preparing import whole
 from tests.bench import bench_config, bench_document
 from tests.daemon.machine import config_of
@@ -41,7 +47,7 @@ def test_rows_are_in_the_drives_increments_and_sign() -> None:
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e9])
 def test_what_is_no_increment_is_no_row(wrong: float) -> None:
     rows = {axis: np.array([0.0, wrong]) for axis in "XY"}
-    with pytest.raises(ValueError, match="not finite, or too large"):
+    with pytest.raises(ProgramError, match="not finite, or too large"):
         encoded(rows, rows, bench_config())
 
 
@@ -51,3 +57,39 @@ def test_what_was_refused_has_no_rows(config: MachineConfig, tmp_path: Path) -> 
     refused = whole(program, config)
     assert isinstance(refused, Refused)
     assert refused.reasons[0].code == "NoGain"
+
+
+FAR = "G1 X{:.4f} F30000\nG1 X0\nM2\n"
+
+
+def test_a_program_beyond_32_bits_is_refused_whichever_way_it_is_checked(tmp_path: Path) -> None:
+    """At once and ahead of the motion: an error for the operator, never the end of the daemon."""
+    document = bench_document("X")
+    document["axis"]["X"]["drive"] = {"increments_per_rev": 20_000_000}
+    config = parse(document, folder=tmp_path)
+    program = tmp_path / "far.ngc"
+    program.write_text(FAR.format(2147.2337))
+    told = "line 1, 'X': axis X at 2147.2337 mm: .* is 2147.2336 mm"
+    for method in (None, "mirror"):
+        with pytest.raises(ProgramError, match=told):
+            whole(program, config, method)
+    with pytest.raises(ProgramError, match=told):
+        check(program, program_digest(program), nominal_models(config), config, io.BytesIO(), print)
+
+
+@pytest.mark.parametrize("name", ["program.ngc", "program.csv"])
+def test_rows_and_digest_are_of_one_content(name: str, config: MachineConfig, tmp_path: Path) -> None:
+    """Another file is renamed to the program's name after its digest was taken: nothing is made of it."""
+    program, other = tmp_path / name, tmp_path / "other"
+    texts = {".ngc": FAR.format(30), ".csv": "time_s,X_mm,Y_mm\n0.000,0,0\n0.001,0,0\n0.002,0,0\n"}
+    program.write_text(texts[program.suffix])
+    request = ArmRequest(program, program_digest(program), nominal_models(config), config, "mirror")
+    other.write_text(texts[program.suffix].replace("0", "0.0", 1))
+    other.rename(program)
+    with pytest.raises(ProgramError, match="was changed while it was checked"):
+        plan_whole(request, {})
+    with pytest.raises(ProgramError, match="was changed while it was checked"):
+        check(program, request.program_digest, request.models, config, io.BytesIO(), print)
+    begin = Piece(0, {"X": [0], "Y": [0]}, {"X": [0], "Y": [0]}, True)
+    with pytest.raises(ProgramError, match="was changed while it was checked"):
+        FirstBlock(begin, program, request.models, config, request.program_digest)

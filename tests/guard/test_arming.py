@@ -270,7 +270,7 @@ def test_what_forbids_arming_alone(change: dict[str, Any], code: str) -> None:
 FREEZES = {"BusOff", "BusRestarted", "BusDown", "SyncLost", "NmtStateWrong", "NodeRebooted"}
 FREEZES |= {"OffsetDoubtful", "InternalError"}
 HOLDS = {"SyncJitter", "FeedbackGap", "TargetLost", "Misaligned", "OverrideChanged", "FeedHold"}
-REFUSES = {"PdoMapping", "StaleOffset", "SoftwareLimit", "CorruptFile", "TableBusy", "ProgramMismatch"}
+REFUSES = {"PdoMapping", "StaleOffset", "SoftwareLimit", "PositionRange", "CorruptFile", "TableBusy", "ProgramMismatch"}
 REFUSES |= {"NotCommissioned", "RecordVoid", "FeedforwardUnknown", "FeedforwardOff", "ModelNotValidated"}
 REFUSES |= {"HarmPredicted", "WatchdogNotArmed", "LimitBeyondWindow", "AuthRequired"}
 REFUSES |= {"NotOff", "NotSettled", "GuardBusy", "DisarmedSince"}

@@ -413,6 +413,19 @@ def test_a_path_that_comes_nearer_is_no_table(demand: list[int]) -> None:
     assert caught.value.code == "SoftwareLimit"
 
 
+@pytest.mark.parametrize("end", [2**31 - 1 - 9, 2**31 - 1, -(2**31) + 9, -(2**31)])
+def test_no_offset_on_a_path_leaves_32_bits(end: int) -> None:
+    """The largest offset is 10 here: one increment nearer to the end and the drive would wrap around."""
+    with pytest.raises(TableRefused, match="path comes nearer to the end of the drive's 32 bit positions") as caught:
+        loaded_within(None, [0] * 5 + [end])
+    assert caught.value.code == "PositionRange"
+
+
+@pytest.mark.parametrize("end", [2**31 - 1 - 10, -(2**31) + 10])
+def test_a_path_up_to_the_largest_offset_from_the_end_of_32_bits_is_a_table(end: int) -> None:
+    assert list(loaded_within(None, [0, end]).demand[0]) == [0, end]
+
+
 def test_a_piece_that_comes_nearer_is_no_part_of_a_table() -> None:
     """Of the rows behind those that were let go, each at its own place."""
     limits = (OffsetLimits(10, 5, 2, 1000, 2),)

@@ -14,11 +14,13 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from fdhil.config import MachineConfig
+from fdhil.errors import ProgramError
 from fdhil.program.motions import Motion
 from fdhil.program.planner import linuxcnc
 from fdhil.program.planner.look_ahead import LookAhead
 from fdhil.program.planner.smoothing import Smoother
 from fdhil.program.planner.timeline import Timeline
+from fdhil.program.reach import first_beyond
 from fdhil.records import Float, Int, Trajectory, frozen, frozen_ints
 
 MAX_ROWS = 10_000_000
@@ -95,12 +97,13 @@ def _trajectory(rows: Float, first_row: int, config: MachineConfig) -> Trajector
     n, dt_s = len(rows), config.machine.sync_period_s
     rapid = rows[:, 4].astype(np.bool_)
     rapid.setflags(write=False)
+    position_mm = {axis: frozen(rows[:, "XYZ".index(axis)] if axis in "XYZ" else np.zeros(n)) for axis in config.axis}
+    if (beyond := first_beyond(position_mm, config)) is not None:  # an arc may, between two ends that fit
+        raise ProgramError(int(rows[beyond.row, 3]), beyond.axis, beyond.text)
     return Trajectory(
         dt_s=dt_s,
         time_s=frozen((first_row + np.arange(n)) * dt_s),
-        position_mm={
-            axis: frozen(rows[:, "XYZ".index(axis)] if axis in "XYZ" else np.zeros(n)) for axis in config.axis
-        },
+        position_mm=position_mm,
         rapid=rapid,
         line=frozen_ints(rows[:, 3]),
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from fdhil.config import MachineConfig
+from fdhil.config import MachineConfig, PositionRange
 from fdhil.errors import ProgramError
 from fdhil.program.motions import PLANE_AXES, Arc, Dwell, Motion, Point, Rapid
 
@@ -22,6 +22,7 @@ class AxisLimits:
     acceleration: Point
     jerk: Point
     dt_s: float
+    ranges: tuple[PositionRange | None, ...]
 
     @staticmethod
     def of(config: MachineConfig) -> AxisLimits:
@@ -32,10 +33,12 @@ class AxisLimits:
             return x, y, z
 
         speed, acceleration = each("rapid_speed_mm_s"), each("max_acceleration_mm_s2")
-        return AxisLimits(speed, acceleration, each("jerk_mm_s3"), config.machine.sync_period_s)
+        dt_s, axes = config.machine.sync_period_s, config.axis
+        ranges = tuple(PositionRange.of(axis, axes[axis], dt_s) if axis in axes else None for axis in "XYZ")
+        return AxisLimits(speed, acceleration, each("jerk_mm_s3"), dt_s, ranges)
 
     def check(self, motion: Motion, start: Point) -> None:
-        """Raise ProgramError for an endless feed or dwell, and for a motion of an axis that the machine lacks."""
+        """Raise ProgramError for an endless feed or dwell, an axis that the machine lacks, a place beyond 32 bits."""
         if isinstance(motion, Dwell):
             if motion.seconds / self.dt_s > _MAX_DWELL_ROWS:
                 raise ProgramError(motion.line, f"P{motion.seconds:g}", "is too long a dwell to plan")
@@ -51,6 +54,9 @@ class AxisLimits:
                 raise ProgramError(
                     motion.line, name, f"moves axis {name}, which the configuration lacks; add [axis.{name}]"
                 )
+        for reach, end in zip(self.ranges, motion.end, strict=True):
+            if reach is not None and not reach.fits(end):
+                raise ProgramError(motion.line, reach.axis, reach.fault(end))
 
     def rows(self, seconds: float) -> int:
         """Return the first SYNC row that is not before a time."""

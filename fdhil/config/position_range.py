@@ -1,0 +1,44 @@
+"""The positions that an axis can be ordered to: set-points are 32 bits, and the largest offset is added to them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from fdhil.cia402 import target_range
+from fdhil.config.axis import Axis
+from fdhil.config.offset_bounds import OffsetBounds
+
+_SHOWN = 1e4  # parts of a millimetre
+
+
+@dataclass(frozen=True, slots=True)
+class PositionRange:
+    """The set-points of one axis in increments, from ``low`` to ``high``; ``per_mm`` has the sign of the drive."""
+
+    axis: str
+    low: int
+    high: int
+    per_mm: float
+
+    @staticmethod
+    def of(name: str, axis: Axis, sync_period_s: float) -> PositionRange:
+        """Return the range of an axis: INTEGER32 less the largest offset that may be sent to it."""
+        most = OffsetBounds.given(axis, sync_period_s).whole[0] if axis.correction is not None else 0
+        return PositionRange(name, *target_range(most), axis.scaling.sign * axis.scaling.increments_per_mm)
+
+    def fits(self, position_mm: float) -> bool:
+        """Return whether the set-point of a finite position, and each offset on top of it, fit into 32 bits."""
+        return self.low <= round(position_mm * self.per_mm) <= self.high
+
+    def last_mm(self, position_mm: float) -> float:
+        """Return the last position that fits on the way to one that does not, rounded to zero."""
+        end = self.high if position_mm * self.per_mm > 0.0 else self.low
+        return math.trunc(end / self.per_mm * _SHOWN) / _SHOWN
+
+    def fault(self, position_mm: float) -> str:
+        """Return what is wrong with a position that does not fit, and what to do."""
+        text = f"axis {self.axis} at {position_mm:.10g} mm: the set-point with its largest offset exceeds 32 bits"
+        text += f" of increments ({abs(self.per_mm):.10g} per mm); the last position that fits is"
+        text += f" {self.last_mm(position_mm):.10g} mm; move the work, or set the drive to coarser increments"
+        return text

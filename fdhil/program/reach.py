@@ -1,0 +1,32 @@
+"""Finds the first row of a demand whose set-points leave the 32 bits that a drive has for them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from fdhil.config import MachineConfig, PositionRange
+from fdhil.records import Float
+
+
+class Beyond(NamedTuple):
+    """A row beyond the range of an axis, and the sentence about it."""
+
+    row: int
+    axis: str
+    text: str
+
+
+def first_beyond(position_mm: Mapping[str, Float], config: MachineConfig) -> Beyond | None:
+    """Return the first row at which an axis is beyond its range, None where all (n,) positions fit."""
+    found = []
+    for name, axis in config.axis.items():
+        reach = PositionRange.of(name, axis, config.machine.sync_period_s)
+        increments = np.rint(position_mm[name] * reach.per_mm)
+        out = np.flatnonzero(~((reach.low <= increments) & (increments <= reach.high)))  # NaN does not fit either
+        if out.size:
+            row = int(out[0])
+            found.append(Beyond(row, name, reach.fault(float(position_mm[name][row]))))
+    return min(found, default=None)
