@@ -61,7 +61,7 @@ def _conclude(
     covariances = {axis: found.published.covariance for axis, found in known.items() if found.published is not None}
     skills = {axis: found.skills for axis, found in known.items()}
     checked.half_um = gain(planned, request.models, request.config, covariances, skills).half_um
-    checked.method, checked.warnings = planned.method, planned.warnings
+    checked.method, checked.warnings = planned.method, planned.warnings + planned.before.reference.notes
     largest_um = max(float(np.abs(offset).max()) for offset in planned.offset_um.values())
     checked.conclude({**checked.errors, "largest_um": largest_um})
 

@@ -319,6 +319,8 @@ def _show_prediction(
     )
     entries = document.zones(predicted) if told is None else told
     shown = sorted(sorted(entries, key=lambda zone: -zone["max_um"])[:MANY_ZONES], key=lambda zone: zone["start_s"])
+    for note in predicted.reference.notes:
+        click.echo(f"note, {note}; {note.advice}", err=True)
     for zone in shown:
         std = f" {plus_minus(INTERVAL_95 * zone['std_um'])}" if "std_um" in zone else ""
         line = f"line {zone['line']}, " if zone["line"] else ""

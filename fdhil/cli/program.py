@@ -6,6 +6,7 @@ import json
 import shutil
 import sys
 import tempfile
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import click
@@ -17,21 +18,34 @@ _SPOOL_CHARACTERS = 8_000_000
 
 @click.command()
 @click.argument("program", type=FILE)
+@click.option("--config", "config_path", type=FILE, help="The machine (TOML): its dialect, axes and 32 bit positions.")
 @click.option("--json", "as_document", is_flag=True, help="Print one JSON document instead of a table.")
 @click.option("--max-blocks", type=click.IntRange(min=1), default=10_000_000, show_default=True,
               help="Blocks that may be executed before the program is refused.")  # fmt: skip
 @click.option("--max-repeated-blocks", "max_repeated", type=click.IntRange(min=1), default=500_000, show_default=True,
               help="Of these, blocks that loops and calls may execute again.")  # fmt: skip
-def interpret(program: Path, as_document: bool, max_blocks: int, max_repeated: int) -> None:
+def interpret(program: Path, config_path: Path | None, as_document: bool, max_blocks: int, max_repeated: int) -> None:
     """List the motions that PROGRAM (ISO 6983, G-code) orders, in machine millimetres.
 
-    Nothing is printed unless the whole program can be interpreted.
+    The program is read as LinuxCNC 2.9 reads it; with --config by [nc] dwell_unit and integers, and refused where the
+    machine lacks an axis or a set-point exceeds its drive's 32 bits. Nothing is printed unless the whole program can be
+    interpreted.
     """
+    from fdhil.config import Nc, load
     from fdhil.program.budget import Budget
     from fdhil.program.interpreter import Interpreter
     from fdhil.program.motions import as_json
+    from fdhil.program.planner.limits import checked
+    from fdhil.program.program_notes import ProgramNotes
 
-    motions = Interpreter(program, Budget(max_blocks, max_repeated), block_delete=False).run()
+    config = None if config_path is None else load(config_path)
+    budget = replace(
+        Budget.of(Nc() if config is None else config.nc), max_blocks=max_blocks, max_repeated_blocks=max_repeated
+    )
+    notes = ProgramNotes(budget.dialect)
+    motions = notes.watch(Interpreter(program, budget, block_delete=False).run())
+    if config is not None:
+        motions = checked(motions, config)
     with tempfile.SpooledTemporaryFile(_SPOOL_CHARACTERS, mode="w+", encoding="utf-8") as spool:
         if as_document:
             spool.write('{"schema": "fdhil-interpret-1", "motions": [')
@@ -39,11 +53,14 @@ def interpret(program: Path, as_document: bool, max_blocks: int, max_repeated: i
             for motion in motions:
                 spool.write(separator + json.dumps(as_json(motion)))
                 separator = ",\n"
-            spool.write("\n]}\n")
+            found = [asdict(note) for note in notes.found]
+            spool.write("\n]" + (f', "notes": {json.dumps(found)}' if found else "") + "}\n")
         else:
             spool.writelines(_row(as_json(motion)) for motion in motions)
         spool.seek(0)
         shutil.copyfileobj(spool, sys.stdout)
+    for note in () if as_document else notes.found:
+        click.echo(f"note, {note}; {note.advice}", err=True)
 
 
 def _row(motion: dict[str, object]) -> str:

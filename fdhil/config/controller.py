@@ -27,6 +27,14 @@ class Nc(Section):
     end_rest_s: NotNegative = Field(
         0.5, le=10, description="rest after the last motion: the drives' settling belongs to the path's error"
     )
+    dwell_unit: Literal["s", "ms", "ms_without_point"] = Field(
+        "s", description="P of a dwell (G4, G82, G86, G89): s as LinuxCNC, ms, or ms_without_point (Haas, Fanuc: P500)"
+    )
+    integers: Literal["whole", "thousandths", "thousandths_and_feed"] = Field(
+        "whole",
+        description="a length or angle without a decimal point: whole units as LinuxCNC, thousandths of mm and degree "
+        "(tenths of that in inch; Haas and Fanuc by default), or thousandths_and_feed: F too (Haas by default)",
+    )
     max_blocks: int = Field(
         10_000_000, ge=1, le=10**12, description="blocks a program may execute before it is refused"
     )

@@ -21,6 +21,7 @@ def prediction_document(predicted: Prediction, models: Mapping[str, Parameters])
         "seen_at": seen_at(models),
         "contour": contour(predicted),
         "zones": zones(predicted),
+        "notes": reasons_document(predicted.reference.notes),
     }
 
 
@@ -40,8 +41,8 @@ def correction_document(
         "gain_at_least": predicted.at_least,
         "delay_s": planned.delay_s,
         "max_offset_um": {axis: float(abs(offset).max()) for axis, offset in planned.offset_um.items()},
-        "refused": _reasons(planned.refused),
-        "warnings": _reasons(planned.warnings),
+        "refused": reasons_document(planned.refused),
+        "warnings": reasons_document(planned.warnings),
     }
 
 
@@ -70,5 +71,6 @@ def zones(predicted: Prediction) -> list[dict[str, Any]]:
     ]
 
 
-def _reasons(reasons: Sequence[Reason]) -> list[dict[str, str]]:
+def reasons_document(reasons: Sequence[Reason]) -> list[dict[str, str]]:
+    """Return reasons: class, text and advice of each."""
     return [asdict(reason) for reason in reasons]

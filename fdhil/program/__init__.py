@@ -4,7 +4,7 @@ from fdhil.program.budget import Budget
 from fdhil.program.demand_csv import write_demand_csv
 from fdhil.program.interpreter import interpret
 from fdhil.program.loading import load_trajectory, program_digest
-from fdhil.program.motions import Arc, Dwell, Feed, Motion, Rapid
+from fdhil.program.motions import Arc, Dwell, Feed, Motion, Probe, Rapid, Turned
 from fdhil.program.planner import plan
 
 __all__ = [
@@ -13,7 +13,9 @@ __all__ = [
     "Dwell",
     "Feed",
     "Motion",
+    "Probe",
     "Rapid",
+    "Turned",
     "interpret",
     "load_trajectory",
     "plan",

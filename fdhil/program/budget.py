@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from fdhil.config import Nc
+from fdhil.program.dialect import LINUXCNC, Dialect
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,7 +17,7 @@ class Budget:
     ``max_motions_per_block`` what one block may order; ``max_call_depth`` nested calls;
     ``max_nesting`` brackets within a value and loops or conditions within one another; ``max_line_chars`` characters
     of one line; ``max_coordinate_mm`` largest co-ordinate; ``max_kept_lines``, ``max_labels`` and ``max_parameters``
-    are kept in memory.
+    are kept in memory. ``dialect`` is how the program's numbers are read.
     """
 
     max_blocks: int = 10_000_000
@@ -29,8 +30,9 @@ class Budget:
     max_kept_lines: int = 2000
     max_labels: int = 100_000
     max_parameters: int = 100_000
+    dialect: Dialect = LINUXCNC
 
     @classmethod
     def of(cls, nc: Nc) -> Budget:
-        """Return the budget that a machine's configuration sets."""
-        return cls(nc.max_blocks, nc.max_repeated_blocks, max_call_depth=nc.max_call_depth)
+        """Return the budget and the dialect that a machine's configuration sets."""
+        return cls(nc.max_blocks, nc.max_repeated_blocks, max_call_depth=nc.max_call_depth, dialect=Dialect.of(nc))

@@ -58,6 +58,7 @@ class Interpreter:
     def __init__(self, source: Path | Iterable[str], budget: Budget, block_delete: bool) -> None:
         self._budget = budget
         self._block_delete = block_delete
+        self._plain = budget.dialect.plain
         self._machine = Machine(budget)
         modal = self._machine.modal
         first = Source(source, budget.max_line_chars)
@@ -147,7 +148,7 @@ class Interpreter:
 
     def _simple(self, raw: str, line: int) -> Motion | None:
         """Execute a block of G0, G1, X, Y, Z, F alone; None leaves it to the long way."""
-        match = _SIMPLE.fullmatch(raw)
+        match = _SIMPLE.fullmatch(raw) if self._plain else None
         if match is None:
             return None
         g, x, y, z, f = match.groups()
@@ -196,13 +197,13 @@ class Interpreter:
         known = self._fetch(raw, line)
         if known is None:
             return None
-        if known.straight is not None:
+        if known.straight is not None and self._plain:
             x, y, z, f = (None if value is None else now(value) for value in known.straight)
             motion = self._straight(line, known.code, x, y, z, f)
             if motion is not None:
                 return motion
         if known.words or known.fixed is not None:
-            block = known.block(self._variables)
+            block = self._block(known)
             if "call" in block.m:
                 check_readers(block, None)
                 self._ended = not self._flow.call_or_end(block, without_number(clean(raw, line).lstrip("/")))
@@ -212,6 +213,10 @@ class Interpreter:
         else:
             self._settle(known.values(self._variables), line)
         return None
+
+    def _block(self, known: Line) -> Block:
+        """Return the block that a line is now, with its numbers as the dialect reads them."""
+        return self._budget.dialect.read(known.block(self._variables), self._machine.modal)
 
     def _fetch(self, raw: str, line: int) -> Line | None:
         """Return a line as it was read, None when it has no words; an O-word is executed."""
@@ -381,7 +386,7 @@ class Interpreter:
             raw, line = found
             known = self._fetch(raw, line)
             if known is not None:
-                drawn = known.block(self._variables)
+                drawn = self._block(known)
                 contour.add(drawn)
                 self._settle(drawn.settings, line)
         modal.position = here

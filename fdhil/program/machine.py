@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from fdhil.errors import GcodeBudget
 from fdhil.program.budget import Budget
 from fdhil.program.compensation import Compensation, Piece, Waiting
-from fdhil.program.modal import Modal
-from fdhil.program.motions import PLANE_AXES, Arc, Dwell, Feed, Motion, Point, Rapid
+from fdhil.program.modal import AXES, Modal
+from fdhil.program.motions import PLANE_AXES, Arc, Corner, Dwell, Feed, Motion, Point, Probe, Rapid, Turned
 from fdhil.program.targets import feed_mm_min, straight_length
 from fdhil.program.words import Block
 
@@ -26,6 +26,7 @@ class Machine:
     modal: Modal = field(default_factory=Modal)
     out: list[Motion] = field(default_factory=list)
     compensation: Compensation | None = None
+    others: list[float] = field(default_factory=lambda: [0.0] * 6)  # A B C U V W of the last motion, machine
     just_left: bool = False  # compensation, so that the next motion must be straight
 
     def rapid_to(self, block: Block, target: list[float]) -> None:
@@ -61,8 +62,8 @@ class Machine:
         self._give(self.compensation.line(block, a, b, target, feed))
 
     def dwell(self, block: Block, seconds: float) -> None:
-        """Order a dwell."""
-        dwell = Dwell(block.line, seconds)
+        """Order a dwell; ``seconds`` are those of P, or what the dialect has instead of seconds."""
+        dwell = Dwell(block.line, self.budget.dialect.dwell_s(seconds, "p" in block.pointless))
         if self.compensation is None or not self.compensation.wait(Waiting(block, dwell)):
             self._order(block, dwell)
 
@@ -119,8 +120,9 @@ class Machine:
                     self._line(waiting.block, self._lifted(piece.end + tip, waiting.whole), waiting.feed)
 
     def _line(self, block: Block, target: list[float], feed: float | None) -> None:
-        end, corner = self._checked(block, target), self.modal.corner
-        self._order(block, Rapid(block.line, end, corner) if feed is None else Feed(block.line, end, feed, corner))
+        end, corner, rotary = self._checked(block, target), self.modal.corner, self._turned(block, target)
+        motion = Rapid(block.line, end, corner, rotary) if feed is None else Feed(block.line, end, feed, corner, rotary)
+        self._order(block, motion)
 
     def _arc(self, block: Block, target: list[float], centre: complex, turns: int, feed: float) -> None:
         about: list[float | None] = list(self.modal.machine(self._lifted(centre, target)))
@@ -128,7 +130,8 @@ class Machine:
         if self.compensation is None:
             self.modal.position = target
         end, plane = self._checked(block, target), self.modal.plane_name
-        self._order(block, Arc(block.line, end, (about[0], about[1], about[2]), turns, plane, feed, self.modal.corner))
+        corner, rotary = self.modal.corner, self._turned(block, target)
+        self._order(block, Arc(block.line, end, (about[0], about[1], about[2]), turns, plane, feed, corner, rotary))
 
     def _order(self, block: Block, motion: Motion) -> None:
         if len(self.out) >= self.budget.max_motions_per_block:
@@ -145,7 +148,23 @@ class Machine:
                 raise block.fault(letter, f"leads to {value:g} mm; no machine reaches beyond {limit:g} mm")
         return end
 
+    def _turned(self, block: Block, position: list[float]) -> tuple[Turned, ...]:
+        """Return the axes beside X, Y and Z that a motion to this position names or moves."""
+        before, self.others = self.others, self.modal.others(position)
+        moved = zip(AXES[3:], before, self.others, strict=True)
+        return tuple(
+            Turned(letter.upper(), start, end)
+            for letter, start, end in moved
+            if letter in block.words or abs(end - start) > _TINY_MM
+        )
+
+    def probe_to(self, block: Block, target: list[float]) -> None:
+        """Order a probe's move to a position in active co-ordinates, at the feed in force."""
+        self.modal.position = target
+        end, stop = self._checked(block, target), Corner("exact_stop")
+        self._order(block, Probe(block.line, end, self.modal.feed_mm_min, stop, self._turned(block, target)))
+
     def stand_at(self, block: Block, position: list[float]) -> None:
-        """Be at a position without a listed motion (a probe's, an operator's)."""
+        """Be at a position without a listed motion (an operator's)."""
         self.modal.position = position
         self._checked(block, position)

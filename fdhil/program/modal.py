@@ -101,9 +101,11 @@ class Modal:
 
     def machine_all(self) -> list[float]:
         """Return all nine axes of the controlled point in machine co-ordinates."""
-        whole = [p + o + g for p, o, g in zip(self.position, self.g92, self.g5x, strict=True)]
-        whole[:3] = self.machine()
-        return whole
+        return [*self.machine(), *self.others(self.position)]
+
+    def others(self, position: list[float]) -> list[float]:
+        """Return A B C (degrees) U V W (mm) of a position in machine co-ordinates."""
+        return [p + o + g for p, o, g in zip(position[3:], self.g92[3:], self.g5x[3:], strict=True)]
 
     def from_machine(self, machine: list[float]) -> list[float]:
         """Return the position in active co-ordinates of a controlled point in machine co-ordinates."""

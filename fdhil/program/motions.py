@@ -31,23 +31,41 @@ class Corner:
 BLEND = Corner()
 
 
+class Turned(NamedTuple):
+    """What a motion orders of one axis of A B C (degrees) U V W (mm) in machine co-ordinates."""
+
+    axis: str
+    start: float
+    end: float
+
+
 @dataclass(frozen=True, slots=True)
 class Rapid:
-    """G0: a straight line at rapid speed to ``end`` (mm); ``line`` is the 1-based source line."""
+    """G0: a straight line at rapid speed to ``end`` (mm); ``line`` is the 1-based source line.
+
+    ``rotary`` are the axes beside X, Y and Z that the block names, or that it moves.
+    """
 
     line: int
     end: Point
     corner: Corner = BLEND
+    rotary: tuple[Turned, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Feed:
-    """G1: a straight line to ``end`` (mm) at ``feed`` mm/min."""
+    """G1: a straight line to ``end`` (mm) at ``feed`` mm/min; of A B C alone degrees/min."""
 
     line: int
     end: Point
     feed: float
     corner: Corner = BLEND
+    rotary: tuple[Turned, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Probe(Feed):
+    """G38.2 to G38.5: a feed to its target, which ends where the probe touches or leaves: unknown before it runs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +84,7 @@ class Arc:
     plane: str
     feed: float
     corner: Corner = BLEND
+    rotary: tuple[Turned, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +161,8 @@ def as_json(motion: Motion) -> dict[str, Any]:
         shown["plane"] = motion.plane
     if not isinstance(motion, Rapid):
         shown["feed"] = _shown(motion.feed)
+    if motion.rotary:
+        shown["rotary"] = {turned.axis: _shown(turned.end) for turned in motion.rotary}
     return shown
 
 

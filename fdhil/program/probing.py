@@ -1,4 +1,4 @@
-"""Probe moves G38.2 to G38.5: taken to reach their targets without a touch, and not listed as motions."""
+"""Probe moves G38.2 to G38.5: taken to reach their targets without a touch, since where they touch is unknown."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _PROBED_FIRST, _HIT = 5061, 5070
 
 
 def probe(machine: Machine, variables: Variables, block: Block) -> None:
-    """Be at the target of a probe move, with #5061 and on as its end and #5070 as 0 (no touch)."""
+    """Order a probe move to its target, with #5061 and on as its end and #5070 as 0 (no touch)."""
     modal = machine.modal
     code = modal.code
     if modal.feed_mode == 930 or modal.feed_mm_min <= 0.0:
@@ -23,7 +23,7 @@ def probe(machine: Machine, variables: Variables, block: Block) -> None:
         raise block.fault(code, "wants the axis words of its target")
     if straight_length(modal.position, end) < _MIN_LENGTH_MM:
         raise block.fault(code, "starts too near to its target to probe")
-    machine.stand_at(block, end)
+    machine.probe_to(block, end)
     for axis, value in enumerate(end):
         variables.store(_PROBED_FIRST + axis, value / modal.unit(axis))
     variables.store(_HIT, 0.0)

@@ -17,6 +17,7 @@ from fdhil.program.expressions import Context, Reader, Value, is_whole, now, who
 _NUMBER = re.compile(r"n(\d++)(?:\.\d++)?+")
 _CLEANED = str.maketrans(ascii_uppercase, ascii_lowercase, " \t\r\v\f")
 _COMMENT = "("
+_DIGITS = re.compile(r"[+-]?\d+")
 _STRAIGHT = frozenset("xyzf")
 _LETTERS = frozenset("abcdefghijklmpqrstuvwxyz@^$")
 
@@ -67,13 +68,15 @@ def g_word(code: int) -> str:
 @dataclass(slots=True)
 class Block:
     """One line, read: ``words`` by letter (lower case, program units), G codes times ten and M codes by modal group,
-    and the parameter settings in their order, done after the whole line was read."""
+    and the parameter settings in their order, done after the whole line was read. ``pointless`` are the letters whose
+    value is a number without a decimal point."""
 
     line: int
     words: dict[str, float] = field(default_factory=dict)
     g: dict[str, int] = field(default_factory=dict)
     m: dict[str, int] = field(default_factory=dict)
     settings: list[tuple[int | str, float]] = field(default_factory=list)
+    pointless: frozenset[str] = frozenset()
 
     def fault(self, word: str, message: str) -> ProgramError:
         """Return the error for one of its words; a letter is shown with its value."""
@@ -128,7 +131,8 @@ def without_number(text: str) -> str:
 class Line:
     """A line that was read: ``fixed`` when it is always the same block, else its words and settings to evaluate.
 
-    ``straight`` are X, Y, Z and F of a line that has no other words but G0 or G1 (``code``, times ten).
+    ``straight`` are X, Y, Z and F of a line that has no other words but G0 or G1 (``code``, times ten). ``pointless``
+    are the letters whose value is a number without a decimal point.
     """
 
     fixed: Block | None
@@ -136,13 +140,14 @@ class Line:
     settings: tuple[tuple[Value | str, Value], ...] = ()
     code: int | None = None
     straight: tuple[Value | None, ...] | None = None
+    pointless: frozenset[str] = frozenset()
 
     def block(self, context: Context) -> Block:
         """Return the block that the line is now, with the parameters as they are before its own settings."""
         fixed, line = self.fixed, context.line
         if fixed is not None:
-            return Block(line, fixed.words, fixed.g, fixed.m)
-        block = Block(line)
+            return Block(line, fixed.words, fixed.g, fixed.m, pointless=self.pointless)
+        block = Block(line, pointless=self.pointless)
         for letter, value in self.words:
             _add(block, letter, now(value))
         block.settings = self.values(context)
@@ -167,11 +172,14 @@ def read(text: str, context: Context, max_nesting: int) -> Line:
     reader = Reader(text, context, max_nesting)
     words: list[tuple[str, Value]] = []
     settings: list[tuple[Value | str, Value]] = []
+    pointless = set()
     while not reader.done():
         read_word(reader, words, settings)
+        if _DIGITS.fullmatch(text, reader.word_at + 1, reader.at):
+            pointless.add(text[reader.word_at])
     if settings:
-        return Line(None, tuple(words), tuple(settings))
-    line = Line(None, tuple(words), (), *_straight(words))
+        return Line(None, tuple(words), tuple(settings), pointless=frozenset(pointless))
+    line = Line(None, tuple(words), (), *_straight(words), frozenset(pointless))
     if not words or any(callable(value) for _, value in words):
         return line
     return replace(line, fixed=line.block(context))

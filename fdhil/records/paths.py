@@ -15,7 +15,8 @@ from fdhil.records.verdicts import Reason
 class Trajectory:
     """A reference on the SYNC grid: ``time_s`` (n,) and ``position_mm`` per axis (n,); ``rapid`` (n,) marks G0 rows.
 
-    ``line`` (n,) is the source line of the program that ordered the row, 0 where there is none.
+    ``line`` (n,) is the source line of the program that ordered the row, 0 where there is none. ``notes`` question the
+    program.
     """
 
     dt_s: float
@@ -23,6 +24,7 @@ class Trajectory:
     position_mm: Mapping[str, Float]
     rapid: Bool
     line: Int
+    notes: tuple[Reason, ...] = ()
 
     @property
     def axes(self) -> tuple[str, ...]:

@@ -279,3 +279,26 @@ def test_trouble_is_one_sentence(
     assert result.exit_code == code
     assert message in result.stderr
     assert "Traceback" not in result.stderr
+
+
+def test_a_probe_runs_at_its_feed_and_a_doubtful_number_is_questioned(bench: Path) -> None:
+    """The probe move of 20 mm at 300 mm/min takes 4 s."""
+    program = bench / "probe.ngc"
+    program.write_text("G0 X0 Y0\nG38.2 X20 F300\nG0 X25\nG4 P61\nM2\n")
+    result = invoke("predict", program, "--config", bench / "bench.toml", "--json")
+    document = json.loads(result.stdout)
+    assert document["duration_s"] - 61.0 == pytest.approx(4.0 + 0.9, abs=0.4)
+    assert [note["code"] for note in document["notes"]] == ["UnknownAfterProbe", "LongDwell"]
+    shown = invoke("predict", program, "--config", bench / "bench.toml")
+    assert "note, LongDwell: line 4: the axes dwell for 61 s; P is read in seconds, as LinuxCNC does" in shown.stderr
+
+
+def test_a_program_with_an_axis_that_is_not_configured_is_refused(bench: Path) -> None:
+    program = bench / "rotary.ngc"
+    program.write_text("G0 X20 A45\nM2\n")
+    for command in ("predict", "correct"):
+        result = invoke(command, program, "--config", bench / "bench.toml", "--json")
+        assert result.exit_code == 3
+        error = json.loads(result.stdout)["error"]
+        assert (error["line"], error["word"]) == (1, "A")
+        assert "moves axis A, which the configuration lacks" in error["text"]

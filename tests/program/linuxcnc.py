@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from fdhil.program import Arc, Dwell, Feed, Motion, Rapid
+from fdhil.program import Arc, Dwell, Feed, Motion, Probe, Rapid, Turned
 from fdhil.program.motions import PLANE_AXES
 
 CASES = Path(__file__).parent / "differential.txt"
@@ -43,6 +43,8 @@ class _Canon:
     rpm: float = 0.0
     pitch: float = 0.0
     at: list[float] = field(default_factory=lambda: [0.0] * 3)
+    abc_offset: dict[str, list[float]] = field(default_factory=lambda: {"g5x": [0.0] * 3, "g92": [0.0] * 3})
+    abc: list[float] = field(default_factory=lambda: [0.0] * 3)
     motions: list[Motion] = field(default_factory=list)
 
     def machine(self, position: list[float]) -> tuple[float, float, float]:
@@ -55,10 +57,21 @@ class _Canon:
             return self.pitch * self.rpm
         return self.feed * (self.rpm if self.per_revolution else 1.0)
 
+    def turned(self, values: list[float]) -> tuple[Turned, ...]:
+        """Return A, B and C of a motion in machine degrees; the reference has no U, V and W."""
+        before, shift = self.abc, self.abc_offset
+        self.abc = [v + a + b for v, a, b in zip(values, shift["g5x"], shift["g92"], strict=False)]
+        return tuple(Turned(*each) for each in zip("ABC", before, self.abc, strict=True))
+
     def straight(self, name: str, values: list[float]) -> None:
         self.at = values[:3]
-        end = self.machine(self.at)
-        self.motions.append(Rapid(0, end) if name == "STRAIGHT_TRAVERSE" else Feed(0, end, self.mm_min()))
+        end, turned = self.machine(self.at), self.turned(values[3:6])
+        if name == "STRAIGHT_TRAVERSE":
+            self.motions.append(Rapid(0, end, rotary=turned))
+        elif name == "STRAIGHT_PROBE":
+            self.motions.append(Probe(0, end, self.mm_min(), rotary=turned))
+        else:
+            self.motions.append(Feed(0, end, self.mm_min(), rotary=turned))
 
     def tap(self, values: list[float]) -> None:
         self.motions.append(Feed(0, self.machine(values[:3]), self.mm_min()))
@@ -71,28 +84,28 @@ class _Canon:
         self.at[first], self.at[second], self.at[normal] = values[0], values[1], values[5]
         shown: list[float | None] = list(self.machine(centre))
         shown[normal] = None
-        self.motions.append(
-            Arc(0, self.machine(self.at), (shown[0], shown[1], shown[2]), int(values[4]), self.plane, self.mm_min())
-        )
+        about, turned = (shown[0], shown[1], shown[2]), self.turned(values[6:9])
+        end = self.machine(self.at)
+        self.motions.append(Arc(0, end, about, int(values[4]), self.plane, self.mm_min(), rotary=turned))
 
     def call(self, name: str, text: str) -> None:
         numbers: Callable[[], list[float]] = lambda: [float(v) for v in text.split(",")]  # noqa: E731
-        if name in ("STRAIGHT_TRAVERSE", "STRAIGHT_FEED"):
+        if name in ("STRAIGHT_TRAVERSE", "STRAIGHT_FEED", "STRAIGHT_PROBE"):
             self.straight(name, numbers())
         elif name == "ARC_FEED":
             self.arc(numbers())
         elif name == "RIGID_TAP":
             self.tap(numbers())
-        elif name == "STRAIGHT_PROBE":
-            self.at = numbers()[:3]
         elif name == "DWELL":
             self.motions.append(Dwell(0, max(0.0, float(text))))  # a negative one ends at once
         elif name == "USE_LENGTH_UNITS":
             self.units(25.4 if "INCHES" in text else 1.0)
         elif name == "SET_G5X_OFFSET":
             self.g5x = [v * self.scale for v in numbers()[1:4]]
+            self.abc_offset["g5x"] = numbers()[4:7]
         elif name == "SET_G92_OFFSET":
             self.g92 = [v * self.scale for v in numbers()[:3]]
+            self.abc_offset["g92"] = numbers()[3:6]
         elif name == "SET_XY_ROTATION":
             self.rotation = float(text)
         elif name == "SELECT_PLANE":
@@ -152,9 +165,14 @@ def cases() -> list[tuple[str, str]]:
 
 def difference(ours: list[Motion], theirs: list[Motion], tolerance_mm: float = 3e-4) -> str:
     """Say where two lists of motions first differ, "" when they agree within the reference's decimals."""
+    abc: dict[str, float] = {}
     for number, (a, b) in enumerate(zip(ours, theirs, strict=False)):
         if type(a) is not type(b) or not _near(_figures(a), _figures(b), tolerance_mm):
             return f"motion {number}: {a} against {b}"
+        if not isinstance(a, Dwell) and not isinstance(b, Dwell):
+            abc |= {turned.axis: turned.end for turned in a.rotary}
+            if any(abs(abc.get(turned.axis, 0.0) - turned.end) > tolerance_mm for turned in b.rotary):
+                return f"motion {number}: {a} against {b}, with {abc}"
     if len(ours) != len(theirs):
         more = (ours if len(ours) > len(theirs) else theirs)[min(len(ours), len(theirs))]
         return f"{len(ours)} motions against {len(theirs)}; the first one more is {more}"

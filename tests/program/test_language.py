@@ -101,7 +101,7 @@ def test_modes_are_kept_and_restored() -> None:
 
 
 def test_probes_rotary_axes_and_block_delete() -> None:
-    assert ends(run("F10 G38.2 X5|G0 Y1|A5 B6 U7")) == [(5, 1, 0), (5, 1, 0)]
+    assert ends(run("F10 G38.2 X5|G0 Y1|A5 B6 U7")) == [(5, 0, 0), (5, 1, 0), (5, 1, 0)]
     assert len(list(interpret(["/G0 X1", "G0 X2"], block_delete=True))) == 1
     assert len(list(interpret(["/G0 X1", "G0 X2"]))) == 2
 

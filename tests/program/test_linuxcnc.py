@@ -17,7 +17,7 @@ pytestmark = pytest.mark.debian
 EXAMPLES = Path("/usr/share/linuxcnc/ncfiles")
 # what the examples do that fdhil does otherwise, and why
 OTHERWISE = {
-    "cone.ngc": "W words: the reference has no such axis, fdhil reads and does not list them",
+    "cone.ngc": "W words: the reference has no such axis, fdhil lists them",
     "lathe_g70_71_demo.ngc": "G70 with cutter compensation: goes to the contour's end first, mended in LinuxCNC 2.9.3",
     "systems.ngc": "splines: the reference does not tell their points",
     "smartprobe.ngc": "a loop that ends when a probe trips before its target; fdhil's never do",

@@ -1,13 +1,17 @@
 """Tells the kind of a move from the text of its block, as an NC shows it. Pure.
 
-A G word holds on: a block without one moves as the block before it. What an interface shows may leave blocks out, and
-then the kind is not known until a block has a word of its own.
-Sources: ISO 6983-1 (G00 to G03); for Klartext the maker's user's manuals: FMAX holds for its block alone.
+A G word of motion is modal: a block without one moves as the block before it. Any motion but G0 ends what G0 ordered,
+and so does a word that is not known to order none: threads (G32, G33), probing (G31, G38), splines, cycles and calls
+are never rapids. What an interface shows may leave blocks out, and then the kind is unknown until a block has a word of
+its own.
+Sources: ISO 6983-1 (G00 to G03); LinuxCNC's modal groups; Fanuc's lathe codes of system A, in which G90, G92 and G94
+with axis words cut; for Klartext the maker's user's manuals: FMAX holds for its block alone.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import Protocol
 
 from fdhil.records import MoveKind
@@ -18,7 +22,21 @@ _G = re.compile(r"(?<![A-Z_$])G\s*(\d+)(\.\d+)?(?!_)", re.IGNORECASE)
 _STRAIGHT = re.compile(r"^\s*\d*\s*(LP|LN|L)\s(?!BL)", re.IGNORECASE)
 _ARC = re.compile(r"^\s*\d*\s*(CTP|CP|CR|CT|C)\s", re.IGNORECASE)
 _RAPID = re.compile(r"\bF\s*MAX\b", re.IGNORECASE)
-_CYCLES = range(73, 90)  # canned ones: rapids and feeds in one block
+_OTHERWISE = re.compile(
+    r"(?<![A-Z_$])(G\s*[\[#=]|(CIP|CT|INVC?CW|POLY|[ABC]SPLINE|CYCLE\d+|POCKET\w*|HOLES\d+|CALL|M98)(?![A-Z_]))",
+    re.IGNORECASE,
+)
+_AXIS = re.compile(r"(?<![A-Z_$])[XYZUVWABC]\s*[-+=.\[#\d]", re.IGNORECASE)
+# codes that order no motion, those of a lathe apart that do with axis words
+_NEUTRAL = frozenset({
+    4, 7, 8, 9, 10, 11, *range(15, 24), 25, 26, *range(40, 45), 49, *range(50, 60), 61, 62, 64, 67, 68, 69,
+    *range(90, 100), 450, 451, *range(500, 604), *range(641, 647), 700, 710,
+})  # fmt: skip
+_NEUTRAL_FORMS = frozenset(
+    {10, 12, 13, 15, 28, 30, *range(40, 45), 49, 50, 51, 52, 53, 54, 59, 61, 64, 68, 69, 90, 91, 92, 96}
+)
+_CUT_WITH_AXES = frozenset({90, 92, 94})
+_ONCE = frozenset({28, 29, 30, 31, 37})  # move in their block alone: home, skip, tool length
 
 
 class BlockReader(Protocol):
@@ -38,17 +56,34 @@ class IsoBlocks:
 
     def kind(self, text: str, line: int | None) -> MoveKind | None:
         """Return what the block moves as; None without a word of its own where blocks may have been left out."""
-        numbers = [int(word[1]) for word in _G.finditer(_COMMENT.sub(" ", text)) if not word[2]]
-        words = {G_WORDS.get(number) for number in numbers if number in G_WORDS or number in _CYCLES}
+        code = _COMMENT.sub(" ", text)
+        words = [(int(word[1]), bool((word[2] or "").strip(".0"))) for word in _G.finditer(code)]
+        told = {G_WORDS.get(number) for number, form in words if number in G_WORDS and not form}
         follows = line is not None and self._line is not None and 0 <= line - self._line <= 1
-        if words:
-            self._held = words.pop() if len(words) == 1 else None
+        if _orders_another(words, code, bool(told)):
+            self._held = None
+        elif told:
+            self._held = told.pop() if len(told) == 1 else None
         elif not follows:
             self._held = None
         # a line may be told before its block: far from the last one, with the text as before
         self._line = line if follows or text != self._text else None
         self._text = text
-        return self._held
+        return None if any(number in _ONCE and not form for number, form in words) else self._held
+
+
+def _orders_another(words: Sequence[tuple[int, bool]], code: str, straight: bool) -> bool:
+    """Return whether a block has a word that orders, or may order, another motion than G0 to G3.
+
+    ``words`` are its G codes, and whether each has a digit behind its point; ``straight``: it has one of G0 to G3, with
+    which G90, G92 and G94 cut nothing.
+    """
+    cuts = not straight and _AXIS.search(code) is not None
+    for number, form in words:
+        known = number in _NEUTRAL_FORMS if form else number in _NEUTRAL or number in G_WORDS or number in _ONCE
+        if not known or (cuts and not form and number in _CUT_WITH_AXES):
+            return True
+    return _OTHERWISE.search(code) is not None
 
 
 class KlartextBlocks:

@@ -10,16 +10,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.errors import ProgramError
-from fdhil.program.motions import Motion
+from fdhil.program.dialect import Dialect
+from fdhil.program.motions import Dwell, Motion, Probe
 from fdhil.program.planner import linuxcnc
 from fdhil.program.planner.look_ahead import LookAhead
 from fdhil.program.planner.smoothing import Smoother
 from fdhil.program.planner.timeline import Timeline
+from fdhil.program.program_notes import ProgramNotes
 from fdhil.program.reach import first_beyond
 from fdhil.records import Float, Int, Trajectory, frozen, frozen_ints
 
@@ -33,7 +36,9 @@ def plan(motions: Iterable[Motion], config: MachineConfig, max_rows: int = MAX_R
     ProgramError for an axis that the machine does not have, a feed of nothing, and a duration of more than
     ``max_rows`` SYNC periods.
     """
-    return _trajectory(np.concatenate(list(_parts(motions, config, _BLOCK_ROWS, max_rows))), 0, config)
+    notes = ProgramNotes(Dialect.of(config.nc))
+    rows = np.concatenate(list(_parts(notes.watch(motions), config, _BLOCK_ROWS, max_rows)))
+    return replace(_trajectory(rows, 0, config), notes=notes.found)
 
 
 def stream(
@@ -57,10 +62,22 @@ def stream(
 
 def _parts(motions: Iterable[Motion], config: MachineConfig, block_rows: int, max_rows: float) -> Iterator[Float]:
     """Yield X, Y, Z in mm, source line and rapid (0 or 1) of the next rows, (n, 5)."""
+    motions = _stopped_at_probes(motions)
     if config.nc.profile == "linuxcnc":
         return linuxcnc.Planner(config, max_rows).parts(motions, block_rows)
     made = _smoothed if config.nc.profile == "fir" else _looked_ahead
     return made(motions, config, block_rows, max_rows)
+
+
+def _stopped_at_probes(motions: Iterable[Motion]) -> Iterator[Motion]:
+    """Yield motions with a stop before and after each probe move: an NC probes from rest, and goes on from rest."""
+    for motion in motions:
+        if isinstance(motion, Probe):
+            yield Dwell(motion.line, 0.0)
+            yield motion
+            yield Dwell(motion.line, 0.0)
+        else:
+            yield motion
 
 
 def _smoothed(motions: Iterable[Motion], config: MachineConfig, block_rows: int, max_rows: float) -> Iterator[Float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from fdhil.config import MachineConfig, PositionRange
@@ -23,6 +24,7 @@ class AxisLimits:
     jerk: Point
     dt_s: float
     ranges: tuple[PositionRange | None, ...]
+    axes: frozenset[str]
 
     @staticmethod
     def of(config: MachineConfig) -> AxisLimits:
@@ -35,7 +37,7 @@ class AxisLimits:
         speed, acceleration = each("rapid_speed_mm_s"), each("max_acceleration_mm_s2")
         dt_s, axes = config.machine.sync_period_s, config.axis
         ranges = tuple(PositionRange.of(axis, axes[axis], dt_s) if axis in axes else None for axis in "XYZ")
-        return AxisLimits(speed, acceleration, each("jerk_mm_s3"), dt_s, ranges)
+        return AxisLimits(speed, acceleration, each("jerk_mm_s3"), dt_s, ranges, frozenset(axes))
 
     def check(self, motion: Motion, start: Point) -> None:
         """Raise ProgramError for an endless feed or dwell, an axis that the machine lacks, a place beyond 32 bits."""
@@ -54,13 +56,31 @@ class AxisLimits:
                 raise ProgramError(
                     motion.line, name, f"moves axis {name}, which the configuration lacks; add [axis.{name}]"
                 )
+        for turned in motion.rotary:
+            if abs(turned.end - turned.start) > _TINY_MM:
+                raise self._not_planned(motion.line, turned.axis)
         for reach, end in zip(self.ranges, motion.end, strict=True):
             if reach is not None and not reach.fits(end):
                 raise ProgramError(motion.line, reach.axis, reach.fault(end))
 
+    def _not_planned(self, line: int, axis: str) -> ProgramError:
+        text = f"moves axis {axis}, which the configuration lacks, so that the path is unknown; add [axis.{axis}]"
+        if axis in self.axes:
+            text = f"moves axis {axis}, and fdhil plans X, Y and Z alone; record the demand with fdhil record"
+        return ProgramError(line, axis, text)
+
     def rows(self, seconds: float) -> int:
         """Return the first SYNC row that is not before a time."""
         return math.ceil(seconds / self.dt_s - TICK_TOLERANCE)
+
+
+def checked(motions: Iterable[Motion], config: MachineConfig) -> Iterator[Motion]:
+    """Yield motions that the machine can be ordered; ProgramError for the first that it cannot."""
+    limits, at = AxisLimits.of(config), (0.0, 0.0, 0.0)
+    for motion in motions:
+        limits.check(motion, at)
+        at = at if isinstance(motion, Dwell) else motion.end
+        yield motion
 
 
 def check_duration(line: int, seconds: float, most_s: float) -> None:

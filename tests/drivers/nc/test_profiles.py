@@ -176,6 +176,61 @@ def test_blocks_hold_their_word_as_far_as_none_is_left_out() -> None:
     assert [reader.kind(text, line) for text, line, _ in BLOCKS] == [kind for *_, kind in BLOCKS]
 
 
+THREADING = [  # a lathe's program: what is cut is no rapid
+    ("N10 G0 X20 Z5", 10, MoveKind.RAPID),
+    ("N11 G33 Z-20 K1.5", 11, None),
+    ("N12 Z-25", 12, None),
+    ("N13 G1 X30 F200", 13, MoveKind.FEED),
+    ("N14 G0 Z5", 14, MoveKind.RAPID),
+    ("N15 G32 Z-20 F1.5", 15, None),
+    ("N16 G0 X40", 16, MoveKind.RAPID),
+]
+
+
+def test_a_thread_ends_what_g0_ordered() -> None:
+    reader = IsoBlocks()
+    assert [reader.kind(text, line) for text, line, _ in THREADING] == [kind for *_, kind in THREADING]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "G33.1 Z-5 K1", "G34 Z-5 F1 K0.1", "G38.2 Z-5 F100", "G5 X1 Y1 I1 J1 P1 Q1", "G5.1 X1 Y1 I1 J1", "G5.2 X1 Y1",
+        "G2.3 X1 Y1", "G6.2 P4 X1", "G12 I5 F100", "G76 P010060", "G76 P1.5 Z-20 I-1 J0.2 K1", "G70 P10",
+        "G[#1] X1",
+        "G78 X20 Z-10 F1", "G92 X19 Z-20 F1.5", "G90 X18 Z-30 F0.2", "G94 X10 Z-5", "G65 P9000 X1", "G66 P9000",
+        "G73 Z-5 R1 Q1 F1", "G80", "G84.2 Z-5 R1 F1", "G187 X1", "G331 Z-5 K1", "CIP X1 Y1 I1=2 J1=3", "CYCLE83(10)",
+        "M98 P100", "G0 G33 Z-5", "G45 X1", "G63 Z-5", "G60 X1",
+    ],
+)  # fmt: skip
+def test_any_other_word_of_motion_ends_what_g0_ordered(text: str) -> None:
+    reader = IsoBlocks()
+    assert reader.kind("G0 X1", 1) is MoveKind.RAPID
+    assert [reader.kind(text, 2), reader.kind("X3", 3)] == [None, None]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "G17 G21 G40 G49 G54", "G90", "G91 X5", "G90 G0 X5", "G94 F200", "G54.1 P3", "G43 H1",
+        "G43.4 H1", "G53 G0 Z0", "G92.1", "G95 S100 M3", "G96 S200", "G4 P1", "G10 L2 P1 X0", "G64 P0.01",
+        "G500", "T1 M6",
+        "N100", "G61.1", "G99",
+    ],
+)  # fmt: skip
+def test_a_word_that_orders_no_motion_leaves_g0_in_force(text: str) -> None:
+    reader = IsoBlocks()
+    reader.kind("G0 X1", 1)
+    reader.kind(text, 2)
+    assert reader.kind("X3", 3) is MoveKind.RAPID
+
+
+def test_the_way_home_is_no_rapid_of_the_program_and_ends_none() -> None:
+    reader = IsoBlocks()
+    kinds = [reader.kind(*each) for each in (("G0 X1", 1), ("G28 Z0", 2), ("X3", 3), ("G31 Z-5 F100", 4), ("X1", 5))]
+    assert kinds == [MoveKind.RAPID, None, MoveKind.RAPID, None, MoveKind.RAPID]
+
+
 def test_a_line_and_its_block_may_be_told_one_after_the_other() -> None:
     line_first = [("G0 X1", 5), ("G0 X1", 6), ("X2", 6), ("X2", 8), ("X3", 8), ("G1 X4", 9), ("G1 X4", 11), ("X5", 11)]
     reader = IsoBlocks()

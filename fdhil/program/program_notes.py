@@ -1,0 +1,65 @@
+"""Questions what a program orders: what is unlikely is often a number that another NC reads otherwise. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from fdhil.program.dialect import Dialect
+from fdhil.program.motions import Dwell, Motion, Probe
+from fdhil.records import Reason
+
+LONG_DWELL_S = 60.0
+FAR_MM = 2000.0
+MOST_OF_A_KIND = 10
+
+
+class ProgramNotes:
+    """Collects notes while motions pass: long dwells, positions metres away, and what follows from a probe."""
+
+    def __init__(self, dialect: Dialect) -> None:
+        self._dialect = dialect
+        self._found: dict[tuple[str, int], Reason] = {}
+
+    @property
+    def found(self) -> tuple[Reason, ...]:
+        """The notes so far, in the order of the motions; ten of a kind at most."""
+        return tuple(self._found.values())
+
+    def watch(self, motions: Iterable[Motion]) -> Iterator[Motion]:
+        """Yield the motions as they are."""
+        for motion in motions:
+            if isinstance(motion, Dwell):
+                if motion.seconds > LONG_DWELL_S:
+                    self._note("LongDwell", motion.line, *self._dwell(motion.seconds))
+            else:
+                for axis, value in zip("XYZ", motion.end, strict=True):
+                    if abs(value) > FAR_MM:
+                        self._note("FarPosition", motion.line, *self._position(axis, value))
+                if isinstance(motion, Probe):
+                    self._note("UnknownAfterProbe", motion.line, *_AFTER_PROBE)
+            yield motion
+
+    def _note(self, code: str, line: int, text: str, advice: str) -> None:
+        if sum(kind == code for kind, _ in self._found) < MOST_OF_A_KIND:
+            self._found.setdefault((code, line), Reason(code, f"line {line}: {text}", advice))
+
+    def _dwell(self, seconds: float) -> tuple[str, str]:
+        unit = self._dialect.dwell_unit
+        how = "as LinuxCNC does" if unit == "s" else f'by [nc] dwell_unit = "{unit}"'
+        other = 'where the NC counts milliseconds, set [nc] dwell_unit = "ms" or "ms_without_point"'
+        text = f"the axes dwell for {seconds:g} s; P is read in {'seconds' if unit == 's' else 'that unit'}, {how}"
+        return text, other if unit == "s" else "compare it with the NC's manual"
+
+    def _position(self, axis: str, value: float) -> tuple[str, str]:
+        text = f"axis {axis} goes to {value:g} mm, farther than most machines"
+        if not self._dialect.plain:
+            return f"{text}; numbers are read by [nc] integers", "compare it with the NC's manual"
+        text += "; a number without a decimal point is read as whole units, as LinuxCNC does"
+        return text, 'where the NC counts it in thousandths, set [nc] integers = "thousandths"'
+
+
+_AFTER_PROBE = (
+    "where the probe touches is unknown: the path from there on, and all that uses #5061 to #5070, is shown as if the"
+    " probe reached its target without a touch",
+    "record the demand of a real run where the path after the probe matters",
+)
