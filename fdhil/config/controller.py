@@ -19,6 +19,12 @@ class Nc(Section):
     smoothing_s: tuple[Annotated[NotNegative, Field(le=10)], ...] = Field(
         (0.060, 0.030), max_length=4, description="fir: moving averages over each axis' demand"
     )
+    max_path_speed_mm_s: Positive = Field(
+        1e6,
+        ge=1e-3,
+        le=1e6,
+        description="largest speed along the path, rapids included (LinuxCNC: [TRAJ] MAX_LINEAR_VELOCITY); 1e6: none",
+    )
     corner: Literal["continuous", "exact_stop"] = Field(
         "continuous", description="between feed moves; look-ahead: continuous obeys G61, G61.1 and G64 P"
     )

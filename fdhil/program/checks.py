@@ -27,6 +27,11 @@ _READERS: Mapping[str, tuple[frozenset[int], frozenset[int], str]] = {
     "r": (CYCLES | _LATHE | {20, 30, 100, 760}, frozenset({19}), "G2, G3, G10 or a cycle"),
 }  # fmt: skip
 
+_CORNERING = (
+    "is of the S-curve planner of LinuxCNC 2.10, whose corners fdhil does not plan; leave R out, or "
+    "record the demand with fdhil record"
+)
+
 
 def check_readers(block: Block, motion: int | None) -> None:
     """Raise ProgramError for a letter that neither a code of the block nor its ``motion`` reads."""
@@ -35,6 +40,8 @@ def check_readers(block: Block, motion: int | None) -> None:
         if letter in _READERS:
             g, m, names = _READERS[letter]
             if motion not in g and g.isdisjoint(block.g.values()) and m.isdisjoint(block.m.values()):
+                if letter == "r" and block.g.get("path control") == 640:
+                    raise block.fault("G64 R", _CORNERING)
                 raise block.fault(letter, f"has no code that reads it; it belongs to {names}")
 
 

@@ -6,6 +6,7 @@ import hashlib
 import logging
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import IO
 
@@ -14,6 +15,7 @@ import numpy as np
 from fdhil.config import MachineConfig
 from fdhil.csv_text import check_lengths, read_content, shown, text_of
 from fdhil.errors import ConfigError, ConfigFault, ProgramError, RecordingError
+from fdhil.program.limit_notes import limit_notes
 from fdhil.program.reach import first_beyond
 from fdhil.records import Float, Trajectory, frozen, frozen_ints
 
@@ -72,7 +74,8 @@ def read_demand_csv(path: Path, config: MachineConfig, sha256: str | None = None
     if (beyond := first_beyond(position_mm, config)) is not None:
         raise RecordingError(f"{path} line {_line_of(lines, beyond.row)}: {beyond.text}")
     time_s = frozen(columns["time_s"])
-    return Trajectory(config.machine.sync_period_s, time_s, position_mm, rapid, frozen_ints(still))
+    demand = Trajectory(config.machine.sync_period_s, time_s, position_mm, rapid, frozen_ints(still))
+    return replace(demand, notes=limit_notes(demand, config))
 
 
 def _numbers(path: Path, lines: Sequence[str], names: Sequence[str]) -> Float:

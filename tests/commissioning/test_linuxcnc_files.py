@@ -33,14 +33,18 @@ MAX_VELOCITY = 500
 MAX_ACCELERATION = 1500
 [JOINT_0]
 TYPE = LINEAR
-MAX_VELOCITY = 450
+MAX_VELOCITY = 550
 MAX_ACCELERATION = 2000   # mm/s2
 FERROR = 5
 SCALE = 1000
-[JOINT_1]
+[AXIS_Y]
 MAX_VELOCITY = 300
 MAX_ACCELERATION = 1800
+[JOINT_1]
 SCALE = -819.2
+[AXIS_Z]
+MAX_VELOCITY = 100
+MAX_ACCELERATION = 500
 [JOINT_2]
 TYPE = LINEAR
 MAX_VELOCITY = 100
@@ -73,12 +77,14 @@ def test_a_machine_is_read(tmp_path: Path) -> None:
         "machine.name": "Mill No 3",
         "machine.sync_period_s": 0.002,
         "nc.profile": "linuxcnc",
+        "nc.max_path_speed_mm_s": 400.0,
         "axis.X.rapid_speed_mm_s": 400.0,
         "axis.X.max_acceleration_mm_s2": 1500.0,
         "axis.X.drive.following_error_window_mm": 5.0,
         "axis.Y.rapid_speed_mm_s": 300.0,
         "axis.Y.max_acceleration_mm_s2": 1800.0,
         "axis.Z.rapid_speed_mm_s": 100.0,
+        "axis.Z.max_acceleration_mm_s2": 500.0,
     }
     assert {axis: (scale.increments_per_mm, scale.source) for axis, scale in found.scales.items()} == {
         "X": (1000.0, "LinuxCNC: cia402.0.pos-scale"),
@@ -98,15 +104,22 @@ def test_inches_become_millimetres(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("COORDINATES = X Y Z", "COORDINATES = X Y Y", "axis Y has joint 2 besides joint 1 (a gantry)"),
-        ("COORDINATES = X Y Z", "COORDINATES = X Y A", "axis A (joint 2) is rotary"),
+        ("KINEMATICS = trivkins", "KINEMATICS = trivkins coordinates=xyy", "axis Y has joint 2 besides joint 1"),
+        ("KINEMATICS = trivkins", "KINEMATICS = trivkins coordinates=XYA", "axis A (joint 2) is rotary"),
+        ("COORDINATES = X Y Z", "COORDINATES = X Y B", "axis B is joint 4 of trivkins without coordinates=, and there"),
+        ("[AXIS_Z]\nMAX_VELOCITY = 100", "[AXIS_Z]", "axis Z: [AXIS_Z] has no MAX_VELOCITY, so that LinuxCNC takes 1"),
+        ("MAX_VELOCITY = 550", "MAX_VELOCITY = 450", "does not keep it in programmed moves; make both equal"),
+        ("FERROR = 5", "FERROR = 5\n[AXIS_X]\nMAX_VELOCITY = 9", "[AXIS_X] stands in the INI again"),
+        ("COORDINATES = X Y Z", "COORDINATES = X Y Z\nPLANNER_TYPE = 1\nMAX_LINEAR_JERK = 9000", "S-curve planner of"),
+        ("COORDINATES = X Y Z", "COORDINATES = X Y Z\nPLANNER_TYPE = 1\nMAX_LINEAR_JERK = 0.5", "trapezoidal planner"),
+        ("COORDINATES = X Y Z", "COORDINATES = X Y Z\nPLANNER_TYPE = 7", "PLANNER_TYPE 7 is unknown"),
         ("KINEMATICS = trivkins", "KINEMATICS = xyzac-trt-kins", "takes each joint for the axis of its place"),
         ("FERROR = 5", "FERROR = 5\nBACKLASH = 0.02", "leave that on: fdhil sees it in the demand"),
         ("FERROR = 5", "FERROR = 5\nMIN_FERROR = 0.1", "an offset is a following error to LinuxCNC"),
         ("[AXIS_X]", "[AXIS_X]\nOFFSET_AV_RATIO = 0.2", "keep them off while a correction is armed"),
         (
-            "[JOINT_1]",
-            "MIN_LIMIT=-9\nMAX_LIMIT=300\n[AXIS_X]\nMAX_LIMIT=250\n[JOINT_1]",
+            "[JOINT_0]",
+            "MAX_LIMIT=250\n[JOINT_0]\nMIN_LIMIT=-9\nMAX_LIMIT=300",
             "lets go X -9 to 250 mm: give",
         ),
         ("HALFILE = drives.hal", "HALFILE = drives.tcl", "HALFILE drives.tcl was not read"),
@@ -116,6 +129,102 @@ def test_inches_become_millimetres(tmp_path: Path) -> None:
 def test_what_matters_beside_fdhil_is_noted(old: str, new: str, words: str, tmp_path: Path) -> None:
     (note,) = machine(tmp_path, INI.replace(old, new)).notes
     assert words in note
+
+
+CASE = """
+[TRAJ]
+COORDINATES=X Y Z
+LINEAR_UNITS=mm
+{traj}
+[KINS]
+KINEMATICS=trivkins coordinates=xyz
+[AXIS_X]
+{x}
+MAX_VELOCITY=100
+MAX_ACCELERATION=2000
+[AXIS_Y]
+{y}
+MAX_VELOCITY=100
+MAX_ACCELERATION=2000
+[AXIS_Z]
+MAX_VELOCITY=100
+MAX_ACCELERATION=2000
+[JOINT_0]
+MAX_VELOCITY=100
+[JOINT_1]
+MAX_VELOCITY=100
+[JOINT_2]
+MAX_VELOCITY=100
+"""
+
+
+@pytest.mark.parametrize(
+    ("traj", "x", "y", "limits"),
+    [  # path, then speed and acceleration of X and Y that LinuxCNC 2.9 reaches with these files
+        ("MAX_LINEAR_VELOCITY=100", "", "", (100.0, 100.0, 2000.0, 100.0, 2000.0)),
+        ("MAX_LINEAR_VELOCITY=100\nMAX_LINEAR_ACCELERATION=100", "", "", (100.0, 100.0, 2000.0, 100.0, 2000.0)),
+        (
+            "MAX_LINEAR_VELOCITY=1000",
+            "OFFSET_AV_RATIO=0.2",
+            "OFFSET_AV_RATIO=0.95",
+            (1000.0, 80.0, 1600.0, 90.0, 1800.0),
+        ),
+        ("", "OFFSET_AV_RATIO=-0.5", "OFFSET_AV_RATIO=0.9", (None, 90.0, 1800.0, 10.0, 200.0)),
+        ("MAX_VELOCITY=50", "[AXIS_W]", "", (None, 1.0, 1.0, 100.0, 2000.0)),
+    ],
+)
+def test_the_limits_are_those_that_linuxcnc_keeps(
+    traj: str, x: str, y: str, limits: tuple[float | None, ...], tmp_path: Path
+) -> None:
+    found = told(machine(tmp_path, CASE.format(traj=traj, x=x, y=y)))
+    keys = ["nc.max_path_speed_mm_s"]
+    keys += [f"axis.{axis}.{key}" for axis in "XY" for key in ("rapid_speed_mm_s", "max_acceleration_mm_s2")]
+    assert [found.get(key) for key in keys] == pytest.approx(list(limits))
+
+
+def test_trivkins_without_coordinates_numbers_its_joints_by_the_alphabet_of_axes(tmp_path: Path) -> None:
+    found = machine(tmp_path, INI.replace("COORDINATES = X Y Z", "COORDINATES = Z X").replace("SCALE = -819.2", ""))
+    assert found.axes == ("X", "Z")
+    assert "axis.Y.rapid_speed_mm_s" not in told(found)
+    assert told(found)["axis.Z.rapid_speed_mm_s"] == 100.0
+
+
+def test_the_s_curve_planner_is_planned_with_its_jerk(tmp_path: Path) -> None:
+    curved = INI.replace("COORDINATES", "PLANNER_TYPE = 1\nMAX_LINEAR_JERK = 9000\nCOORDINATES")
+    found = told(machine(tmp_path, curved))
+    assert found["nc.profile"] == "jerk_limited"
+    assert [found[f"axis.{axis}.max_jerk_mm_s3"] for axis in "XYZ"] == [9000.0] * 3
+    weak = told(machine(tmp_path, curved.replace("9000", "0.9")))
+    assert weak["nc.profile"] == "linuxcnc"
+    assert "axis.X.max_jerk_mm_s3" not in weak
+
+
+ADDER = "loadrt sum2 names=sum2.y,sum2.x\nnet y-cmd joint.1.motor-pos-cmd => sum2.y.in0\n"
+ADDER += "net more sum2.y.in1 sum2.x.in1\nnet y-sum sum2.y.out => limit.y.in\nnet y-lim limit.y.out => y-pid.command\n"
+ADDER += "net x-sum sum2.x.out => x-pid.command\n"
+
+
+@pytest.mark.parametrize(
+    ("hal", "loop"),
+    [
+        ("loadrt pid names=x-pid,y-pid\nnet y joint.1.motor-pos-cmd => y-pid.command\n", "y-pid"),
+        ('loadrt pid names="y.loop"\nnet y joint.1.motor-pos-cmd => y.loop.command\n', "y.loop"),
+        ("loadrt pid count=2\nnet y joint.1.motor-pos-cmd => pid.1.command\n", "pid.1"),
+        ("loadrt at_pid names=servo\nnet y joint.1.motor-pos-cmd => servo.command\n", "servo"),
+        ("newinst pid y-loop\nnet y joint.1.motor-pos-cmd => y-loop.command\n", "y-loop"),
+        ("loadrt pid names=x-pid,y-pid\n" + ADDER, "y-pid"),
+    ],
+)
+def test_a_position_loop_is_found_under_any_name_and_behind_a_chain(hal: str, loop: str, tmp_path: Path) -> None:
+    (note,) = machine(tmp_path, drives=HAL_TEXT + hal).notes
+    assert note.startswith(f"axis Y: HAL's {loop} closes the position loop")
+
+
+def test_a_loop_that_the_command_does_not_reach_is_no_position_loop(tmp_path: Path) -> None:
+    """A spindle's, and one that is fed by the position only."""
+    hal = "loadrt pid names=spindle,other\nnet s motion.spindle-speed-out => spindle.command\n"
+    hal += "net y joint.1.motor-pos-cmd => sum2.y.in0\nnet fb sum2.y.out => other.feedback\n"
+    assert machine(tmp_path, drives=HAL_TEXT + hal).notes == []
 
 
 def test_a_position_loop_in_hal_is_noted_with_its_gains(tmp_path: Path) -> None:

@@ -266,3 +266,8 @@ def test_a_called_block_that_there_is_not_is_told_by_its_number() -> None:
     """As it was written, and without the name that fdhil has for such a block."""
     with pytest.raises(ProgramError, match="line 1, 'O99': is called and stands nowhere"):
         run("M98 P99", "M2")
+
+
+def test_the_cornering_of_the_s_curve_planner_is_refused_by_its_name() -> None:
+    with pytest.raises(ProgramError, match=r"line 1, 'G64 R': is of the S-curve planner of LinuxCNC 2\.10"):
+        list(interpret(["G64 P0.01 R2", "G0 X1"]))

@@ -10,7 +10,7 @@ import pytest
 
 from fdhil.config import MachineConfig, parse
 from fdhil.errors import ProgramError
-from fdhil.program import Arc, Dwell, Feed, Motion, Rapid, plan
+from fdhil.program import Arc, Dwell, Feed, Motion, Rapid, interpret, plan
 from fdhil.program.planner import stream
 from tests.bench import bench_config, bench_document
 
@@ -161,3 +161,24 @@ def test_helices_and_spirals_end_where_they_are_told() -> None:
     assert end == pytest.approx([10.001, 0.0, 5.0], abs=1e-9)
     angle = np.unwrap(np.arctan2(reference.position_mm["Y"], reference.position_mm["X"]))[300:]
     assert angle[-1] == pytest.approx(-6 * math.pi, abs=1e-6)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize(
+    ("text", "most", "linuxcnc_s"),
+    [  # what LinuxCNC 2.9 takes with [TRAJ] MAX_LINEAR_VELOCITY at this speed, run headless
+        ("G0 X150 Y150", 100.0, 2.195),
+        ("G64 P0.1|G1 X60 Y60 F12000|X120 Y0", 80.0, 2.204),
+        ("G64 P0.1|G1 F12000|G2 X40 I20|G3 X80 I20|G1 X120", 60.0, 2.841),
+    ],
+)
+def test_the_path_is_run_no_faster_than_the_nc_allows(profile: str, text: str, most: float, linuxcnc_s: float) -> None:
+    document = bench_document("XYZ")
+    document["nc"] = {"profile": profile, "max_path_speed_mm_s": most, "end_rest_s": 0.0}
+    for axis in document["axis"].values():
+        axis |= {"rapid_speed_mm_s": 100.0, "max_acceleration_mm_s2": 2000.0}
+    step_mm = np.linalg.norm(np.diff(plan(list(interpret(text.split("|"))), parse(document)).path_mm, axis=0), axis=1)
+    assert step_mm.max() / 0.001 == pytest.approx(most, rel=1e-3)
+    moving = np.flatnonzero(step_mm > 0.0)
+    if profile == "linuxcnc":
+        assert (moving[-1] - moving[0] + 2) * 0.001 == pytest.approx(linuxcnc_s, abs=0.005)

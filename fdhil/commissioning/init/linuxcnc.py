@@ -1,7 +1,9 @@
 """Takes from a LinuxCNC machine's own INI and HAL files what a configuration needs: axes, speeds, scales, the period.
 
-Units: the INI's own ([TRAJ] LINEAR_UNITS) are taken to millimetres. The smaller of [JOINT_n], [AXIS_x] and [TRAJ]
-holds, as it does in LinuxCNC's motion controller. Rotary axes and the second joint of a gantry are told and left out.
+Units: the INI's own ([TRAJ] LINEAR_UNITS) are taken to millimetres. Programmed moves keep [AXIS_x] MAX_VELOCITY and
+MAX_ACCELERATION, less the share of OFFSET_AV_RATIO, and [TRAJ] MAX_LINEAR_VELOCITY along the path; defaults are 1.
+Neither [JOINT_n] nor [TRAJ] MAX_LINEAR_ACCELERATION limits them (measured on LinuxCNC 2.9). Rotary axes and the second
+joint of a gantry are named and left out.
 """
 
 from __future__ import annotations
@@ -18,8 +20,12 @@ HAL_LIBRARY = Path("/usr/share/linuxcnc/hallib")
 MAX_BYTES = 1024 * 1024
 UNITS_MM = {"mm": 1.0, "metric": 1.0, "inch": 25.4, "in": 25.4, "imperial": 25.4}
 ROTARY = "ABC"
+ALL_AXES = "XYZABCUVW"
 _SCALE_PINS = ("position-scale", "pos-scale", "scale")
 _SCALE_KEYS = ("SCALE", "INPUT_SCALE", "ENCODER_SCALE", "STEP_SCALE")
+DEFAULT_LIMIT = 1.0  # of a speed or acceleration that the INI lacks, in its unit
+LARGEST_RATIO, REPLACED_RATIO = 0.9, 0.1  # of OFFSET_AV_RATIO: what LinuxCNC accepts, and puts in place of others
+LEAST_JERK, LARGEST_JERK = 1.0, 1e9  # of MAX_LINEAR_JERK; the latter is its default
 LARGEST_OFFSET_MM = 0.25  # the ceiling of [axis.X.correction]
 
 
@@ -98,6 +104,7 @@ def machine_of(ini: Ini, hal: Hal, path: Path) -> Machine:
         raise _fault(path, "TRAJ.COORDINATES", "names no linear axis with a joint", advice)
     machine.axes = tuple(joints)
     _common(ini, machine)
+    _planner(ini, joints, unit_mm, machine)
     for letter, joint in joints.items():
         _axis(ini, hal, letter, joint, unit_mm, machine)
     machine.notes += _travel(ini, joints, unit_mm)
@@ -130,12 +137,24 @@ def _joints(ini: Ini, notes: list[str]) -> dict[str, int]:
     """Return the joint of each linear axis."""
     kinematics = ini.text("KINS", "KINEMATICS").split()
     told = next((word[12:] for word in kinematics if word.lower().startswith("coordinates=")), "")
-    letters = "".join((told or ini.text("TRAJ", "COORDINATES")).upper().split())
+    named = "".join(ini.text("TRAJ", "COORDINATES").upper().split())
+    letters = told.upper() or named
+    numbered = list(enumerate(letters))
+    if kinematics and kinematics[0] == "trivkins" and not told:
+        numbered = [(joint, letter) for joint, letter in enumerate(ALL_AXES) if letter in named]
+        for joint, letter in numbered:
+            if f"JOINT_{joint}" not in ini.sections:
+                notes.append(
+                    f"axis {letter} is joint {joint} of trivkins without coordinates=, and there is no "
+                    f"[JOINT_{joint}]: left out; for another number write KINEMATICS = trivkins coordinates={named}"
+                )
     if kinematics and kinematics[0] != "trivkins":
         notes.append(f"KINEMATICS {kinematics[0]}: fdhil takes each joint for the axis of its place in {letters}")
     joints: dict[str, int] = {}
-    for joint, letter in enumerate(letters):
+    for joint, letter in numbered:
         section = f"JOINT_{joint}"
+        if section not in ini.sections:
+            continue
         if letter in ROTARY or ini.text(section, "TYPE").upper() == "ANGULAR":
             notes.append(f"axis {letter} (joint {joint}) is rotary and left out: fdhil knows linear feed drives")
         elif letter in joints:
@@ -143,7 +162,7 @@ def _joints(ini: Ini, notes: list[str]) -> dict[str, int]:
                 f"axis {letter} has joint {joint} besides joint {joints[letter]} (a gantry); it is left out: "
                 "give its drive an axis of its own, by another letter, to watch it; correct none of the two"
             )
-        elif letter.isalpha() and letter.isascii() and section in ini.sections:
+        elif letter.isalpha() and letter.isascii():
             joints[letter] = joint
     return joints
 
@@ -154,20 +173,70 @@ def _common(ini: Ini, machine: Machine) -> None:
     period_ns = ini.number("EMCMOT", "SERVO_PERIOD")
     if period_ns:
         machine.told["machine.sync_period_s"] = Told(rounded(period_ns * 1e-9), "LinuxCNC: [EMCMOT] SERVO_PERIOD")
-    machine.told["nc.profile"] = Told("linuxcnc", "LinuxCNC plans the moves")
+    machine.notes += [f"[{name}] stands in the INI again: LinuxCNC reads the first one alone" for name in ini.repeated]
+
+
+def _planner(ini: Ini, joints: Mapping[str, int], unit_mm: float, machine: Machine) -> None:
+    """Take the planner: LinuxCNC's trapezoidal one, or for PLANNER_TYPE 1 of 2.10 the nearest that fdhil has."""
+    told, path = machine.told, ini.number("TRAJ", "MAX_LINEAR_VELOCITY")
+    if path is not None and path > 0:
+        told["nc.max_path_speed_mm_s"] = Told(rounded(path * unit_mm), "LinuxCNC: [TRAJ] MAX_LINEAR_VELOCITY")
+    told["nc.profile"] = Told("linuxcnc", "LinuxCNC plans the moves")
+    kind, jerk = ini.text("TRAJ", "PLANNER_TYPE"), ini.number("TRAJ", "MAX_LINEAR_JERK")
+    if finite(kind) in (None, 0.0):
+        return
+    if finite(kind) != 1.0:
+        machine.notes.append(f"[TRAJ] PLANNER_TYPE {kind[:20]} is unknown; fdhil plans as the trapezoidal planner (0)")
+        return
+    jerk = LARGEST_JERK if jerk is None else jerk
+    if jerk < LEAST_JERK:
+        machine.notes.append(
+            f"[TRAJ] PLANNER_TYPE 1 needs MAX_LINEAR_JERK of {LEAST_JERK:g} or more, and it is {jerk:g}: LinuxCNC "
+            "plans with the trapezoidal planner (0), and so does fdhil"
+        )
+        return
+    told["nc.profile"] = Told("jerk_limited", "LinuxCNC: [TRAJ] PLANNER_TYPE 1, the S-curve planner of 2.10")
+    for letter in joints:
+        source = "LinuxCNC: [TRAJ] MAX_LINEAR_JERK"
+        told[f"axis.{letter}.max_jerk_mm_s3"] = Told(rounded(min(jerk * unit_mm, LARGEST_JERK)), source)
+    machine.notes.append(
+        "[TRAJ] PLANNER_TYPE 1: the S-curve planner of LinuxCNC 2.10 is planned with profile jerk_limited, which keeps "
+        "the same jerk, but blends corners otherwise; judge programs by a recorded demand (fdhil record): "
+        "where the planner exceeds the axes' limits, predict reports it"
+    )
+
+
+def _limit(ini: Ini, letter: str, joint: int, name: str, machine: Machine) -> tuple[float, str]:
+    """Return what [AXIS_x] lets programmed moves have of speed or acceleration, in the INI's unit, and its source."""
+    section = f"AXIS_{letter}"
+    given = ini.number(section, name)
+    value, source = DEFAULT_LIMIT if given is None or given <= 0 else given, f"LinuxCNC: [{section}] {name}"
+    if given is None:
+        source = f"LinuxCNC's default: [{section}] has no {name}"
+        machine.notes.append(f"axis {letter}: [{section}] has no {name}, so that LinuxCNC takes {DEFAULT_LIMIT:g} unit")
+    ratio = ini.number(section, "OFFSET_AV_RATIO") or 0.0
+    if not 0.0 <= ratio <= LARGEST_RATIO:
+        ratio = REPLACED_RATIO
+    if ratio:
+        source += f", less the share {ratio:g} of its OFFSET_AV_RATIO"
+    of_joint = ini.number(f"JOINT_{joint}", name)
+    if of_joint is not None and 0 < of_joint < value:
+        machine.notes.append(
+            f"axis {letter}: [JOINT_{joint}] {name} is {of_joint:g}, less than {value:g} of [{section}]: LinuxCNC does "
+            "not keep it in programmed moves; make both equal"
+        )
+    return value * (1.0 - ratio), source
 
 
 def _axis(ini: Ini, hal: Hal, letter: str, joint: int, unit_mm: float, machine: Machine) -> None:
     told, here = machine.told, f"axis.{letter}"
-    for key, name, path_name in (
-        ("rapid_speed_mm_s", "MAX_VELOCITY", "MAX_LINEAR_VELOCITY"),
-        ("max_acceleration_mm_s2", "MAX_ACCELERATION", "MAX_LINEAR_ACCELERATION"),
-    ):
-        places = ((f"JOINT_{joint}", name), (f"AXIS_{letter}", name), ("TRAJ", path_name))
-        found = [(value, place) for place in places if (value := ini.number(*place)) is not None and value > 0]
-        if found:
-            value, (section, used) = min(found, key=lambda one: one[0])
-            told[f"{here}.{key}"] = Told(rounded(value * unit_mm), f"LinuxCNC: [{section}] {used}")
+    path = ini.number("TRAJ", "MAX_LINEAR_VELOCITY")
+    value, source = _limit(ini, letter, joint, "MAX_VELOCITY", machine)
+    if path is not None and 0 < path < value:  # a move of this axis alone is no faster
+        value, source = path, "LinuxCNC: [TRAJ] MAX_LINEAR_VELOCITY"
+    told[f"{here}.rapid_speed_mm_s"] = Told(rounded(value * unit_mm), source)
+    value, source = _limit(ini, letter, joint, "MAX_ACCELERATION", machine)
+    told[f"{here}.max_acceleration_mm_s2"] = Told(rounded(value * unit_mm), source)
     ferror = ini.number(f"JOINT_{joint}", "FERROR")
     if ferror is not None and ferror > 0:
         source = f"LinuxCNC: [JOINT_{joint}] FERROR; the drive's own 0x6065 is compared by fdhil check"
@@ -201,13 +270,13 @@ def _beside(ini: Ini, hal: Hal, letter: str, joint: int, unit_mm: float) -> Iter
             f"axis {letter}: LinuxCNC compensates backlash or the screw ([{section}] BACKLASH, COMP_FILE); leave that "
             "on: fdhil sees it in the demand, and judges programs by a recorded demand (fdhil record)"
         )
-    if (ini.number(f"AXIS_{letter}", "OFFSET_AV_RATIO") or 0.0) > 0:
+    if ini.number(f"AXIS_{letter}", "OFFSET_AV_RATIO"):
         yield (
-            f"axis {letter}: external offsets are allowed ([AXIS_{letter}] OFFSET_AV_RATIO); keep them off while a "
-            "correction is armed: the path would not be the one that was checked, and the guard refuses it"
+            f"axis {letter}: external offsets are allowed ([AXIS_{letter}] OFFSET_AV_RATIO), and take their share of "
+            "speed and acceleration from every program, used or not; keep them off while a correction is "
+            "armed: the path would not be the one that was checked, and the guard refuses it"
         )
-    loops = [name for name in hal.around(f"joint.{joint}.motor-pos-cmd") if name.startswith("pid.")]
-    for loop in loops:
+    for loop in hal.loops_behind(f"joint.{joint}.motor-pos-cmd"):
         gains = _gains(hal.given, loop)
         yield (
             f"axis {letter}: HAL's {loop} closes the position loop ({gains}); fdhil corrects drives that get position "

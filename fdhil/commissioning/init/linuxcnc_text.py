@@ -7,11 +7,16 @@ that are set and the pins that each signal joins.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 _SUBSTITUTE = re.compile(r"\[(\w+)\]\(?(\w+)\)?")
 _HAL_ARROWS = frozenset({"=>", "<=", "<=>"})
+
+_PIDS = {"pid": "pid", "at_pid": "pid"}  # component, and what its numbered instances are called
+_DEFAULT_LOOPS, _MOST_LOOPS = 3, 16
+_OUTPUT = re.compile(r"out|sum|result|pos-cmd")
+_ENDS = frozenset({"joint", "axis", "motion", "halui", "ini"})  # they belong to LinuxCNC itself
 
 Read = Callable[[str], str]
 """Return the text of a file that another one names; OSError or ValueError where it cannot be read."""
@@ -19,9 +24,13 @@ Read = Callable[[str], str]
 
 @dataclass(frozen=True, slots=True)
 class Ini:
-    """Sections of keys, in the order of the file; a key may come several times."""
+    """Sections of keys, in the order of the file; a key may come several times.
+
+    ``repeated`` are the sections that stand in the file again, which LinuxCNC never reads.
+    """
 
     sections: Mapping[str, Mapping[str, tuple[str, ...]]]
+    repeated: tuple[str, ...] = ()
 
     def all(self, section: str, key: str) -> tuple[str, ...]:
         """Return every value of a key; empty where there is none."""
@@ -53,14 +62,19 @@ def parse_ini(text: str, read: Read) -> Ini:
     """Parse an INI file and those that it includes (``#INCLUDE file``); what is no section and no key is left out."""
     sections: dict[str, dict[str, tuple[str, ...]]] = {}
     current: dict[str, tuple[str, ...]] = {}
+    repeated: dict[str, None] = {}
     for line in _included(text, read):
         line = line.strip()
         if line.startswith("[") and "]" in line:
-            current = sections.setdefault(line[1 : line.index("]")].strip(), {})
+            name, current = line[1 : line.index("]")].strip(), {}
+            if name in sections:
+                repeated[name] = None
+            else:
+                sections[name] = current
         elif "=" in line and line[0] not in "#;":
             key, _, value = line.partition("=")
             current[key.strip()] = (*current.get(key.strip(), ()), value.strip())
-    return Ini(sections)
+    return Ini(sections, tuple(repeated))
 
 
 def _included(text: str, read: Read, depth: int = 0) -> Iterator[str]:
@@ -81,10 +95,11 @@ def _joined(text: str) -> Iterator[str]:
 
 @dataclass(slots=True)
 class Hal:
-    """Parameters that are set, and the pins that each signal joins."""
+    """Parameters that are set, the pins that each signal joins, and the components that are PID loops."""
 
     given: dict[str, str] = field(default_factory=dict)
     nets: dict[str, set[str]] = field(default_factory=dict)
+    loops: set[str] = field(default_factory=set)
 
     def joined(self, pin: str) -> list[str]:
         """Return the other pins on a pin's signal, in alphabetical order."""
@@ -93,6 +108,26 @@ class Hal:
     def around(self, pin: str) -> list[str]:
         """Return the components (with their instance) whose pins are on a pin's signal."""
         return list(dict.fromkeys(other.rpartition(".")[0] for other in self.joined(pin)))
+
+    def loops_behind(self, pin: str) -> list[str]:
+        """Return the PID loops that a pin commands, straight or through a chain of components (adders, limits, ...)."""
+        found: dict[str, None] = {}
+        waiting, seen = [pin], {pin}
+        while waiting:
+            for other in self.joined(waiting.pop()):
+                component, _, name = other.rpartition(".")
+                if component in self.loops or component.startswith("pid."):
+                    if name == "command":
+                        found[component] = None
+                elif component.partition(".")[0] not in _ENDS:
+                    waiting += [out for out in self._outputs(component) if out not in seen]
+                    seen.update(waiting)
+        return sorted(found)
+
+    def _outputs(self, component: str) -> list[str]:
+        """Return the wired pins of a component that hand on what it was given, by their names."""
+        pins = [pin.rpartition(".") for pins in self.nets.values() for pin in pins]
+        return sorted(f"{owner}.{name}" for owner, _, name in pins if owner == component and _OUTPUT.match(name))
 
 
 def parse_hal(text: str, ini: Ini, read: Read, hal: Hal, depth: int = 0) -> None:
@@ -109,8 +144,22 @@ def parse_hal(text: str, ini: Ini, read: Read, hal: Hal, depth: int = 0) -> None
                 hal.nets.setdefault(signal, set()).update(pin for pin in pins if pin not in _HAL_ARROWS)
             case ["linkps", pin, *rest] if signals := [word for word in rest if word not in _HAL_ARROWS]:
                 hal.nets.setdefault(signals[0], set()).add(pin)
+            case ["loadrt" | "newinst", name, *arguments] if name in _PIDS:
+                hal.loops.update(_instances(name, arguments))
             case ["source", name] if depth < 8:
                 parse_hal(read(name), ini, read, hal, depth + 1)
+
+
+def _instances(name: str, arguments: Sequence[str]) -> Iterator[str]:
+    """Yield the names of the components that a ``loadrt`` (or Machinekit's ``newinst``) makes."""
+    for argument in arguments:
+        key, equals, value = argument.replace('"', "").partition("=")
+        if key == "names" or not equals:
+            yield from (value or key).split(",")
+        elif key in ("count", "num_chan") and value.isdecimal():
+            yield from (f"{_PIDS[name]}.{number}" for number in range(min(int(value), _MOST_LOOPS)))
+    if not arguments:
+        yield from (f"{_PIDS[name]}.{number}" for number in range(_DEFAULT_LOOPS))
 
 
 def _substituted(line: str, ini: Ini) -> str:

@@ -25,6 +25,7 @@ class AxisLimits:
     dt_s: float
     ranges: tuple[PositionRange | None, ...]
     axes: frozenset[str]
+    path_speed: float  # mm/s along the path
 
     @staticmethod
     def of(config: MachineConfig) -> AxisLimits:
@@ -37,7 +38,15 @@ class AxisLimits:
         speed, acceleration = each("rapid_speed_mm_s"), each("max_acceleration_mm_s2")
         dt_s, axes = config.machine.sync_period_s, config.axis
         ranges = tuple(PositionRange.of(axis, axes[axis], dt_s) if axis in axes else None for axis in "XYZ")
-        return AxisLimits(speed, acceleration, each("jerk_mm_s3"), dt_s, ranges, frozenset(axes))
+        return AxisLimits(
+            speed,
+            acceleration,
+            each("jerk_mm_s3"),
+            dt_s,
+            ranges,
+            frozenset(axes),
+            config.nc.max_path_speed_mm_s,
+        )
 
     def check(self, motion: Motion, start: Point) -> None:
         """Raise ProgramError for an endless feed or dwell, an axis that the machine lacks, a place beyond 32 bits."""

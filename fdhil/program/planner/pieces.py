@@ -40,6 +40,7 @@ def piece(motion: Rapid | Feed | Arc, start: Point, limits: AxisLimits) -> Row |
         min(limit / part for limit, part in zip(axes, share, strict=True) if part)
         for axes in (limits.speed, limits.acceleration, limits.jerk)
     )
+    speed = min(speed, limits.path_speed)
     if not isinstance(motion, Rapid):
         speed = min(speed, motion.feed / 60.0)
     corner = motion.corner

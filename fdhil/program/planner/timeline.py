@@ -137,6 +137,7 @@ class Timeline:
         """Return how long a rapid lasts, and its ramps: one trapezoid for all axes, so that none exceeds its limits."""
         way = [abs(b - a) for a, b in zip(self._at, motion.end, strict=True)]
         speed = min(v / w for v, w in zip(self._limits.speed, way, strict=True) if w)  # shares of the way per second
+        speed = min(speed, self._limits.path_speed / math.hypot(*way))
         acceleration = min(a / w for a, w in zip(self._limits.acceleration, way, strict=True) if w)
         ramp_s = min(speed / acceleration, 1.0 / math.sqrt(acceleration))
         span_s = 2.0 * ramp_s + max(0.0, (1.0 - acceleration * ramp_s**2) / (acceleration * ramp_s))

@@ -103,13 +103,17 @@ def segment(motion: Rapid | Feed | Arc, start: Point, limits: AxisLimits) -> Seg
         min(limit / abs(part) for limit, part in zip(axes, shape.way, strict=True) if part)
         for axes in (limits.speed, limits.acceleration)
     )
-    return _segment(motion, shape, top, acceleration, math.inf)
+    return _segment(motion, shape, (top, acceleration, math.inf), limits.path_speed)
 
 
-def _segment(motion: Rapid | Feed | Arc, shape: Shape, top: float, acceleration: float, bent: float) -> Segment:
+def _segment(
+    motion: Rapid | Feed | Arc, shape: Shape, bounds: tuple[float, float, float], path_speed: float
+) -> Segment:
+    """``bounds`` are top speed, acceleration and radius; ``path_speed`` limits what is ordered, as a feed does."""
+    top, acceleration, bent = bounds
     rapid = isinstance(motion, Rapid)
     corner = motion.corner
-    wanted = top if isinstance(motion, Rapid) else motion.feed / 60.0
+    wanted = min(top if isinstance(motion, Rapid) else motion.feed / 60.0, path_speed)
     tolerance = corner.tolerance_mm if math.isfinite(corner.tolerance_mm) else 0.0
     ending = _ENDS[corner.mode]
     return Segment(motion.line, rapid, shape, wanted, top, acceleration, bent, tolerance, ending, shape.length)
@@ -132,4 +136,4 @@ def _turn(motion: Arc, shape: Turn, limits: AxisLimits) -> Segment | None:
     top = min(top, math.sqrt(NORMAL_SHARE * acceleration * steep * radius))
     # measured: of a helix the whole rise counts, not that of a radian, so that it keeps more along the path
     bent = radius + sum(rise) ** 2 / radius if radius else _LEAST_RADIUS_MM
-    return _segment(motion, shape, top, acceleration, bent)
+    return _segment(motion, shape, (top, acceleration, bent), limits.path_speed)

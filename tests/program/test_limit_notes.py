@@ -1,0 +1,71 @@
+"""A recorded demand that exceeds the limits of its NC is reported with axis, figure and place."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil.config import MachineConfig, parse
+from fdhil.program import interpret, plan
+from fdhil.program.limit_notes import limit_notes
+from fdhil.records import Float, Reason, Trajectory, frozen, frozen_ints
+from tests.bench import bench_document
+
+PROFILES = ("trapezoidal", "jerk_limited", "linuxcnc")
+
+
+def config_of(profile: str = "linuxcnc", **nc: Any) -> MachineConfig:
+    document = bench_document("XY")
+    for axis in "XY":
+        document["axis"][axis] |= {"rapid_speed_mm_s": 100.0, "max_acceleration_mm_s2": 2000.0}
+    document["nc"] = {"profile": profile, **nc}
+    return parse(document)
+
+
+def notes_of(x_mm: Float, y_mm: Float, config: MachineConfig) -> tuple[Reason, ...]:
+    rows = np.arange(x_mm.size)
+    still = frozen_ints(np.zeros(x_mm.size))
+    position = {"X": frozen(x_mm), "Y": frozen(y_mm)}
+    return limit_notes(Trajectory(0.001, frozen(rows * 0.001), position, np.zeros(x_mm.size, np.bool_), still), config)
+
+
+def ramp(acceleration: float, top: float, rows: int = 600) -> Float:
+    """Return a demand that accelerates to a speed, in mm."""
+    speed = np.minimum(acceleration * np.arange(rows) * 0.001, top)
+    return np.asarray(np.concatenate([np.zeros(50), np.cumsum(speed * 0.001)]))
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("resolution_mm", [0.0, 20 / 65536, 0.001])
+def test_what_a_planner_makes_within_its_limits_is_not_questioned(profile: str, resolution_mm: float) -> None:
+    config = config_of(profile, max_path_speed_mm_s=90.0)
+    text = "G64 P0.05|G0 X60 Y60|G1 X120 Y0 F9000|G2 X100 Y-20 I-20|G61|G1 X0|G1 Y0"
+    planned = plan(list(interpret(text.split("|"))), config).position_mm
+    x, y = (np.round(v / resolution_mm) * resolution_mm if resolution_mm else np.array(v) for v in planned.values())
+    assert notes_of(x, y, config) == ()
+
+
+@pytest.mark.parametrize("resolution_mm", [0.0, 20 / 65536, 0.001])
+@pytest.mark.parametrize(
+    ("acceleration", "top", "words"),
+    [
+        (2600.0, 90.0, "axis Y accelerates by 26"),
+        (1500.0, 115.0, "axis Y moves at 115"),
+    ],
+)
+def test_a_demand_beyond_a_limit_is_reported(acceleration: float, top: float, words: str, resolution_mm: float) -> None:
+    y = ramp(acceleration, top)
+    y = np.round(y / resolution_mm) * resolution_mm if resolution_mm else y
+    (note,) = [n for n in notes_of(np.zeros(y.size), y, config_of()) if n.text.startswith(words)]
+    assert note.code == "DemandBeyondLimits"
+    assert ", X 0.0 Y " in note.text
+    assert notes_of(np.zeros(y.size), y, config_of("fir")) == ()
+
+
+def test_a_path_faster_than_the_nc_allows_is_reported() -> None:
+    x = ramp(1500.0, 80.0)
+    (note,) = notes_of(x, x, config_of(max_path_speed_mm_s=100.0))
+    assert note.text.startswith("the path is run at 113.")
+    assert "nc.max_path_speed_mm_s is 100" in note.text
