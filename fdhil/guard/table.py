@@ -24,6 +24,11 @@ MAX_TABLE_BYTES = 16 << 20
 MAX_HEAD_BYTES = 4096
 SEALED = fcntl.F_SEAL_SEAL | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_WRITE
 _LENGTH = struct.Struct("<I")
+_TOO_NEAR = {
+    "SoftwareLimit": "a software limit of the drive than twice the largest offset; lower max_offset_um, or move the"
+    " work away from the end",
+    "PositionRange": "the end of 32 bits than the largest offset; move the work, or coarsen the drive's increments",
+}
 
 
 Column = Collection[int]
@@ -179,18 +184,11 @@ def check_demand(travel: Travel, limits: OffsetLimits, demand: Sequence[int]) ->
     The largest offset from the ends of 32 bits (``PositionRange``), twice that from the software limits
     (``SoftwareLimit``).
     """
-    if not demand:
-        return
-    lowest, highest = min(demand), max(demand)
-    if travel is not None and not (
-        travel[0] + 2 * limits.offset <= lowest and highest <= travel[1] - 2 * limits.offset
-    ):
-        text = "the path comes nearer to a software limit of the drive than twice the largest offset"
-        raise TableRefused("SoftwareLimit", f"{text}; lower max_offset_um, or move the work away from the end")
-    low, high = target_range(limits.offset)
-    if not (low <= lowest and highest <= high):
-        text = "the path comes nearer to the end of the drive's 32 bit positions than the largest offset"
-        raise TableRefused("PositionRange", f"{text}; move the work, or set the drive to coarser increments")
+    room = limits.offset
+    ends = [("SoftwareLimit", travel[0] + 2 * room, travel[1] - 2 * room)] if travel is not None else []
+    for code, low, high in (*ends, ("PositionRange", *target_range(room))):
+        if demand and not (low <= min(demand) and max(demand) <= high):
+            raise TableRefused(code, f"the path comes nearer to {_TOO_NEAR[code]}")
 
 
 @dataclass(slots=True)
