@@ -158,11 +158,11 @@ class Machine:
             if letter in block.words or abs(end - start) > _TINY_MM
         )
 
-    def probe_to(self, block: Block, target: list[float]) -> None:
-        """Order a probe's move to a position in active co-ordinates, at the feed in force."""
+    def probe_to(self, block: Block, target: list[float], feed: float) -> None:
+        """Order a probe's move to a position in active co-ordinates at ``feed`` mm/min."""
         self.modal.position = target
         end, stop = self._checked(block, target), Corner("exact_stop")
-        self._order(block, Probe(block.line, end, self.modal.feed_mm_min, stop, self._turned(block, target)))
+        self._order(block, Probe(block.line, end, feed, stop, self._turned(block, target)))
 
     def stand_at(self, block: Block, position: list[float]) -> None:
         """Be at a position without a listed motion (an operator's)."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fdhil.program.machine import Machine
 from fdhil.program.parameters import Variables
-from fdhil.program.targets import axis_words, straight_length, target
+from fdhil.program.targets import axis_words, feed_mm_min, straight_length, target
 from fdhil.program.words import Block
 
 CODES = (382, 383, 384, 385)
@@ -23,7 +23,7 @@ def probe(machine: Machine, variables: Variables, block: Block) -> None:
         raise block.fault(code, "wants the axis words of its target")
     if straight_length(modal.position, end) < _MIN_LENGTH_MM:
         raise block.fault(code, "starts too near to its target to probe")
-    machine.probe_to(block, end)
+    machine.probe_to(block, end, feed_mm_min(modal, block, 0.0))
     for axis, value in enumerate(end):
         variables.store(_PROBED_FIRST + axis, value / modal.unit(axis))
     variables.store(_HIT, 0.0)

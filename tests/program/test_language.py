@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from fdhil.errors import GcodeBudget, ProgramError
-from fdhil.program import Arc, Budget, Dwell, Feed, Motion, Rapid, interpret
+from fdhil.program import Arc, Budget, Dwell, Feed, Motion, Probe, Rapid, interpret
 
 
 def ends(motions: list[Motion]) -> list[tuple[float, ...]]:
@@ -98,6 +98,16 @@ def test_splines_are_followed_within_a_micrometre() -> None:
 def test_modes_are_kept_and_restored() -> None:
     assert ends(run("M70|G20 G91|G0 X1|M72|G0 X1")) == [(25.4, 0, 0), (1, 0, 0)]
     assert ends(run("o1 sub|M73|G91|G0 X5|o1 endsub|o1 call|o1 call|G0 X1")) == [(5, 0, 0), (10, 0, 0), (1, 0, 0)]
+
+
+@pytest.mark.parametrize(
+    ("text", "feed"),
+    [("F10 G38.2 X5", 10.0), ("G20|F10 G38.3 X5", 254.0), ("G95 S100 F0.5|G38.4 X5", 50.0), ("F7 G38.5 X5|X9", 7.0)],
+)
+def test_a_probe_moves_at_its_feed_to_its_target(text: str, feed: float) -> None:
+    for motion in run(text):
+        assert isinstance(motion, Probe)
+        assert motion.feed == pytest.approx(feed)
 
 
 def test_probes_rotary_axes_and_block_delete() -> None:

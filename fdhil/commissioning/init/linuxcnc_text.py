@@ -15,7 +15,7 @@ _HAL_ARROWS = frozenset({"=>", "<=", "<=>"})
 
 _PIDS = {"pid": "pid", "at_pid": "pid"}  # component, and what its numbered instances are called
 _DEFAULT_LOOPS, _MOST_LOOPS = 3, 16
-_OUTPUT = re.compile(r"out|sum|result|pos-cmd")
+_OUTPUT = re.compile(r".*out|sum$|result$|pos-cmd$")
 _ENDS = frozenset({"joint", "axis", "motion", "halui", "ini"})  # they belong to LinuxCNC itself
 
 Read = Callable[[str], str]

@@ -19,6 +19,7 @@ from fdhil.errors import ProgramError
 from fdhil.program.dialect import Dialect
 from fdhil.program.motions import Dwell, Motion, Probe
 from fdhil.program.planner import linuxcnc
+from fdhil.program.planner.limits import checked
 from fdhil.program.planner.look_ahead import LookAhead
 from fdhil.program.planner.smoothing import Smoother
 from fdhil.program.planner.timeline import Timeline
@@ -62,7 +63,7 @@ def stream(
 
 def _parts(motions: Iterable[Motion], config: MachineConfig, block_rows: int, max_rows: float) -> Iterator[Float]:
     """Yield X, Y, Z in mm, source line and rapid (0 or 1) of the next rows, (n, 5)."""
-    motions = _stopped_at_probes(motions)
+    motions = _stopped_at_probes(checked(motions, config))
     if config.nc.profile == "linuxcnc":
         return linuxcnc.Planner(config, max_rows).parts(motions, block_rows)
     made = _smoothed if config.nc.profile == "fir" else _looked_ahead

@@ -73,10 +73,9 @@ class AxisLimits:
                 raise ProgramError(motion.line, reach.axis, reach.fault(end))
 
     def _not_planned(self, line: int, axis: str) -> ProgramError:
-        text = f"moves axis {axis}, which the configuration lacks, so that the path is unknown; add [axis.{axis}]"
-        if axis in self.axes:
-            text = f"moves axis {axis}, and fdhil plans X, Y and Z alone; record the demand with fdhil record"
-        return ProgramError(line, axis, text)
+        lacks = "" if axis in self.axes else f", which the configuration lacks: add [axis.{axis}]"
+        also = "; programs are planned in X, Y and Z, so that the path is unknown: record the demand with fdhil record"
+        return ProgramError(line, axis, f"moves axis {axis}{lacks}{also}")
 
     def rows(self, seconds: float) -> int:
         """Return the first SYNC row that is not before a time."""

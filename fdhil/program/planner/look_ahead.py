@@ -79,7 +79,6 @@ class LookAhead:
     def stretches(self, motions: Iterable[Motion]) -> Iterator[Stretch]:
         """Yield the phases of all motions, the rest before them and the settling after them."""
         for motion in motions:
-            self._limits.check(motion, self._at)
             if isinstance(motion, Dwell):
                 self._dwell(motion)
             else:

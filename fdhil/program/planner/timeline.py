@@ -104,7 +104,6 @@ class Timeline:
         goes_on = kind not in (Rapid, Dwell) and self._before not in (Rapid, Dwell) and not self._stop_always
         if self._before is not None and not goes_on:
             self._stop(self._settle_rows)
-        self._limits.check(motion, self._at)
         self._line = motion.line
         self._before = kind
         if isinstance(motion, Dwell):

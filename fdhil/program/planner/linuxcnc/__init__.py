@@ -60,7 +60,6 @@ class Planner:
     def _rows(self, motions: Iterable[Motion]) -> Iterator[Row]:
         yield (*self._at, 0, False)
         for motion in joined(motions):
-            self._limits.check(motion, self._at)
             if isinstance(motion, Dwell):
                 yield from self._run(0)
                 self._line = motion.line
