@@ -85,8 +85,9 @@ def _shared(wanted: Callable[..., int | None]) -> Callable[..., int | None]:
 def predict(asked: Asked, sensitivity: bool, tolerance_um: float | None, since: int | None) -> None:
     """Predict the path error that the drives will leave of a PROGRAM (NC program or demand CSV).
 
-    The parameters are the configuration's nominal ones unless --model or --from-history says otherwise. Exit codes: 0
-    done, 2 wrong option, model or configuration, 3 a file cannot be read or written.
+    The parameters are the configuration's nominal ones unless --model or --from-history says otherwise. A program is
+    read as LinuxCNC 2.9 reads it, or by [nc] dwell_unit and integers. Exit codes: 0 done, 2 wrong option, model or
+    configuration, 3 a file cannot be read or written.
 
     With --from-history the contour error has its standard deviation, from the parameters' covariance, and a step of an
     axis' inertia or friction is told with what it costs: since REVISION, or since before the last step. The prediction

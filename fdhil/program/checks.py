@@ -36,12 +36,12 @@ _CORNERING = (
 def check_readers(block: Block, motion: int | None) -> None:
     """Raise ProgramError for a letter that neither a code of the block nor its ``motion`` reads."""
     words = block.words
+    if "r" in words and block.g.get("path control") == 640 and _READERS["r"][0].isdisjoint(block.g.values()):
+        raise block.fault("G64 R", _CORNERING)
     for letter in words:
         if letter in _READERS:
             g, m, names = _READERS[letter]
             if motion not in g and g.isdisjoint(block.g.values()) and m.isdisjoint(block.m.values()):
-                if letter == "r" and block.g.get("path control") == 640:
-                    raise block.fault("G64 R", _CORNERING)
                 raise block.fault(letter, f"has no code that reads it; it belongs to {names}")
 
 

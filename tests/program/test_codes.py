@@ -269,5 +269,6 @@ def test_a_called_block_that_there_is_not_is_told_by_its_number() -> None:
 
 
 def test_the_cornering_of_the_s_curve_planner_is_refused_by_its_name() -> None:
-    with pytest.raises(ProgramError, match=r"line 1, 'G64 R': is of the S-curve planner of LinuxCNC 2\.10"):
-        list(interpret(["G64 P0.01 R2", "G0 X1"]))
+    for cycle in ("G80", "G81 X1 Z-1 R1"):
+        with pytest.raises(ProgramError, match=r"line 2, 'G64 R': is of the S-curve planner of LinuxCNC 2\.10"):
+            list(interpret([f"F100 {cycle}", "G64 P0.01 R2", "G0 X1"]))
