@@ -25,8 +25,7 @@ MAX_HEAD_BYTES = 4096
 SEALED = fcntl.F_SEAL_SEAL | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_WRITE
 _LENGTH = struct.Struct("<I")
 _TOO_NEAR = {
-    "SoftwareLimit": "a software limit of the drive than twice the largest offset; lower max_offset_um, or move the"
-    " work away from the end",
+    "SoftwareLimit": "a software limit of the drive than twice the largest offset; lower max_offset_um, or move work",
     "PositionRange": "the end of 32 bits than the largest offset; move the work, or coarsen the drive's increments",
 }
 
@@ -184,9 +183,8 @@ def check_demand(travel: Travel, limits: OffsetLimits, demand: Sequence[int]) ->
     The largest offset from the ends of 32 bits (``PositionRange``), twice that from the software limits
     (``SoftwareLimit``).
     """
-    room = limits.offset
-    ends = [("SoftwareLimit", travel[0] + 2 * room, travel[1] - 2 * room)] if travel is not None else []
-    for code, low, high in (*ends, ("PositionRange", *target_range(room))):
+    ends = [("SoftwareLimit", travel[0] + 2 * limits.offset, travel[1] - 2 * limits.offset)] if travel else []
+    for code, low, high in (*ends, ("PositionRange", *target_range(limits.offset))):
         if demand and not (low <= min(demand) and max(demand) <= high):
             raise TableRefused(code, f"the path comes nearer to {_TOO_NEAR[code]}")
 
@@ -219,10 +217,9 @@ class Loading:
         """Check the next rows of all axes; TableRefused with the class of the first limit that is broken."""
         first = self.joined.first
         stop = min(self.next_row + rows, self.last)
-        travels = self.travel or (None,) * len(self.limits)
-        for limits, travel, demand in zip(self.limits, travels, self.joined.demand, strict=True):
-            check_demand(travel, limits, demand[self.next_row - first : stop - first])
-        for limits, offsets in zip(self.limits, self.joined.offset, strict=True):
+        for k, limits in enumerate(self.limits):
+            demand, offsets = self.joined.demand[k][self.next_row - first : stop - first], self.joined.offset[k]
+            check_demand(self.travel[k] if self.travel else None, limits, demand)
             broken = check_rows(limits, offsets, self.next_row - first, stop - first)
             if broken is not None:
                 raise TableRefused(
