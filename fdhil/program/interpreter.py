@@ -76,10 +76,8 @@ class Interpreter:
         self._known: dict[str, Command | Line] = {}
         self._blocks = self._again = 0
         self._empty_so_far = True
-        self._percent = False
-        self._tool = False
+        self._percent = self._tool = self._ended = False
         self._pending_tool = 0.0
-        self._ended = False
 
     @property
     def files(self) -> list[tuple[Path, str]]:
