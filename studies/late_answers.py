@@ -21,7 +21,7 @@ from fdhil.config.sensors import ModbusPlace, SerialPlace
 from fdhil.drivers.can import sdo
 from fdhil.drivers.modbus import rtu_line
 from fdhil.drivers.modbus.line import Request
-from fdhil.drivers.serial import port
+from fdhil.drivers.serial import byte_stream, port
 from fdhil.errors import DeviceError
 from fdhil.sim.frame_faults import FrameFault, FrameFaults
 from fdhil.sim.wire.modbus_answers import answer, spoilt
@@ -91,7 +91,7 @@ class LatePort(port.SerialPort):
 
     def _arrive(self, data: bytes) -> None:
         self.last_ns = self._virtual.monotonic_ns()
-        self._chunks.append(port.Chunk(data, self.last_ns))
+        self._chunks.append(byte_stream.Chunk(data, self.last_ns))
         self._kept += len(data)
         self._came.set()
 
@@ -131,7 +131,7 @@ def modbus(
     with (
         patch.object(rtu_line, "SerialPort", lambda _place: wire),
         patch.object(rtu_line, "time", clock),
-        patch.object(port, "time", clock),
+        patch.object(byte_stream, "time", clock),
     ):
         run(ask(), loop)
     seen["late"], seen["spoilt"] = wire.late, wire.spoilt

@@ -106,6 +106,7 @@ def machines(draw: st.DrawFn) -> dict[str, Any]:
     return {"machine": {"name": "any"}, "axis": {"X": axis}}
 
 
+@pytest.mark.usefixtures("long_computation")
 @settings(max_examples=300, deadline=None)
 @given(machines())
 def test_ordinary_machines_are_never_doubted(machine: dict[str, Any]) -> None:

@@ -91,6 +91,7 @@ def test_a_token_with_a_flipped_bit_arms_nothing_and_is_no_traceback(tmp_path: P
     assert len(read_token(tmp_path)) <= 256
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_checked_program_with_a_flipped_bit_is_checked_again(tmp_path: Path) -> None:
     """The rows that the guard will get, and what vouches for them."""
     rows = bytes(range(256)) * 16

@@ -51,6 +51,7 @@ def make_wheel(folder: Path, says: str) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.fault("G14")
 def test_a_package_with_other_content_is_not_installed(tmp_path: Path) -> None:
     """By the very options of the Makefile and of the unit's instructions."""

@@ -123,6 +123,7 @@ def house(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("page", ["README.md", "docs/tutorial/first-identification.md"])
 def test_the_first_commands_run_as_they_stand(page: str, house: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ran = 0

@@ -26,6 +26,7 @@ def test_the_code_overview_names_what_exists() -> None:
     assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
 
 
+@pytest.mark.usefixtures("processes")
 def test_the_generated_files_are_current() -> None:
     """In a process of its own: click remembers how a command was last asked for help."""
     command = [sys.executable, str(ROOT / "docs" / "generate.py"), "--check"]
@@ -139,6 +140,7 @@ def test_the_index_of_decisions_lists_every_page_once_in_order() -> None:
         assert (folder / target).read_text("utf-8").startswith(f"# {number}. {title}")
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_the_source_archive_holds_what_is_needed_and_nothing_else(tmp_path: Path) -> None:
     archive = next(iter(SdistBuilder(str(ROOT)).build(directory=str(tmp_path))))
     with tarfile.open(archive) as opened:

@@ -40,6 +40,7 @@ def test_each_table_of_things_to_add_has_a_section() -> None:
     assert [found(r"^Line in `(\w+)`", section) for section in SECTIONS] == [(table,) for table in TABLES]
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("section", SECTIONS, ids=TABLES)
 def test_an_example_passes_the_tests_by_being_listed(section: str, copy: Path) -> None:
     table, line = found(r"^Line in `(\w+)`: `([^`]*)`", section)

@@ -66,6 +66,7 @@ def documented() -> set[str]:
     return found
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_each_refusal_tells_class_cause_and_next_action() -> None:
     short = [f"{place} {code}" for code, place, left, says in calls() if left < 0 or not says]
     assert short == []

@@ -8,6 +8,8 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
+import pytest
+
 from studies import mutants
 from studies.mutation import Mutant, function_of, of_code, of_values, put
 from studies.trial import UNCALLED, UNNOTICED
@@ -16,6 +18,7 @@ ROOT = Path(__file__).parent.parent
 LIMITS = "fdhil.guard.limits"
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_the_mistakes_of_a_module_are_those_of_its_functions_properties_tables_and_constants() -> None:
     import_module("fdhil.guard.core")  # only what is loaded is searched for who reads a table
     code = {mutant.name for mutant in of_code(LIMITS)}
@@ -43,6 +46,7 @@ def test_a_mistake_replaces_what_others_have_imported() -> None:
     assert function(5, 1, 3) == 3
 
 
+@pytest.mark.usefixtures("processes")
 def test_mistakes_are_noticed_by_tests_that_call_the_place(tmp_path: Path) -> None:
     """The study itself, on a small module: what a test calls and checks is noticed, what none calls is said so."""
     options = ["--modules", "requests", "--every", "12", "--tests", "tests/guard/test_requests.py"]

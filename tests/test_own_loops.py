@@ -35,6 +35,7 @@ def filtered() -> list[WindowOutcome]:
     return outcomes(replace(Loops(), speed_filter_s=0.001))
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_other_loops_are_named_and_then_used(filtered: list[WindowOutcome]) -> None:
     for outcome in filtered:
         assert [reason.code for reason in outcome.verdict.reasons] == [LOOPS_DIFFER]
@@ -50,6 +51,7 @@ def test_other_loops_are_named_and_then_used(filtered: list[WindowOutcome]) -> N
     assert all(outcome.verdict.accepted for outcome in again)
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_running_machine_goes_on_with_its_own_loops(filtered: list[WindowOutcome]) -> None:
     loops = OwnLoops(AXIS, SETTINGS, PERIOD_S)
     first, found = loops.analyse(filtered[0].window)

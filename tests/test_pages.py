@@ -131,6 +131,7 @@ def test_every_page_of_a_study_has_its_figures_beside_it() -> None:
     assert pages == {path.stem for path in FOLDER.glob("*.json")}
 
 
+@pytest.mark.usefixtures("processes")
 def test_figures_survive_the_file() -> None:
     assert plain({"a": (float("nan"), 1.23456789), "n": 3, "s": "R"}) == {"a": [None, 1.23457], "n": 3, "s": "R"}
     assert provenance("python -m studies.x")["versions"].startswith("Python 3.")

@@ -62,6 +62,7 @@ def test_what_it_cannot_do_fails_the_test(feed_drive_bench):
 """
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("bus", ["virtual", "hub"])
 def test_a_suite_of_somebody_else_uses_it(bus: str, pytester: pytest.Pytester) -> None:
     pytester.makepyfile(MASTER)

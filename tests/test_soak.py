@@ -34,6 +34,7 @@ def test_a_slope_is_found_within_its_interval_and_none_where_there_is_none() -> 
     assert slope(np.ones(100), time[:100]) is None
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.fault("F10")
 def test_what_a_process_uses_is_seen_from_outside() -> None:
     script = """

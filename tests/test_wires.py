@@ -21,6 +21,7 @@ def test_no_stale_or_spoilt_answer_of_a_serial_unit_is_taken() -> None:
         assert seen[kind] > 30, kind
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_answers_that_are_asked_for_again_within_noise_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rtu_line, "is_damaged", lambda *_: True)
     assert modbus(3000, 11, 2.0, wires.SPOILT, 0.3)["wrong"] > 0

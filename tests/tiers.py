@@ -21,7 +21,7 @@ SYSTEM_MARKS = ("debian", "socketcan")
 MOST_SLEEP_S = 0.1
 MOST_PROCESSOR_S = 5.0  # a guard against what grew by a factor: the slowest test needs a third of it
 STARTS_PROCESS = frozenset({"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.exec"})
-WHOLE_MODULE = re.compile(r"^pytestmark = .*(usefixtures\(\"processes\"|mark\.(debian|socketcan))", re.MULTILINE)
+WHOLE_MODULE = re.compile(r"^pytestmark = .*(\"(processes|long_computation)\"|mark\.(debian|socketcan))", re.MULTILINE)
 
 
 class AuditTrail:

@@ -217,14 +217,13 @@ class Loading:
         """Check the next rows of all axes; TableRefused with the class of the first limit that is broken."""
         first = self.joined.first
         stop = min(self.next_row + rows, self.last)
-        for k, limits in enumerate(self.limits):
-            demand, offsets = self.joined.demand[k][self.next_row - first : stop - first], self.joined.offset[k]
-            check_demand(self.travel[k] if self.travel else None, limits, demand)
+        travels = self.travel or (None,) * len(self.limits)
+        axes = zip(self.limits, travels, self.joined.demand, self.joined.offset, strict=True)
+        for limits, travel, demand, offsets in axes:
+            check_demand(travel, limits, demand[self.next_row - first : stop - first])
             broken = check_rows(limits, offsets, self.next_row - first, stop - first)
             if broken is not None:
-                raise TableRefused(
-                    broken, f"rows {self.next_row} to {stop} break the limit; plan the correction inside the limits"
-                )
+                raise TableRefused(broken, f"rows {self.next_row} to {stop} break the limit; plan within the limits")
         self.next_row = stop
 
 

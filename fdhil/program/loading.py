@@ -13,9 +13,9 @@ from fdhil.program.budget import Budget
 from fdhil.program.demand_csv import read_demand_csv, require_digest
 from fdhil.program.interpreter import Interpreter
 from fdhil.program.planner import plan
+from fdhil.program.source import MAX_BYTES
 from fdhil.records import Trajectory
 
-MAX_BYTES = 1 << 30  # ten million lines of a hundred characters
 _PIECE_BYTES = 1 << 20
 
 

@@ -18,6 +18,7 @@ from typing import IO, NamedTuple, cast
 from fdhil.errors import GcodeBudget, ProgramError
 
 _SPOOL_BYTES = 4_000_000
+MAX_BYTES = 1 << 30  # of a program that is corrected: ten million lines of a hundred characters
 _READ_AHEAD_BYTES = 1 << 18
 _MAX_KEPT = 2000
 _BYTE_ORDER_MARK = codecs.BOM_UTF8.decode("latin-1")  # editors on Windows begin a file in UTF-8 with it
@@ -35,7 +36,8 @@ class Source:
     """A program that is read line by line and can go back to a place; ProgramError when it cannot be read.
 
     ``line`` is the 1-based number of the line last read; ``folder`` is where its subroutines lie, None for an iterable.
-    ``sha256`` is the digest of the file that is open, whatever its name becomes; empty for what is no plain file.
+    ``sha256`` is the digest of the file that is open, whatever its name becomes; empty for a device and a file of more
+    than ``MAX_BYTES``.
     """
 
     __slots__ = (
@@ -68,7 +70,8 @@ class Source:
             self.name, self.folder = program.name, program.parent
             try:
                 file = self._open.enter_context(program.open("rb", buffering=_READ_AHEAD_BYTES))
-                if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                found = os.fstat(file.fileno())
+                if stat.S_ISREG(found.st_mode) and found.st_size <= MAX_BYTES:
                     digest = hashlib.sha256()
                     while piece := file.read(_READ_AHEAD_BYTES):
                         digest.update(piece)

@@ -81,11 +81,9 @@ def _jump_of_demand(evidence: Evidence, demand: Float) -> Iterator[Reason]:
     steps = np.abs(np.diff(bridged(demand)))
     row = int(np.argmax(steps))
     if steps[row] > speed_mm_s * max(LONGEST_CYCLE_S, 2.0 * window.dt_s) + resolution(demand[np.isfinite(demand)]):
-        text = (
-            f"demand jumps by {steps[row]:.4g} mm at {evidence.time_s(row):.3f} s, as after a pause or lost samples: "
-            f"the axis takes {1e3 * steps[row] / speed_mm_s:.0f} ms for that"
-        )
-        yield Reason("StuckValue", text, "check where the demand is recorded, or the object's mapping")
+        takes = f"the axis takes {1e3 * steps[row] / speed_mm_s:.0f} ms for that" if speed_mm_s else "the speed is zero"
+        text = f"demand jumps by {steps[row]:.4g} mm at {evidence.time_s(row):.3f} s, as after a pause or lost samples"
+        yield Reason("StuckValue", f"{text}: {takes}", "check where the demand is recorded, or the object's mapping")
 
 
 def copied_signals(evidence: Evidence) -> Iterator[Reason]:

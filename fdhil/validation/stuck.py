@@ -75,7 +75,7 @@ def stuck_values(evidence: Evidence) -> Iterator[Reason]:
         readings = Readings(signal, begin, end, evidence.window.dt_s)
         same = np.diff(signal.values[begin:end]) == 0.0
         held = _update_rows(same)
-        if held * readings.dt_s >= TOLD_S:
+        if held > 1 and held * readings.dt_s >= TOLD_S:
             text = (
                 f"{signal.name} changes only every {1e3 * held * readings.dt_s:.3g} ms: the samples between repeat it"
             )

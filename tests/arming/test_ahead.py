@@ -150,6 +150,7 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
+@pytest.mark.usefixtures("processes")
 async def test_it_is_armed_ahead_of_its_check_and_ends_gently_when_that_stops(
     config: MachineConfig, mill: Mill, tmp_path: Path
 ) -> None:
@@ -230,6 +231,7 @@ async def _dies_with_a_word(shop: Shop) -> None:
     assert len(shop.major()) == 2
 
 
+@pytest.mark.usefixtures("processes")
 async def test_a_place_that_is_refused_later_is_told_long_before_the_motion_reaches_it(
     config: MachineConfig, mill: Mill, tmp_path: Path
 ) -> None:
@@ -259,6 +261,7 @@ async def test_a_place_that_is_refused_later_is_told_long_before_the_motion_reac
         assert mill.state == "OFF"
 
 
+@pytest.mark.usefixtures("processes")
 async def test_a_whole_check_is_waited_for_when_it_is_asked_for(
     config: MachineConfig, mill: Mill, tmp_path: Path
 ) -> None:

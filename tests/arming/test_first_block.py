@@ -62,6 +62,7 @@ def cut(program: Path, piece: Piece, amperes: dict[str, float], config: MachineC
     return contour_error_um(reference.path_mm, np.column_stack(positions), 0.001, 0)
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("text", [LONG, SHORT])
 def test_the_error_before_the_first_corner_is_gone(text: str, tmp_path: Path) -> None:
     """Drives that stand with a current somewhere in the band of dry friction: what is left is what is left without."""
@@ -99,6 +100,7 @@ def test_rows_that_are_right_already_stay(tmp_path: Path) -> None:
     assert first.renew(resting({"X": 0.0, "Y": 0.0})) is not None  # it has moved since
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_what_the_way_to_the_start_leaves_is_expected(tmp_path: Path) -> None:
     """X comes from the positive side, Y stands there: independent drives that do so are corrected from their start."""
     program, begin = checked(tmp_path, LONG, MODELS, CONFIG)

@@ -59,6 +59,7 @@ def checked(program: Path, config: MachineConfig) -> tuple[dict[str, Any], bytes
     return header, body.getvalue(), told
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_the_rows_are_those_of_the_whole_plan(config: MachineConfig, tmp_path: Path) -> None:
     program = written(tmp_path, LONG)
     header, body, told = checked(program, config)
@@ -109,6 +110,7 @@ def hard_program() -> str:
     return "\n".join(lines) + "\n"
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_every_place_is_named_with_line_axis_figure_and_advice(config: MachineConfig, tmp_path: Path) -> None:
     sharp = config.model_copy(update={"nc": config.nc.model_copy(update={"smoothing_s": (0.02, 0.01)})})
     header, body, at_once = checked(written(tmp_path, hard_program()), sharp)
@@ -127,6 +129,7 @@ def test_a_program_without_an_error_gains_nothing(config: MachineConfig, tmp_pat
     assert [told["code"] for told in header["refused"]] == ["NoGain"]
 
 
+@pytest.mark.usefixtures("processes")
 def test_a_checked_program_is_armed_with_its_first_rows_and_goes_on(config: MachineConfig, tmp_path: Path) -> None:
     program = written(tmp_path, LONG)
     save_records(config)
@@ -179,6 +182,7 @@ async def _twice(config: MachineConfig, found: ArmRequest) -> list[CheckedProgra
     return [first, again]
 
 
+@pytest.mark.usefixtures("processes")
 async def test_an_abandoned_check_says_so_and_leaves_nothing(config: MachineConfig, tmp_path: Path) -> None:
     program = written(tmp_path, HEAD + SQUARE * 2000 + "M2\n")
     check = BackgroundCheck(config)
@@ -199,6 +203,7 @@ CALLS = HEAD + "O<square> CALL\n" * 3 + "G4 P0.3\nM2\n"
 BESIDE = "O<square> SUB\n" + SQUARE + "O<square> ENDSUB\n"
 
 
+@pytest.mark.usefixtures("processes")
 async def test_a_subroutine_beside_the_program_belongs_to_it(config: MachineConfig, tmp_path: Path) -> None:
     """The program is the same, its subroutine is not: what was checked is not what would be cut."""
     beside = tmp_path / "square.ngc"
@@ -238,6 +243,7 @@ def test_what_changes_while_it_is_checked_is_refused(which: str, config: Machine
         check(program, program_digest(program), nominal_models(config), config, io.BytesIO(), change)
 
 
+@pytest.mark.usefixtures("processes")
 async def test_a_process_that_dies_within_a_line_is_told(
     config: MachineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -248,6 +254,7 @@ async def test_a_process_that_dies_within_a_line_is_told(
     assert (refused[0].code, "exit code 9" in refused[0].text) == ("InternalError", True)
 
 
+@pytest.mark.usefixtures("processes")
 async def test_a_process_that_cannot_be_started_is_told(
     config: MachineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -259,6 +266,7 @@ async def test_a_process_that_cannot_be_started_is_told(
     await check.attend()  # it is no fault of the daemon
 
 
+@pytest.mark.usefixtures("processes")
 async def test_a_broken_program_is_refused_with_its_line_by_a_process_that_ends(
     config: MachineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -274,6 +282,7 @@ async def test_a_broken_program_is_refused_with_its_line_by_a_process_that_ends(
     assert "43" in refused[0].text
 
 
+@pytest.mark.usefixtures("processes")
 def test_the_process_ends_with_the_daemon(config: MachineConfig, tmp_path: Path) -> None:
     program = written(tmp_path, HEAD + SQUARE * 5000 + "M2\n")
     command = [sys.executable, "-m", "fdhil.arming.program_check"]
@@ -367,6 +376,7 @@ def test_a_store_that_refuses_is_told(tmp_path: Path) -> None:
         made(tmp_path / "file" / "folder", "a")
 
 
+@pytest.mark.usefixtures("processes")
 async def test_rows_of_other_terms_or_loops_are_other_rows(config: MachineConfig, tmp_path: Path) -> None:
     """A check is known by all that its rows depend on, and its process is told all of it."""
     program = written(tmp_path, HEAD + SQUARE + "G4 P0.3\nM2\n")

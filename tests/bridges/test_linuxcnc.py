@@ -80,6 +80,7 @@ def test_a_listener_that_does_not_read_is_let_go_and_holds_nobody_up() -> None:
     listeners.close()
 
 
+@pytest.mark.usefixtures("processes")
 def test_the_line_for_the_hal_file_names_the_bridge() -> None:
     done = subprocess.run([sys.executable, "-m", "fdhil.bridges"], capture_output=True, text=True, check=True)
     assert done.stdout.startswith(f"loadusr -Wn {NAME} /usr/bin/python3 /")

@@ -16,6 +16,7 @@ from tests.cli.test_predict import _bench as _bench
 from tests.cli.test_predict import invoke
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize(("tolerance", "code", "lines"), [(200, 0, 0), (60, 0, 2), (0.001, 1, 2)])
 def test_lists_the_lines_that_leave_the_tolerance(bench: Path, tolerance: float, code: int, lines: int) -> None:
     """Exit code 1 when no feed helps."""
@@ -34,6 +35,7 @@ def test_lists_the_lines_that_leave_the_tolerance(bench: Path, tolerance: float,
     assert ("line 3: F15000 -> F" in shown or "lines 2-3: F15000 -> F" in shown) == (lines > 0)
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_written_program_that_leaves_the_tolerance_is_no_yes(bench: Path) -> None:
     """The correction would hold both lines; the file has the feeds without it, and none of them does."""
     program, out = bench / "corner.ngc", bench / "slow.ngc"
@@ -59,6 +61,7 @@ def wave(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_many_lines_become_few_ranges_and_a_program_that_keeps_the_tolerance(wave: Path) -> None:
     """The new program, predicted, stays within it; without its new F words it is the old one."""
     program, out, config = wave / "wave.ngc", wave / "new.ngc", wave / "bench.toml"

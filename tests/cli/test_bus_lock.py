@@ -103,6 +103,7 @@ def test_what_lies_in_the_place_of_the_file_is_not_followed(directory: Path, tmp
     assert not (tmp_path / "elsewhere").exists()
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.skipif(os.getuid() != 0, reason="needs root, to be somebody else")
 def test_somebody_else_can_neither_lock_nor_block(directory: Path) -> None:
     """The file is out of reach, and the name that the lock once was may be taken by anyone."""
@@ -119,6 +120,7 @@ def test_somebody_else_can_neither_lock_nor_block(directory: Path) -> None:
         assert os.waitpid(child, 0)[1] == 0
 
 
+@pytest.mark.usefixtures("processes")
 def test_it_survives_an_exec(directory: Path) -> None:
     """The guard becomes another program; the lock stays until that one ends."""
     lock = lock_bus(CanBus(port=47))

@@ -113,6 +113,7 @@ def test_a_room_that_is_none_is_told(room: tuple[str, str], bench: Bench) -> Non
     assert (code, "--room wants two numbers of mm" in err) == (2, True)
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_what_was_stopped_goes_on_where_it_ended(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     def stop(*_: object) -> str:
         raise KeyboardInterrupt
@@ -149,6 +150,7 @@ def test_what_was_stopped_goes_on_where_it_ended(bench: Bench, monkeypatch: pyte
     assert (code, "kept" in out, "step 4 of 7, sign test: Moving" in out) == (0, False, True)
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_an_axis_is_tried_where_the_operator_agrees_and_known_to_the_history(bench: Bench) -> None:
     code, out, err = bench.commission(said="y\n" + "-2 130\n" + 3 * "y\n")
     assert code == 0, err
@@ -181,6 +183,7 @@ def test_an_axis_is_tried_where_the_operator_agrees_and_known_to_the_history(ben
     assert bench.peer.drive.table_mm == pytest.approx(0.0, abs=0.05)
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize(("said", "code"), [("y\n\n", 0), ("y\n-2 130\nn\n", 1), ("y\nfar\n", 1)])
 def test_who_does_not_agree_is_not_moved(said: str, code: int, bench: Bench) -> None:
     got, out, err = bench.commission(said=said)
@@ -280,6 +283,7 @@ def test_twelve_wrong_set_ups_and_more_are_tried(record_property: Callable[[str,
     record_property("goal", f"{len(WRONG)} wrong set-ups ({', '.join(WRONG)}), each refused by the command")
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.goal("R20")
 @pytest.mark.parametrize("what", WRONG)
 def test_a_wrong_set_up_is_refused(what: str, bench: Bench) -> None:

@@ -17,6 +17,8 @@ import pytest
 
 from tests.sim.twin_process import TwinProcess, write_config
 
+pytestmark = pytest.mark.usefixtures("processes")
+
 # a trial with shorter waits than on a real machine, as a process of its own
 QUICK = """
 import importlib

@@ -132,6 +132,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
         yield Bench(twin, folder)
 
 
+@pytest.mark.usefixtures("processes")
 def test_a_scan_lists_the_drives_with_their_eds(fdhil: Said, bench: Bench) -> None:
     eds = bench.twin.ready["drives"]["X"]["eds"]
     found = document(fdhil, "scan", bench.config(), "--eds", eds)
@@ -343,6 +344,7 @@ def overheard(bench: Bench) -> Iterator[list[int]]:
             notifier.stop()
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_an_axis_is_commissioned_and_signed_off(fdhil: Said, bench: Bench) -> None:
     config = bench.config("signed.toml")
     code, out, err = fdhil("commission", config, "--axis", "X", said="y\n")
@@ -357,6 +359,7 @@ def test_an_axis_is_commissioned_and_signed_off(fdhil: Said, bench: Bench) -> No
     assert (record.watchdog, record.serial, record.options["1017"]) == ("proven", 1001, 100)
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_the_document_of_a_commissioning(fdhil: Said, bench: Bench) -> None:
     config = bench.config("json.toml")
     found = document(fdhil, "commission", config, "--axis", "Y", "--yes")
@@ -377,6 +380,7 @@ def test_a_drive_that_must_not_be_used_is_refused(fdhil: Said, bench: Bench) -> 
         bench.fault(0x6007, 1)
 
 
+@pytest.mark.usefixtures("processes")
 def test_a_stopped_commissioning_leaves_the_drive_off(fdhil: Said, bench: Bench) -> None:
     lasting = QUICK.replace("'AVERAGE_CYCLES', 400", "'AVERAGE_CYCLES', 1_000_000")  # a sign test without an end
     command = [sys.executable, "-c", lasting, "commission", str(bench.config("stopped.toml")), "--axis", "X", "--yes"]

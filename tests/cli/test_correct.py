@@ -70,6 +70,7 @@ def test_text_for_people(bench: Path) -> None:
     assert "times better" not in result.stdout
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_with_a_history_a_gain_has_its_uncertainty_and_a_spread_below_the_digits_is_not_zero(bench: Path) -> None:
     """Parameters known to 1e-6 promise no more than the last moves were predicted to."""
     remember(bench, [{}], known_to=1e-6)
@@ -122,6 +123,7 @@ def test_the_default_method_is_the_best_one(bench: Path) -> None:
     assert document["delay_s"] == 0.0
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_report_shows_before_and_after(bench: Path) -> None:
     """``predict`` and ``correct`` write a page of their own."""
     for command, shown in (("predict", "predicted, RMS"), ("correct", "not known here")):

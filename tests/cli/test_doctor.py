@@ -242,6 +242,7 @@ def test_nothing_is_wrong_with_a_machine_as_it_must_be(pc: Pc) -> None:
         assert pc.examined() == (0, [])
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("plant", PLANTED, ids=lambda plant: plant.__name__)
 def test_a_planted_trouble_is_named_first(plant: Callable[..., None], pc: Pc, monkeypatch: pytest.MonkeyPatch) -> None:
     with pc.peer():
@@ -259,6 +260,7 @@ def test_what_could_be_better_comes_last_and_is_no_failure(pc: Pc, monkeypatch: 
     assert (code, [t["code"] for t in troubles]) == (0, ["BusyHost", "NotCommissioned"])
 
 
+@pytest.mark.usefixtures("processes")
 def test_a_store_that_may_not_be_entered_is_told_and_the_rest_examined(pc: Pc) -> None:
     pc.document["store"]["run_directory"] = str(pc.folder / "run")
     History.open(pc.store).close()

@@ -112,6 +112,7 @@ def test_a_history_without_an_outbox(tmp_path: Path) -> None:
     machine = recorded(tmp_path)
     change(machine, "DROP TABLE outbox")
     change(machine, "DROP TABLE outbox_of")
+    change(machine, "ALTER TABLE revisions DROP COLUMN loops")
     change(machine, "PRAGMA user_version = 6")
     assert codes(machine) == ["UplinkOutbox"]
 

@@ -99,6 +99,7 @@ def never(*_: object) -> None:
     raise AssertionError("a second guard")
 
 
+@pytest.mark.usefixtures("processes")
 def test_it_becomes_the_guard_owns_its_bus_and_stops_cleanly(
     tmp_path: Path, peer: Peer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -125,6 +126,7 @@ def test_it_becomes_the_guard_owns_its_bus_and_stops_cleanly(
     assert peer.sent == []
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
 def test_a_guard_whose_output_is_closed_says_nothing_on_the_bus(closed: str, tmp_path: Path, peer: Peer) -> None:
     """The descriptor that is free must not become the bus: the journal would be written to it."""
@@ -144,6 +146,7 @@ def test_a_guard_whose_output_is_closed_says_nothing_on_the_bus(closed: str, tmp
     assert peer.sent == []
 
 
+@pytest.mark.usefixtures("processes")
 def test_the_process_alone_refuses_what_it_cannot_use(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "fdhil.guard", "--settings", str(tmp_path / "none.json"), "--descriptor", "0"]
     refused = subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL)

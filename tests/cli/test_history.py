@@ -96,6 +96,7 @@ def test_the_date_of_a_limit_comes_with_its_interval(worn: Path, capsys: Any) ->
     assert "a changed load" in out
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_the_plot_and_the_report_show_it(worn: Path, tmp_path: Path, capsys: Any) -> None:
     assert fdhil("history", worn, "--plot", tmp_path / "plot.png", capsys=capsys)[::2] == (0, "")
     assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
@@ -106,6 +107,7 @@ def test_the_plot_and_the_report_show_it(worn: Path, tmp_path: Path, capsys: Any
         assert words in page
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_the_report_begins_with_how_the_drives_are(worn: Path, tmp_path: Path, capsys: Any) -> None:
     """What to do next, the newest values beside nominal ones, then a course of each parameter with both."""
     document = json.loads(fdhil("history", worn, "--json", capsys=capsys)[1])
@@ -141,6 +143,7 @@ def test_rapids_that_were_not_believed_are_in_the_report(tmp_path: Path, capsys:
     assert "<h2>Axis Y</h2>" in page
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_long_store_is_a_small_page(tmp_path: Path, capsys: Any) -> None:
     """Of many rapids each day's median is drawn, and where most of its estimates lie."""
     path = tmp_path / "machine.toml"

@@ -154,6 +154,7 @@ def test_one_bad_recording_does_not_end_a_batch(shuttle: Path, tmp_path: Path) -
     assert [line.split(" cannot")[0].split(":")[0] for line in shown.stderr.splitlines()] == ["fdhil", "fdhil"]
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("place", ["empty", "closed", "a" * 300])
 def test_a_bad_place_does_not_end_a_batch(place: str, shuttle: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
@@ -201,6 +202,7 @@ def test_unknown_method_is_exit_2(shuttle: Path, monkeypatch: pytest.MonkeyPatch
     assert run_safely(identify) == 2
 
 
+@pytest.mark.usefixtures("processes")
 def test_every_file_format_gives_the_same_answer(tmp_path: Path) -> None:
     table = table_of(slow_windows(0.005)[0])
     answers = []

@@ -13,6 +13,8 @@ from studies import real_plant as real
 from tests.bench import bench_toml
 from tests.identification.test_loops import shuttle
 
+pytestmark = pytest.mark.usefixtures("long_computation")
+
 
 @pytest.fixture
 def filtered(tmp_path: Path) -> Path:

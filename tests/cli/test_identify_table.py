@@ -64,6 +64,7 @@ def told(result: Result) -> dict[str, Any]:
     return dict(file)
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_an_encoder_at_the_table_tells_resonance_and_true_error(tmp_path: Path) -> None:
     config = tmp_path / "machine.toml"
     config.write_text(bench_toml("X", resonance_hz=45.0))
@@ -85,6 +86,7 @@ def test_an_encoder_at_the_table_tells_resonance_and_true_error(tmp_path: Path) 
     assert "not at 45 Hz as configured" in shown
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_printers_accelerometer_file_is_laid_beside_the_recording(tmp_path: Path) -> None:
     path = written(tmp_path, table=False)
     file = told(invoke(path, "--accelerometer", printed(tmp_path), "--json"))

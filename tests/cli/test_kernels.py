@@ -9,7 +9,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import fdhil
+
+pytestmark = pytest.mark.usefixtures("processes")
 
 ROOT = Path(fdhil.__file__).parent
 # entries are kernels that no other kernel calls; those that are called are compiled with their callers

@@ -30,6 +30,7 @@ def test_every_command_is_there_and_explains_itself(name: str) -> None:
     assert command.help
 
 
+@pytest.mark.usefixtures("processes")
 def test_help_imports_no_numerics() -> None:
     code = (
         "import sys; from fdhil.cli.main import cli; cli.main(['--help'], standalone_mode=False); print(*sys.modules)"
@@ -40,6 +41,7 @@ def test_help_imports_no_numerics() -> None:
         assert heavy not in done.stdout.split()
 
 
+@pytest.mark.usefixtures("processes")
 def test_an_unknown_command_and_option_are_usage_errors() -> None:
     assert fdhil("identfy").returncode == 2
     done = fdhil("predict", "--no-such-option")

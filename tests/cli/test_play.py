@@ -22,6 +22,8 @@ from fdhil.store import audit
 from tests.integration.conftest import sign_off
 from tests.sim.twin_process import TwinProcess, write_config
 
+pytestmark = pytest.mark.usefixtures("processes")
+
 PER_MM = 65536 / 20
 HEARTBEAT_LOST = 0x8130
 STROKE = "G21 G90 G94\nG1 X300 F1500\nM2\n"  # longer than a host is held up

@@ -17,6 +17,8 @@ from fdhil.program import load_trajectory
 from fdhil.records import Float, Trajectory
 from tests.sim.twin_process import TwinProcess, write_config
 
+pytestmark = pytest.mark.usefixtures("processes")
+
 PROGRAM = "G61 G1 X12 F6000\nG3 X24 Y12 J12\nG1 Y20\nG4 P0.2\nG0 X0 Y0\nM2\n"
 NC = '[nc]\nprofile = "jerk_limited"\n'
 

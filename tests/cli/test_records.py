@@ -144,6 +144,7 @@ def test_history_as_json_has_intervals_and_every_bit(machine: Path, capsys: Any)
     assert [row["axis"] for row in json.loads(out)["revisions"]] == ["Y"]
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_history_as_a_table_and_a_plot(machine: Path, tmp_path: Path, capsys: Any) -> None:
     code, out, err = fdhil("history", machine, "--plot", tmp_path / "plot.SVG", capsys=capsys)
     assert (code, err) == (0, "")
@@ -185,6 +186,7 @@ def test_history_of_nothing_is_told(tmp_path: Path, capsys: Any) -> None:
     assert "cannot be read" in err
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_report_is_one_page_without_anything_from_elsewhere(machine: Path, tmp_path: Path, capsys: Any) -> None:
     out = tmp_path / "report.html"
     code, _, err = fdhil("report", machine, "--out", out, capsys=capsys)

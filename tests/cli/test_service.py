@@ -147,6 +147,7 @@ def test_a_refusal_exits_1_with_class_cause_and_next_action(machine: Path, tmp_p
     assert (code, json.loads(out)) == (1, answer)
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("how", ["--json", "in words"])
 def test_a_no_that_nobody_took_is_no_yes(how: str, machine: Path) -> None:
     """What may still be applied is then known to nobody; exit code 0 would say that nothing is."""
@@ -183,6 +184,7 @@ def test_without_a_daemon_it_is_3_and_how_to_start_one(command: str, machine: Pa
     assert "fdhil run CONFIG" in err
 
 
+@pytest.mark.usefixtures("processes")
 def test_a_daemon_that_may_not_be_asked_is_not_told_to_be_away(machine: Path) -> None:
     """Who was told to start it would start another one."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as server:

@@ -188,6 +188,7 @@ def test_a_wrong_configuration_is_2(config: str, words: str, capsys: Any) -> Non
         assert words in told(capsys, USAGE, *command.split(), *given), command
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("kind", ["absent", "folder", "junk", "empty", "loop"])
 def test_a_file_that_cannot_be_read_is_3(kind: str, capsys: Any) -> None:
     for command, arguments in WITH_FILE.items():
@@ -207,6 +208,7 @@ def test_a_file_that_cannot_be_written_is_3_and_found_at_once(out: str, words: s
     assert Path("pipe").is_fifo()
 
 
+@pytest.mark.usefixtures("processes")
 def test_a_file_without_the_right_to_read_it_is_3_and_a_configuration_2() -> None:
     """In a process that has not root's way past the rights."""
     for suffix in (".toml", ".ngc", ".csv"):

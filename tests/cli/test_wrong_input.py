@@ -29,6 +29,7 @@ def assert_told(said: Said, code: int, *words: str) -> None:
         assert word in err
 
 
+@pytest.mark.usefixtures("processes")
 def test_a_wrong_config_is_told_by_the_process_itself(tmp_path: Path) -> None:
     """One process for all of it: the sentence, the exit code, JSON alone on stdout, and no advice of a library."""
     path = write_config(tmp_path)
@@ -39,6 +40,7 @@ def test_a_wrong_config_is_told_by_the_process_itself(tmp_path: Path) -> None:
     assert "finite" in json.loads(done.stdout)["error"]["text"]
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("sink", ["> /dev/full", "| head -1", ">&-"])
 def test_an_output_that_takes_nothing_is_no_traceback(sink: str, tmp_path: Path) -> None:
     """A full disk is trouble; a reader that has seen enough, or none at all, is not."""
@@ -66,6 +68,7 @@ def unread(*arguments: str | Path) -> int:
     return done.returncode
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("form", [(), ("--json",)], ids=["text", "json"])
 def test_an_answer_that_nobody_took_is_no_yes(form: tuple[str, ...], tmp_path: Path) -> None:
     """Neither where fdhil writes itself, nor where a library draws the table, which tells it in another way."""
@@ -92,6 +95,7 @@ def test_every_command_that_answers_no_by_its_exit_code_is_marked_so() -> None:
         assert marked or not answers, name
 
 
+@pytest.mark.usefixtures("processes")
 def test_a_shell_that_has_no_completion_is_no_success() -> None:
     for shell, code in (("bash", 0), ("foo", 1)):
         asked = os.environ | {"_FDHIL_COMPLETE": f"{shell}_source"}
@@ -101,6 +105,7 @@ def test_a_shell_that_has_no_completion_is_no_success() -> None:
         )
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize(
     "arguments",
     [("acceptance", "machine.toml", "--by"), ("interpret",), ("history", "machine.toml", "--json", "--axis")],
@@ -121,6 +126,7 @@ def said_by_shell(command: str, redirected: str) -> tuple[int, str]:
     return done.returncode, done.stderr
 
 
+@pytest.mark.usefixtures("processes")
 def test_a_closed_standard_input_is_one_at_its_end(tmp_path: Path) -> None:
     path = write_config(tmp_path)
     path.write_text(path.read_text() + '[web]\nusers_file = "users.json"\n')
@@ -134,6 +140,7 @@ def test_a_closed_standard_input_is_one_at_its_end(tmp_path: Path) -> None:
     assert not (tmp_path / "new.toml").exists()
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize(("command", "code"), [("interpret absent.ngc", 3), ("predict", 2), ("run absent.toml", 2)])
 def test_a_standard_error_that_takes_nothing_leaves_the_exit_code(command: str, code: int) -> None:
     assert said_by_shell(command, "2> /dev/full")[0] == code

@@ -49,6 +49,7 @@ def peer() -> Iterator[tuple[Spoilt, MachineConfig]]:
         yield running, settings
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_drive_that_takes_both_is_signed_off_with_its_cob_id(peer: tuple[Spoilt, MachineConfig]) -> None:
     drive, settings = peer
     seen: list[tuple[int, int]] = []

@@ -46,6 +46,7 @@ def enabled() -> Iterator[Enabled]:
         yield Enabled(peer, config, master)
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_an_axis_is_moved_and_held_there(enabled: Enabled) -> None:
     move([enabled.master], [enabled.bounds], enabled.way(5.0))
     enabled.master.wait_cycles(200)
@@ -69,6 +70,7 @@ def test_ctrl_c_brakes_before_it_is_raised(enabled: Enabled) -> None:
     assert enabled.peer.drive.table_mm == pytest.approx(-held / 3276.8, abs=0.01)
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_way_out_of_the_travel_is_refused(enabled: Enabled) -> None:
     with pytest.raises(DriveFault, match="could not be braked inside its travel; find the cause"):
         move([enabled.master], [enabled.bounds], enabled.way(60.0))

@@ -95,6 +95,7 @@ def floor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Iterator[Floor]
         yield Floor(tmp_path, path, config, {"X": x, "Y": y}, capsys)
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_demand_is_played_to_its_end_from_the_start_that_is_gone_to_when_asked(floor: Floor) -> None:
     time_s = np.arange(301) * 1e-3
     rows = np.column_stack([time_s, 2 + 0.5 * np.sin(np.pi * time_s / 0.3) ** 2])
@@ -114,6 +115,7 @@ def test_a_demand_is_played_to_its_end_from_the_start_that_is_gone_to_when_asked
     assert floor.sent() - DRIVES <= {0x000, 0x080, 0x601, 0x602, 0x201, 0x202, 0x765}
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_signal_brakes_the_axes_and_switches_them_off(floor: Floor) -> None:
     thread = floor.while_it_plays(lambda: os.kill(os.getpid(), signal.SIGTERM))
     code, document, _ = floor.play(SLOW, "--yes")
@@ -125,6 +127,7 @@ def test_a_signal_brakes_the_axes_and_switches_them_off(floor: Floor) -> None:
     assert 0.5 < x < 10.5
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_drive_that_trips_stops_the_others(floor: Floor) -> None:
     thread = floor.while_it_plays(lambda: floor.peers["Y"].drive.trip(0x3210))
     code, document, _ = floor.play(SLOW, "--yes")
@@ -134,6 +137,7 @@ def test_a_drive_that_trips_stops_the_others(floor: Floor) -> None:
     assert floor.off()
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.fault("A23")
 def test_a_drive_that_boots_while_it_plays_is_not_vouched_for(floor: Floor) -> None:
     """A daemon marks both: of X it heard the boot-up, of Y what play writes to it."""
@@ -189,6 +193,7 @@ def refused(floor: Floor, text: str = STROKE, *options: str) -> str:
     return str(said["refused"])
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_what_is_not_as_it_must_be_is_refused(floor: Floor, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stdin", io.StringIO())
     assert "nobody said yes" in refused(floor)

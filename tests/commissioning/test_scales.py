@@ -71,6 +71,7 @@ def test_what_the_drive_does_not_tell_is_not_compared(tmp_path: Path) -> None:
     assert "DC link" in found
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize(("millis", "ok"), [(2000, True), (3000, False)])
 def test_a_rated_torque_is_compared_where_the_current_is_a_torque(millis: int, ok: bool, tmp_path: Path) -> None:
     own = tmp_path / "own.toml"

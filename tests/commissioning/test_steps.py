@@ -50,6 +50,7 @@ def peer() -> Iterator[tuple[DrivePeer, MachineConfig]]:
         yield running, settings
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_good_drive_is_signed_off_and_left_as_it_was(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
     consumers = [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)]
@@ -72,6 +73,7 @@ def test_a_good_drive_is_signed_off_and_left_as_it_was(peer: tuple[DrivePeer, Ma
     assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == consumers
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_drive_that_boots_while_it_is_commissioned_is_not_signed_off(peer: tuple[DrivePeer, MachineConfig]) -> None:
     _, settings = peer
 
@@ -277,6 +279,7 @@ def test_a_drive_that_takes_offsets_otherwise_is_refused_and_disabled(
     assert drive.drive.dictionary.number(0x60B0) == 0
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.fault("E14")
 def test_a_watchdog_that_does_nothing_is_refused(
     peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
@@ -323,12 +326,14 @@ def fed(peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch) 
     assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_feeding_that_this_computer_missed_is_tried_again(fed: LateCycle) -> None:
     fed.late = 2
     run_steps(fed.master, lambda m: watchdog(m) == "proven" or pytest.fail("not proven"))
     assert 2 < fed.feedings <= FEEDING_TRIES  # this computer may be late once by itself
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_computer_that_is_always_late_is_told(fed: LateCycle) -> None:
     fed.late = 99
     with pytest.raises(DriveFault, match="missed our heartbeat 4 times; take load off this computer"):
@@ -336,6 +341,7 @@ def test_a_computer_that_is_always_late_is_told(fed: LateCycle) -> None:
     assert fed.feedings == FEEDING_TRIES
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_drive_that_trips_while_it_is_fed_is_not_tried_again(
     fed: LateCycle, peer: tuple[DrivePeer, MachineConfig]
 ) -> None:
@@ -345,6 +351,7 @@ def test_a_drive_that_trips_while_it_is_fed_is_not_tried_again(
     assert fed.feedings == 1
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_heartbeat_that_is_late_right_after_the_feeding_proves_as_much(
     fed: LateCycle, peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -382,6 +389,7 @@ class SlowReader(Master):
         return value
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_ramp_whose_begin_was_missed_is_made_again(peer: tuple[DrivePeer, MachineConfig]) -> None:
     _, settings = peer
     with SlowReader(settings, "X") as master, rolled_back(master):
@@ -392,6 +400,7 @@ def test_a_ramp_whose_begin_was_missed_is_made_again(peer: tuple[DrivePeer, Mach
         assert master.readings > 3 * steps.RAMPS
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_feedforward_that_is_never_seen_stays_untold(
     peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -405,6 +414,7 @@ def test_a_feedforward_that_is_never_seen_stays_untold(
         assert master.readings == 1 + steps.MOST_RAMPS * master.patience  # the object is there, and one a ramp
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_what_was_read_before_the_ramp_is_no_missing_feedforward(
     peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -491,6 +501,7 @@ def test_a_bus_of_another_bit_rate_gets_no_frame(monkeypatch: pytest.MonkeyPatch
         assert other.recv(0) is None
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_drive_without_a_heartbeat_is_commissioned(peer: tuple[DrivePeer, MachineConfig]) -> None:
     """0x1017 = 0 is what many drives come with: with the NC off such a drive says nothing until it is asked."""
     drive, settings = peer

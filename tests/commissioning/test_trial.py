@@ -77,6 +77,7 @@ def bench(quick_trial: None, tmp_path: Path) -> Iterator[Bench]:
         yield Bench(peer, config, record)
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_wrong_sign_and_what_nobody_saw_end_it_before_a_rapid(bench: Bench) -> None:
     bench.peer.drive.faults.signal("voltage").gain = -1.0
     with pytest.raises(DriveFault, match="SignOrScale: voltage times current, and times speed is negative"):

@@ -18,6 +18,8 @@ from studies.real_plant import Loops, Mechanics, at_rest, run
 from tests.bench import bench_config
 from tests.paths import bench_trajectory
 
+pytestmark = pytest.mark.usefixtures("long_computation")
+
 INCREMENT_MM = 20.0 / 65536
 REAL = Mechanics(static=0.2, asymmetry=0.05, screw_ripple=0.05, motor_ripple_nm=0.4, load_nm=2.0)
 

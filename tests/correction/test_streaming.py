@@ -113,6 +113,7 @@ def test_seams_do_not_show() -> None:
         assert check(np.rint(joined).astype(np.int64), PlanLimits.of(CONFIG.axis[axis], 0.001)) == []
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_memory_is_flat() -> None:
     """After the first blocks a longer program needs no more memory: what is kept is half a second of path."""
     there = bench_demand(20)

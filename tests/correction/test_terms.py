@@ -86,6 +86,7 @@ def test_what_the_model_knows_is_predicted_and_corrected(effect: str) -> None:
     assert (after - before).max() < 1.0
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("hertz", [50.0, 80.0])
 def test_a_configured_resonance_need_not_be_exact(hertz: float) -> None:
     """15 % off in either way: far better than without, where a fifth of the path gets worse."""

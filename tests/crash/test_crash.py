@@ -57,6 +57,7 @@ def test_a_store_that_empties_a_file_before_it_writes_it_is_found_out(
     assert any(text.startswith("write 2 killed: [1] lost") for text in found.wrong)
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("name", KEEPERS)
 @pytest.mark.fault("F3")
 def test_a_full_disk_takes_nothing_back(name: str, tmp_path: Path) -> None:
@@ -69,6 +70,7 @@ def test_a_full_disk_takes_nothing_back(name: str, tmp_path: Path) -> None:
     assert told.refused or name == "audit"  # a line may still fit into the page that the file has
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("name", KEEPERS)
 @pytest.mark.fault("F5")
 def test_a_read_only_disk_takes_nothing_and_loses_nothing(name: str, tmp_path: Path) -> None:

@@ -231,6 +231,7 @@ print(json.dumps([ask(Path(sys.argv[1]), {"request": what}) for what in ("status
 """
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.skipif(os.getuid() != 0, reason="only root may become another user")
 @pytest.mark.parametrize("role", [Role.WATCH, Role.OPERATE])
 async def test_another_user_of_this_computer_is_known_by_the_kernel(role: Role, open_folder: Path) -> None:

@@ -16,6 +16,8 @@ from fdhil import config as machine_config
 from fdhil.cli.demo.processes import Twin
 from tests.daemon.shop import AXIS, HEAD, Shop, fdhil
 
+pytestmark = pytest.mark.usefixtures("processes")
+
 FT_PER_KELVIN, CD_PER_KELVIN = -0.16, -0.10
 SHUTTLE = "G21 G90 G94\nG0 X200\nG4 P0.3\nG0 X0\nG4 P0.3\nM2\n"
 CELSIUS = np.linspace(20.0, 22.0, 4)

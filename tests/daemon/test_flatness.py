@@ -19,7 +19,7 @@ from tests.daemon.shop import HEAD, TO_AND_FRO, Shop, fdhil, opened
 from tests.paths import bench_demand
 
 Capture = pytest.CaptureFixture[str]
-pytestmark = pytest.mark.timeout(1500)  # four processes in lockstep: minutes on a busy host
+pytestmark = [pytest.mark.timeout(1500), pytest.mark.usefixtures("processes")]
 LIMITS = {"max_torque_nm": 100.0, "max_speed_rad_s": 30.0}
 CASES = {"X": (1.0, 3.0), "Y": (0.5, 50.0)}
 """An axis of the bench and one that lags: the drive's own speed feed-forward, and by how much the largest tracking

@@ -106,6 +106,7 @@ class Opens:
     open = staticmethod(open_machine)
 
 
+@pytest.mark.usefixtures("long_computation")
 async def test_a_wrong_period_a_node_never_heard_and_a_dead_bus_are_told(
     line: Line, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

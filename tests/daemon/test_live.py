@@ -126,6 +126,7 @@ async def test_the_times_of_the_ticks_are_told_where_a_sensor_has_its_own_clock(
         writer.close()
 
 
+@pytest.mark.usefixtures("long_computation")
 async def test_a_viewer_that_does_not_read_loses_lines_and_is_told_the_others_lose_none(tmp_path: Path) -> None:
     stream = LiveStream(config_of(tmp_path))
     async with streaming(stream, tmp_path) as path:

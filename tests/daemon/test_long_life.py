@@ -53,6 +53,7 @@ def look_on_and_leave(path: Path) -> None:
                 client.recv(10)
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.fault("F10")
 async def test_a_rapid_more_and_a_client_more_take_no_memory_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

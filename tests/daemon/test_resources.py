@@ -39,6 +39,7 @@ print(uses()[0].used - before)
 """
 
 
+@pytest.mark.usefixtures("processes")
 def test_a_large_block_that_is_freed_is_given_back() -> None:
     said = subprocess.run([sys.executable, "-c", FREED], capture_output=True, text=True, check=True)
     assert int(said.stdout) < 5e6  # of 42 MB
@@ -55,6 +56,7 @@ print(before - uses()[0].used)
 """
 
 
+@pytest.mark.usefixtures("processes")
 def test_what_lies_free_between_used_blocks_is_given_back() -> None:
     said = subprocess.run([sys.executable, "-c", BETWEEN], capture_output=True, text=True, check=True)
     assert int(said.stdout) > 30e6  # of 40 MB
@@ -73,6 +75,7 @@ print(*(b - a for a, b in zip(before, after)))
 """
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.fault("F10")
 def test_what_grows_is_seen_to_grow() -> None:
     """In a process of its own: what other tests left behind may end just then."""

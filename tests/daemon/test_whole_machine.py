@@ -22,7 +22,7 @@ from tests.daemon.shop import CORNER, REAL, SHUTTLE, Shop, fdhil, opened, patien
 Capture = pytest.CaptureFixture[str]
 ROUND = "G1 X60 F8000\nG1 Y40\nG1 X0\nG1 Y0\n"
 LONG = "G21 G90 G94\nG4 P0.3\n" + ROUND * 7 + "G4 P0.2\nM2\n"
-pytestmark = pytest.mark.timeout(1500)  # four processes in lockstep: minutes on a busy host
+pytestmark = [pytest.mark.timeout(1500), pytest.mark.usefixtures("processes")]
 
 
 @pytest.fixture

@@ -43,6 +43,7 @@ def played(twin: TwinInHand, demand: Trajectory, path: Float, offset_um: dict[st
     return rms(contour_error_um(path, actual, PERIOD_S))
 
 
+@pytest.mark.usefixtures("long_computation")
 @LED
 def test_a_corrected_cut_is_better(outfit: Outfit, tmp_path: Path) -> None:
     config = dressed(outfit, tmp_path, "XY")

@@ -38,6 +38,8 @@ from tests.guard.machine import FACTS_GIVEN
 from tests.sim.bench_twin import PERIOD_S, TwinInHand, smooth, trajectory
 from tests.sim.rig import NO_NOISE
 
+pytestmark = pytest.mark.usefixtures("long_computation")
+
 Capture = pytest.CaptureFixture[str]
 __all__ = ["quick"]  # a fixture: shorter waits than on a real machine
 PROGRAM = "program-1"

@@ -16,6 +16,8 @@ from fdhil.records import AxisSamples, Float, TickTimes, WindowOutcome
 from tests.dressed.wardrobe import LED, OUTFITS, Outfit, dressed, started
 from tests.sim.bench_twin import TwinInHand
 
+pytestmark = pytest.mark.usefixtures("long_computation")
+
 K, R, CRUISE_RAD_S = 0.8, 0.5, 157.08
 CRUISE_A = (5.0 + 0.05 * CRUISE_RAD_S) / K
 IDENTIFIED = [o for o in OUTFITS if o.name in ("epos4", "nanotec", "trinamic", "technosoft", "cia402-ingenia")]

@@ -75,6 +75,7 @@ def differing(config: MachineConfig) -> dict[str, Finding]:
     return {finding.point: finding for _, finding in check_machine(config) if finding.ok is False}
 
 
+@pytest.mark.usefixtures("long_computation")
 @EVERY
 def test_it_is_found_checked_and_commissioned(outfit: Outfit, tmp_path: Path) -> None:
     with on_a_bus(outfit, tmp_path) as (peer, config):

@@ -101,6 +101,7 @@ def test_error_frames_keep_their_class_where_the_format_has_one(tmp_path: Path) 
         convert(ERRORS, "trc", tmp_path)
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.skipif(shutil.which("log2asc") is None, reason="needs can-utils")
 def test_asc_has_the_events_that_log2asc_writes(tmp_path: Path) -> None:
     out, _ = convert(CANDUMP + ERRORS, "asc", tmp_path)
@@ -116,6 +117,7 @@ def test_asc_has_the_events_that_log2asc_writes(tmp_path: Path) -> None:
     assert events(out.read_text()) == events(theirs)
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.skipif(shutil.which("log2asc") is None, reason="needs can-utils")
 def test_log2asc_is_read_as_it_was_written(tmp_path: Path) -> None:
     log, asc = tmp_path / "bus.log", tmp_path / "bus.asc"
@@ -127,6 +129,7 @@ def test_log2asc_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert came[-1].startswith("(1714557601.004300)")
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.skipif(shutil.which("asc2log") is None, reason="needs can-utils")
 def test_asc2log_reads_what_is_written(tmp_path: Path) -> None:
     out, _ = convert(CANDUMP + ERRORS, "asc", tmp_path)

@@ -106,6 +106,7 @@ def test_every_lost_frame_is_counted_and_leaves_a_hole(data: st.DataObject, cut:
         assert int(ticks[c]) in holes
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_lost_sync_is_no_lost_pdo_wherever_the_blocks_part() -> None:
     wire = Wire(n=60)
     frames = wire.frames()

@@ -71,6 +71,7 @@ def test_what_holds_frames_takes_nothing_of_the_heap_which_keeps_its_holes() -> 
     assert taken < HEAP_BYTES
 
 
+@pytest.mark.usefixtures("long_computation")
 @given(st.lists(st.integers(0, 3 * CHUNK_FRAMES), max_size=8), st.integers(0, 4 * CHUNK_FRAMES))
 def test_a_history_returns_the_newest_frames_in_order(sizes: list[int], kept: int) -> None:
     history, sent = FrameHistory(kept_s=kept * PERIOD_NS * 1e-9), 0
@@ -87,6 +88,7 @@ def test_a_history_holds_a_chunk_more_than_it_must_at_most() -> None:
     assert sum(chunk.size for chunk in history._chunks) <= 1001 + CHUNK_FRAMES
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_log_of_a_flood_is_made_piece_by_piece() -> None:
     frames = flood(0, FLOOD)
     tracemalloc.start()

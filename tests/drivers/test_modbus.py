@@ -213,6 +213,7 @@ def registers(peer: SensorPeer) -> list[int]:
     return peer.registers()
 
 
+@pytest.mark.usefixtures("long_computation")
 @settings(max_examples=200)
 @given(st.integers(0, 115), st.integers(0, 0xFFFF))
 def test_damage_of_a_register_is_checked(at: int, value: int) -> None:

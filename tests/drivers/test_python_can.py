@@ -155,6 +155,7 @@ def rows_of(records: Iterable[object]) -> npt.NDArray[np.float64]:
     return np.hstack([np.stack([s.tick, s.demand_mm, s.position_mm, s.speed_rad_s, s.current_a]) for s in samples])
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("interface", ADAPTERS)
 def test_an_adapter_that_is_not_there_is_said(interface: str) -> None:
     settings = BusSettings.model_validate({"interface": interface, "channel": "0"})

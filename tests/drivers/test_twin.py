@@ -108,6 +108,7 @@ def moved(records: list[Record]) -> bool:
     return any(isinstance(r, MoveEvent) and r.kind is MoveKind.REST for r in records)
 
 
+@pytest.mark.usefixtures("processes")
 def test_commissioning_of_the_process(twin: Twin, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 0.3)
     monkeypatch.setattr("fdhil.commissioning.steps.SETTLE_CYCLES", 150)

@@ -7,6 +7,8 @@ import sys
 
 import pytest
 
+pytestmark = pytest.mark.usefixtures("processes")
+
 
 @pytest.mark.parametrize("module", ["fdhil.daemon.service", "fdhil.guard.process", "fdhil.cli.main", "fdhil.cli.fleet"])
 def test_it_runs_without_the_extra(module: str) -> None:

@@ -127,6 +127,7 @@ def test_a_machine_with_a_hundred_times_the_sets_does_not_speak_for_all() -> Non
     assert judged(courses).slope_per_k == pytest.approx(-0.01, rel=0.3)
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("kind", sisters.KINDS)
 def test_one_group_in_a_hundred_has_an_alarm_by_chance(kind: str) -> None:
     """The study counts more of them, and smaller ones."""

@@ -109,6 +109,7 @@ def test_an_acceptance_is_whole_whatever_call_fails_or_is_the_last(
     assert sum(found.runs.values()) > 8
 
 
+@pytest.mark.usefixtures("processes")
 def test_a_full_disk_takes_nothing_back(offers: Path, tmp_path: Path) -> None:
     (tmp_path / "disk").mkdir()
     told = disks.filled(Acceptances, tmp_path / "disk", free_bytes=0)

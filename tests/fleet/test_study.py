@@ -36,6 +36,7 @@ WRONG: Mapping[str, tuple[str, dict[str, int]]] = {
 }
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("what", WRONG)
 def test_it_notices_what_is_wrong(what: str, database: Postgres, tmp_path: Path) -> None:
     days = [fleet_day.machine(tmp_path / f"day-{k}", f"day-{k}", "nats://127.0.0.1:4222") for k in range(2)]

@@ -68,6 +68,7 @@ def windows(tmp_path: Path) -> list[Stored]:
     return kept
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_any_number_of_workers_gives_the_same_bytes_also_when_one_is_killed(
     windows: list[Stored], tmp_path: Path
 ) -> None:
@@ -113,6 +114,7 @@ def test_a_worker_with_other_code_or_without_the_windows_is_refused(windows: lis
         analyse_again(windows, rapids.method(tmp_path / "elsewhere"))
 
 
+@pytest.mark.usefixtures("processes")
 def test_a_scheduler_that_is_not_there_is_told(tmp_path: Path) -> None:
     """In a process of its own: the library leaves a thread behind where it finds no scheduler."""
     (tmp_path / "fleet.toml").write_text("")

@@ -17,6 +17,8 @@ from tests.daemon.shop import fdhil
 from tests.foreign.peers import ForeignProcess
 from tests.sim.twin_process import TwinProcess, write_config
 
+pytestmark = pytest.mark.usefixtures("processes")
+
 PERIOD_MS = 5
 MAKES = [pytest.param("master.js", marks=pytest.mark.debian), "python_master.py"]
 

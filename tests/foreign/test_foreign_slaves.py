@@ -108,6 +108,7 @@ def assert_compared(machine: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert err.startswith("refused: drive X: RPDO1 maps nothing where the profile has")
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("make", MAKES)
 def test_a_foreign_drive_is_found_compared_and_refused(
     make: str, hub: Hub, machine: Path, capsys: pytest.CaptureFixture[str]
@@ -117,6 +118,7 @@ def test_a_foreign_drive_is_found_compared_and_refused(
         assert_compared(machine, capsys)
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("make", MAKES)
 def test_a_foreign_module_is_told_to_be_no_drive(
     make: str, hub: Hub, machine: Path, capsys: pytest.CaptureFixture[str]
@@ -131,6 +133,7 @@ def test_a_foreign_module_is_told_to_be_no_drive(
         assert "it is no CiA 402 drive: 0x1000 says CiA 401, an I/O module" in err
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("make", MAKES)
 def test_a_foreign_drive_without_the_profiles_tpdos_is_told_and_loses_nothing(
     make: str, hub: Hub, machine: Path, monkeypatch: pytest.MonkeyPatch

@@ -18,6 +18,7 @@ MANY = 100
 SLOW = [{"kind": "slow", "place": "x", "inputs": 1}]
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("name", TARGETS)
 def test_true_and_changed_examples_have_a_declared_answer(name: str) -> None:
     target = target_of(name)
@@ -26,6 +27,7 @@ def test_true_and_changed_examples_have_a_declared_answer(name: str) -> None:
         assert finding is None, (data, finding)
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize(
     "path", [path for name in TARGETS for path in found_inputs(name)], ids=lambda p: f"{p.parent.name}-{p.name}"
 )
@@ -34,6 +36,7 @@ def test_what_once_hurt_does_so_no_more(path: Path) -> None:
     assert finding is None, finding
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_what_is_not_declared_is_a_finding() -> None:
     """Also what takes for ever, and what takes too much memory."""
 
@@ -57,6 +60,7 @@ def test_what_is_not_declared_is_a_finding() -> None:
         assert [kind(data) for data in (b"x", b"for ever")] == ["KeyError", "slow"]
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_slip_of_one_character_changes_nothing_but_what_was_mistyped() -> None:
     text = slips.SAMPLE.read_text("utf-8")
     counts, wrong = slips.judged(slips.sample(text, 500, seed=2), text)

@@ -8,6 +8,8 @@ from fdhil.drivers.cia402.eds import MAX_OBJECTS, MAX_SECTIONS
 from tests.fuzz.targets import target_of
 from tests.fuzz.tasting import judged
 
+pytestmark = pytest.mark.usefixtures("long_computation")
+
 HEAD = "[DeviceInfo]\n[1000]\nParameterName=x\nObjectType=7\nDataType=7\nAccessType=ro\n"
 OBJECT = "[{:04X}]\nParameterName=x\nObjectType=8\nDataType=7\nAccessType=ro\nCompactSubObj=254\n"
 LARGE = {

@@ -101,6 +101,7 @@ def test_every_vector_of_what_is_vouched_for(settled: tuple[Bench, Inputs]) -> N
         assert refusals(machine, changed) == expected
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_every_vector_of_the_interlocks(settled: tuple[Bench, Inputs]) -> None:
     machine, inputs = settled
     codes = [*AXIS_CHANGES, *BUS_CHANGES]

@@ -16,6 +16,8 @@ from fdhil.guard import table
 from fdhil.guard.control import MAX_CLIENTS, MAX_LINE_BYTES
 from tests.guard.test_process import DEMAND, ENDS_S, OFFSET, Rig, check_limits
 
+pytestmark = pytest.mark.usefixtures("processes")
+
 STOPPING = (signal.SIGHUP, signal.SIGQUIT, signal.SIGINT, signal.SIGXCPU)
 SURROGATE = "\\ud800"
 VALUES = [

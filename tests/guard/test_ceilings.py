@@ -63,6 +63,7 @@ def documents() -> st.SearchStrategy[dict[str, Any]]:
     )
 
 
+@pytest.mark.usefixtures("long_computation")
 @settings(max_examples=150, deadline=None)
 @given(documents(), st.integers(0, 2**32 - 1))
 def test_planner_and_guard_agree_on_every_axis_and_nothing_exceeds_a_ceiling(
@@ -149,6 +150,7 @@ def test_the_travel_of_an_axis_is_read_as_it_was_written(travel: list[int] | Non
     assert from_json(json.dumps(document)).axes[0].travel == (travel and tuple(travel))
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.fault("G11")
 def test_no_value_of_any_kind_in_any_field_is_anything_but_a_refusal() -> None:
     """Every key of the file, at every depth, given what does not belong there."""

@@ -6,6 +6,7 @@ import struct
 from collections.abc import Sequence
 
 import hypothesis.strategies as st
+import pytest
 from hypothesis import settings as hypothesis_settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
@@ -14,6 +15,8 @@ from fdhil.guard.state import Request
 from studies.guard_invariants import episode
 from tests.guard.machine import ENABLED, RECORD, Bench, arm_request, bench
 from tests.guard.wire import CEILING, Wire
+
+pytestmark = pytest.mark.usefixtures("long_computation")
 
 NODES = st.sampled_from((0, 1))
 VALUES = st.one_of(st.integers(-CEILING, CEILING), st.integers(-(2**24), 2**24))

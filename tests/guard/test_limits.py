@@ -158,6 +158,7 @@ def test_total_variation_is_that_of_any_second() -> None:
     assert set(pieces[11:]) == {"OffsetEnergy"}
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("window", [10, 20, 100])
 @example([9] * 350)
 @example([k % 19 - 9 for k in range(350)])

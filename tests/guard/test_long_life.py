@@ -73,6 +73,7 @@ def test_the_guard_leaves_nothing_behind_that_only_a_collector_would_find(tmp_pa
         shop.close()
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.fault("F10")
 def test_a_life_more_takes_no_memory_and_no_descriptor_more(tmp_path: Path) -> None:
     """In a process of its own, where nothing else comes and goes."""

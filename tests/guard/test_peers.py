@@ -148,6 +148,7 @@ with GuardClient(Path(sys.argv[1]), 60.0) as guard:
 """
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.skipif(os.getuid() != 0, reason="only root may become another user")
 @pytest.mark.fault("G1")
 def test_another_user_of_this_computer_is_known_by_the_kernel() -> None:

@@ -27,6 +27,8 @@ from tests.guard.machine import DIGEST, FACTS_GIVEN, LIMITS, commissioned, smoot
 from tests.guard.peer import NEVER, Peer, open_bus, write_config
 from tests.listening import tcp_ports
 
+pytestmark = pytest.mark.usefixtures("processes")
+
 DEMAND, OFFSET = smooth_path(rows=800)
 TOKEN = "the operator's"
 ENDS_S = 100.0  # a process that ends or answers does so at once, on a host that has time for it

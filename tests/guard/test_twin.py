@@ -13,12 +13,16 @@ import time
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from fdhil import config as machine_config
 from fdhil.arming.guard_client import GuardClient
 from fdhil.arming.guard_settings import settings_of
 from fdhil.guard.settings import to_json
 from tests.guard.machine import FACTS_GIVEN, commissioned
 from tests.guard.peer import open_bus, write_config
+
+pytestmark = pytest.mark.usefixtures("processes")
 
 ROWS = 900
 TOKEN = "the operator's"

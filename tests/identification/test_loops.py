@@ -110,6 +110,7 @@ def test_loops_as_configured_are_told_to_be_the_same() -> None:
     assert not better_loops(loops)
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize(
     ("loops", "configured"),
     [
@@ -131,6 +132,7 @@ def test_what_is_not_configured_is_found_within_five_percent(loops: real.Loops, 
     assert better_loops(told) == configured
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize(
     "own",
     [
@@ -158,6 +160,7 @@ def test_options_and_structures_are_told_apart(own: dict[str, Any]) -> None:
     assert used.speed_ki == pytest.approx(axis.regulators.speed_ki, rel=0.06)
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_the_path_is_predicted_though_the_machine_has_more_than_the_model() -> None:
     mechanics = replace(real.ORDINARY_MECHANICS, load_nm=0.0)
     loops = replace(real.ORDINARY_LOOPS, speed_filter_s=0.001, speed_feedforward=0.95)
@@ -169,6 +172,7 @@ def test_the_path_is_predicted_though_the_machine_has_more_than_the_model() -> N
     assert off[1] < 1e-3
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_loops_are_refused_where_they_do_not_explain() -> None:
     windows = rapids(real.Loops())
     strict = SETTINGS.model_copy(update={"tolerance_um": 0.01})
@@ -183,6 +187,7 @@ def test_without_a_demand_no_loops_are_told() -> None:
     assert identify_loops(windows, [NOMINAL] * len(windows), bench_axis(), SETTINGS) is None
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("row_s", [0.004, 0.010])
 def test_slow_rows_show_the_loops(row_s: float) -> None:
     axis = bench_axis()

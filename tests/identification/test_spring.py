@@ -65,6 +65,7 @@ def test_no_table_adds_no_torque() -> None:
     assert np.abs(torques.felt(torques.answer(Spring(5000.0, 0.5, 0.03)))).max() < 0.05
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_told_resonance_takes_what_bends_the_six_away() -> None:
     """A good encoder sees it: the table's share is told as well, and inertia and inductance no more bent."""
     mechanics = replace(ORDINARY_MECHANICS, load_nm=0.0)
@@ -110,6 +111,7 @@ def test_a_resonance_that_is_not_there_is_named() -> None:
     assert all("resonance_hz" in reason.advice for reason in reasons)
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_resonance_that_nobody_told_is_found_by_the_replay() -> None:
     axis = axis_of(SLOW, "slow")
     windows = slow_rapids(replace(SLOW, resonance_hz=80.0))
@@ -124,6 +126,7 @@ def test_a_resonance_that_nobody_told_is_found_by_the_replay() -> None:
         assert hertz * (1 - share) ** 0.5 == pytest.approx(80.0 * 0.4**0.5, rel=0.15)
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_running_machine_goes_on_with_the_resonance_that_it_found() -> None:
     windows = slow_rapids(replace(SLOW, resonance_hz=80.0))
     loops = OwnLoops(axis_of(SLOW, "slow"), SETTINGS, PERIOD_S)
@@ -137,6 +140,7 @@ def test_a_running_machine_goes_on_with_the_resonance_that_it_found() -> None:
     assert RESONANCE in second.estimate.terms
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize(
     "mechanics", [SLOW, replace(SLOW, static=-0.25, static_speed_rad_s=20.0)], ids=["stiff", "friction"]
 )

@@ -153,6 +153,7 @@ def test_how_low_speed_friction_changes_with_its_speed() -> None:
     np.testing.assert_allclose(slope, change, atol=1e-6)
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_what_may_join_answers_as_it_is_there() -> None:
     motion = prepare(rapids(sensors=Sensors(command=True), loops=Loops(dead_time_v=1.0))[0])
     theta = np.array([*TRUTH, 0.0])

@@ -14,6 +14,8 @@ from fdhil.errors import DeviceError
 from tests.guard.peer import Peer, at_rest, write_config
 from tests.listening import tcp_ports
 
+pytestmark = pytest.mark.usefixtures("processes")
+
 CYCLES = 500
 
 

@@ -25,6 +25,8 @@ from tests.integration.conftest import PATIENCE_S, Bench
 from tests.integration.test_guard import toml
 from tests.paths import bench_demand
 
+pytestmark = pytest.mark.usefixtures("processes")
+
 LIMITS = {"max_torque_nm": 100.0, "max_speed_rad_s": 30.0}
 
 

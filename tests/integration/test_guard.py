@@ -18,6 +18,8 @@ from fdhil.cli.demo.processes import Process
 from fdhil.guard.interlocks import FACTS
 from tests.integration.conftest import PATIENCE_S, Bench, sign_off
 
+pytestmark = pytest.mark.usefixtures("processes")
+
 DIGEST = "0" * 64
 
 

@@ -14,6 +14,8 @@ from tests.eds import write_eds
 from tests.integration.conftest import Bench
 from tests.integration.test_guard import every_offset_is_applied_in_its_own_cycle, guarded
 
+pytestmark = pytest.mark.usefixtures("processes")
+
 
 @pytest.fixture(params=["hub", pytest.param("socketcan", marks=pytest.mark.socketcan)])
 def transport(request: pytest.FixtureRequest) -> str:

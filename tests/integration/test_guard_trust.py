@@ -24,6 +24,8 @@ from tests.guard import impatient
 from tests.integration.conftest import PATIENCE_S, Bench, sign_off
 from tests.integration.test_guard import toml
 
+pytestmark = pytest.mark.usefixtures("processes")
+
 WINDOW = 0x6065
 
 

@@ -21,6 +21,7 @@ def test_a_fault_at_any_time_ends_at_zero_in_time(row: str) -> None:
     assert len(found.descents[row]) == 3
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.fault("F15", "F16", "F14", "E13")
 @pytest.mark.parametrize(
     ("part", "times", "seed"),
@@ -37,6 +38,7 @@ def test_killed_hung_and_restarted_processes_end_at_zero(part: str, times: int, 
     assert found.frames > 100
 
 
+@pytest.mark.usefixtures("processes")
 def test_faults_of_the_bus_end_at_zero_between_processes() -> None:
     found = kills.live_part("faults", 3, 5)
     assert found.wrong == []

@@ -19,6 +19,8 @@ from fdhil.pipeline import AxisPipeline
 from fdhil.records import AxisSamples, MoveEvent, MoveKind, ParameterSet, WindowOutcome
 from tests.integration.conftest import PATIENCE_S, Bench, digested
 
+pytestmark = pytest.mark.usefixtures("long_computation")
+
 ROUND = "G0 X300 Y300\nG4 P0.3\nG0 X0 Y0\nG4 P0.3\n"
 TRUE = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
 SETTLED_ROWS = 500  # after the last rapid: it becomes a window when its axis has stood for a while

@@ -17,6 +17,8 @@ from fdhil.records import VoltageSamples, WindowOutcome
 from tests.integration.conftest import Bench, digested, take_voltage_from_sensors
 from tests.integration.test_loop import TRUE, recorded, shuttle
 
+pytestmark = pytest.mark.usefixtures("long_computation")
+
 
 @pytest.fixture(params=["hub", pytest.param("socketcan", marks=pytest.mark.socketcan)])
 def transport(request: pytest.FixtureRequest) -> str:

@@ -19,6 +19,8 @@ from fdhil.records import Float, Parameters
 from tests.bench import bench_document
 from tests.sim.bench_twin import TwinInHand
 
+pytestmark = pytest.mark.usefixtures("long_computation")
+
 PROGRAMS = Path(__file__).parents[2] / "configs" / "programs"
 PLANTS: dict[str, dict[str, dict[str, float]]] = {
     "bench": {"X": {}, "Y": {}},

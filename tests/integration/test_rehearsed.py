@@ -15,6 +15,8 @@ from fdhil.arming.token import read_token
 from tests.integration.conftest import PATIENCE_S, Bench
 from tests.integration.test_guard import DIGEST, arm, client, sections, transport
 
+pytestmark = pytest.mark.usefixtures("processes")
+
 __all__ = ["client", "sections", "transport"]
 
 REHEARSED: dict[str, tuple[str, dict[str, Any]]] = {

@@ -71,6 +71,7 @@ async def recorded(bench: Bench) -> tuple[list[Any], dict[str, int]]:
         return records, source.counters()
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("period_s", [0.002, 0.004, 0.01])
 def test_four_axes_are_recorded_row_by_row(period_s: float, tmp_path: Path) -> None:
     document = bench_document(AXES)

@@ -15,6 +15,8 @@ from fdhil.records import Outcome, ParameterSet, WindowOutcome
 from tests.integration.conftest import Bench, digested, take_voltage_from_sensors
 from tests.integration.test_loop import TRUE, recorded, shuttle
 
+pytestmark = pytest.mark.usefixtures("long_computation")
+
 
 @pytest.fixture
 def transport() -> str:

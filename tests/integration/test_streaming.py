@@ -28,6 +28,8 @@ from tests.integration.conftest import PATIENCE_S, Bench
 from tests.integration.test_guard import DIGEST, client, sections
 from tests.paths import bench_demand
 
+pytestmark = pytest.mark.usefixtures("processes")
+
 __all__ = ["client", "sections"]
 
 

@@ -98,6 +98,7 @@ def estimates(axis: str) -> list[Estimate]:
     return [o.estimate for o in recorded()[axis] if o.estimate is not None and "resonance" in o.estimate.terms]
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("axis", list(TRUE))
 def test_the_resonance_is_found_in_each_rapid_and_the_rapid_believed(axis: str) -> None:
     assert [o.window.direction for o in recorded()[axis]] == [1, -1]

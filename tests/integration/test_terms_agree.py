@@ -16,6 +16,8 @@ from fdhil.records import Float, Parameters
 from tests.bench import bench_document
 from tests.integration.test_prediction_agrees import PROGRAMS, table
 
+pytestmark = pytest.mark.usefixtures("long_computation")
+
 PROGRAM = PROGRAMS / "bench_10m.ngc"
 STARTED = 500  # rows after which what the regulators held at the start no longer counts
 REALITY = {

@@ -28,6 +28,7 @@ def random_demand(seed: int, n: int = 450) -> Float:
     return smooth(path[:, None], (0.060, 0.030), PERIOD)[:, 0]
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("seed", range(6))
 def test_agrees_with_independent_physics(seed: int) -> None:
     """Within 0.6 um of a drive that quantises (dry friction keeps what rounding left), 0.02 um of one that does not."""

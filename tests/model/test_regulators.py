@@ -95,6 +95,7 @@ def test_agrees_with_independent_physics(structure: str, option: str) -> None:
     assert np.abs(response.position_mm - slow).max() < 0.05e-3
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize(("structure", "option"), CASES)
 def test_agrees_with_an_adaptive_solver(structure: str, option: str) -> None:
     """Within a tenth of 0.5 um of ``solve_ivp`` with the standstill as an event, reversal and rest included."""
@@ -122,6 +123,7 @@ def test_agrees_while_a_limit_acts(structure: str, option: str) -> None:
     assert np.abs(response.position_mm - slow).max() < 0.05e-3
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("structure", tables.REGULATORS)
 def test_agrees_with_an_adaptive_solver_while_a_limit_acts(structure: str) -> None:
     """The same within 0.05 um of ``solve_ivp``, all options on."""

@@ -77,6 +77,7 @@ def test_agrees_with_independent_physics(joined: str, delay: int) -> None:
     assert np.abs(response.position_mm - slow).max() < 0.1e-3
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("joined", TERMS)
 def test_agrees_with_an_adaptive_solver(joined: str) -> None:
     """The same with ``solve_ivp``, the standstill found as an event."""
@@ -87,6 +88,7 @@ def test_agrees_with_an_adaptive_solver(joined: str) -> None:
     assert np.abs(response.position_mm - exact).max() < 0.1e-3
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("share", [0.3, 0.7])
 def test_a_table_behind_a_spring_agrees_with_independent_physics(share: float) -> None:
     """Motor and table as a drive of other code makes them; what is left is when in a step the table stops."""

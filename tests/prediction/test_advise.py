@@ -47,6 +47,7 @@ def shares_of(advice: tuple[Advice, ...], held: Callable[[Advice], Held | None])
     return {line: one.share for line, one in found.items() if one is not None and one.share is not None}
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_beyond_the_drives_feed_is_told_with_the_feeds_that_hold() -> None:
     """20 m/min asks for 1.7 times the current. Each line has its own feed, also where the correction is refused as
     programmed; they keep the tolerance, 5 % more do not."""

@@ -22,6 +22,7 @@ COVARIANCE = np.diag((RELATIVE * VALUES) ** 2)
 COVARIANCE[4, 5] = COVARIANCE[5, 4] = -0.9 * np.sqrt(COVARIANCE[4, 4] * COVARIANCE[5, 5])
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_standard_deviation_is_that_of_drawn_plants() -> None:
     """Where the table is well off the path the contour error scatters as told, within the error of 60 draws; 95 % of
     the draws are within 1.96 of it."""

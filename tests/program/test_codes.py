@@ -235,6 +235,7 @@ def test_calls_may_nest_as_deep_as_the_configuration_says() -> None:
 LINES = 1_000_000
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_million_lines_are_read_in_flat_memory(tmp_path: Path) -> None:
     """A file of 20 Mbyte: what is held after twenty thousand lines is what was held after five hundred."""
     path = tmp_path / "long.ngc"

@@ -141,6 +141,7 @@ def test_short_lines_are_joined_within_q() -> None:
     assert [m.line for m in joined(interpret(straight))] == [10, 11]
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_the_path_is_left_by_no_more_than_p_and_ends_where_it_is_told() -> None:
     config = machine()
     furthest = 0.0
@@ -162,6 +163,7 @@ def chords(count: int) -> Iterator[Motion]:
         yield Feed(number + 1, end, 6000.0, Corner("blend", 0.01))
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_long_program_is_planned_in_flat_memory() -> None:
     peaks = []
     for count in (150, 600):

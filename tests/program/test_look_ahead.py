@@ -172,6 +172,7 @@ def test_rapid_and_feed_are_parted_by_a_stop_unless_the_configuration_blends_the
     assert nearest[1] > 0.1
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("profile", PROFILES)
 def test_blocks_make_the_same_reference_whatever_their_length(profile: str) -> None:
     config = machine(profile)
@@ -185,6 +186,7 @@ def zigzag(count: int) -> Iterator[Motion]:
         yield Feed(number, (0.3 * (number % 2), 0.2 * (number % 2), 0.0), 3000.0, Corner("blend", 0.01))
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_long_program_is_planned_in_flat_memory() -> None:
     config = machine("jerk_limited")
     peaks = []

@@ -113,6 +113,7 @@ def test_units_are_typeset_and_names_are_not() -> None:
     assert typeset_markup('<text class="um">um</text>') == '<text class="um">µm</text>'
 
 
+@pytest.mark.usefixtures("processes")
 def test_without_a_browser_there_is_no_pdf_and_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(FdhilError, match="apt-get install chromium"):

@@ -30,6 +30,7 @@ def _correction() -> Correction:
     return plan(bench_trajectory(10), MODELS, CONFIG)
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_before_and_after(correction: Correction, tmp_path: Path) -> None:
     """A map and a scale for each, every corner enlarged with both, the zones with both figures."""
     page = correction_page("part.ngc", "bench", correction)
@@ -57,6 +58,7 @@ def test_what_is_magnified_is_the_contour_error(correction: Correction) -> None:
     assert np.allclose(away_um, before.contour_um[rows], atol=1e-6)
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_refused_correction_says_why() -> None:
     """Its page shows the path as it would be cut, and the advice."""
     refused = plan(bench_trajectory(20, (0.030, 0.015)), MODELS, CONFIG)
@@ -98,6 +100,7 @@ def test_one_axis_alone_is_enlarged_over_time() -> None:
     assert page.sections[2].tables[0].rows
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_long_path_is_drawn_by_points_and_its_zones_are_cut(tmp_path: Path) -> None:
     """Each place in the colour of its own error, whatever the length; other passes over a place are not in its picture;
     equal places are shown a few times."""

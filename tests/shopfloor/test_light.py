@@ -7,6 +7,8 @@ import sys
 
 import pytest
 
+pytestmark = pytest.mark.usefixtures("processes")
+
 HEAVY = ("numba", "scipy", "pyarrow", "can", "canopen", "pymodbus")
 
 

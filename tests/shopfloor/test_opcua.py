@@ -96,6 +96,7 @@ async def until(done: Callable[[], bool]) -> None:
             await asyncio.sleep(0.01)
 
 
+@pytest.mark.usefixtures("long_computation")
 async def test_a_machine_tool_stands_where_clients_look_for_it(client: Client) -> None:
     machinery = await client.get_namespace_index("http://opcfoundation.org/UA/Machinery/")
     tool, di = (
@@ -250,6 +251,7 @@ async def subscribed(client: Client, heard: Heard, at: str = "messages") -> Any:
     return subscription
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("at", ["messages", "server"])
 async def test_an_alarm_is_a_condition_that_begins_and_ends_and_a_notice_is_an_event(
     at: str, stage: Stage, client: Client
@@ -356,6 +358,7 @@ async def refused(entering: Awaitable[Any]) -> str:
     return "let in"
 
 
+@pytest.mark.usefixtures("long_computation")
 async def test_who_enters_is_known_by_certificate_and_password(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -396,6 +399,7 @@ async def test_a_certificate_that_cannot_be_used_is_named(content: bytes | None,
         await publish(config_of(tmp_path, publish={"opcua": files}))
 
 
+@pytest.mark.usefixtures("long_computation")
 async def test_a_real_daemon_is_read_and_its_end_is_seen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = config_of(tmp_path, publish={"opcua": {"port": 0, "period_s": 0.1}})
     with pytest.MonkeyPatch.context() as patch:

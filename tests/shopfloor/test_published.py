@@ -109,6 +109,7 @@ async def test_what_a_real_daemon_says_is_published(tmp_path: Path, monkeypatch:
     assert "SourceLost" in {event.code for event in events(answer, NOW_MS)}
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("protocol", list(tables.PUBLISHERS))
 async def test_every_publisher_lives_without_a_daemon_and_ends_when_it_is_told(
     protocol: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -153,6 +153,7 @@ ODD = st.sampled_from(
 )
 
 
+@pytest.mark.usefixtures("long_computation")
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(LINES | ODD, min_size=1, max_size=60), st.integers(0, 500))
 def test_a_drive_can_wear_whatever_a_file_says(tmp_path: Path, lines: list[str], place: int) -> None:

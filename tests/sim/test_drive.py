@@ -283,6 +283,7 @@ def test_two_runs_are_the_same_bit_by_bit() -> None:
     assert run() == run()
 
 
+@pytest.mark.usefixtures("long_computation")
 @settings(deadline=None, max_examples=60)
 @given(
     st.lists(

@@ -135,6 +135,7 @@ def test_a_listed_rpdo_that_does_not_exist_is_refused(listed: str) -> None:
         Machine(twin_config(sim={"lockstep_rpdo": [listed]}))
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_two_runs_are_equal_bit_by_bit() -> None:
     """Noise, stick-slip, sensors: nothing but the seed and the SYNCs decides."""
 

@@ -201,6 +201,7 @@ def test_dropped_tpdos_and_a_mapping_changed_behind_our_back() -> None:
     assert rig.read(0x1A00, 1) == 0x606C0020
 
 
+@pytest.mark.usefixtures("long_computation")
 @settings(deadline=None, max_examples=40)
 @given(st.integers(-(2**31), 2**31 - 1), st.integers(-(2**15), 2**15 - 1), st.integers(0, 2**16 - 1))
 def test_the_codec_is_that_of_the_library(position: int, torque: int, word: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -152,6 +153,7 @@ TABLE = {
 }
 
 
+@pytest.mark.usefixtures("long_computation")
 @settings(deadline=None, max_examples=300)
 @given(st.lists(st.one_of(st.sampled_from([0, 2, 6, 7, 15, 128]), st.integers(0, 0xFFFF), st.none()), max_size=20))
 def test_random_walks_follow_the_standard_s_table(words: list[int | None]) -> None:

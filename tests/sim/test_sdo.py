@@ -65,6 +65,7 @@ def test_strings_and_numbers_read_as_the_library_expects() -> None:
     assert node.sdo[0x607D][1].raw == -(2**31)
 
 
+@pytest.mark.usefixtures("long_computation")
 @settings(deadline=None, max_examples=40)
 @given(st.integers(-(2**31), 2**31 - 1), st.booleans())
 def test_what_is_downloaded_is_uploaded(value: int, segmented: bool) -> None:
@@ -78,6 +79,7 @@ def test_what_is_downloaded_is_uploaded(value: int, segmented: bool) -> None:
 RIG = Rig()
 
 
+@pytest.mark.usefixtures("long_computation")
 @settings(deadline=None, max_examples=15)
 @given(st.integers(0, 1400), st.integers(1, 127), st.booleans())
 def test_block_upload_by_the_library(cycles: int, block_size: int, crc: bool) -> None:

@@ -26,6 +26,7 @@ IDENTITY = (0x46444849, 0x0402, 0x00010000, 1001)
 # -- block download
 
 
+@pytest.mark.usefixtures("long_computation")
 @settings(deadline=None, max_examples=25)
 @given(st.binary(min_size=1, max_size=3000), st.booleans())
 def test_block_download_by_the_library(content: bytes, crc: bool) -> None:

@@ -52,6 +52,7 @@ def bus(twin: TwinProcess) -> Iterator[can.BusABC]:
     bus.shutdown()
 
 
+@pytest.mark.usefixtures("processes")
 def test_the_ready_event_tells_how_to_join(twin: TwinProcess) -> None:
     ready = twin.ready
     assert ready["buses"]["can0"].keys() == {"interface", "channel", "host", "port"}
@@ -149,6 +150,7 @@ def test_the_nc_plays_in_real_time_and_no_sync_is_lost(twin: TwinProcess, tmp_pa
     assert np.abs(table["Y_table_mm"] - table["Y_reference_mm"]).max() < 0.3
 
 
+@pytest.mark.usefixtures("processes")
 def test_two_lockstep_runs_are_equal_bit_by_bit(tmp_path: Path) -> None:
     """One in a process of its own, one in this process: nothing but the configuration decides."""
     path = write_config(tmp_path, 'pace = "lockstep"')
@@ -177,6 +179,7 @@ def _load_torque(folder: Path) -> Path:
     return script
 
 
+@pytest.mark.usefixtures("processes")
 def test_lockstep_waits_for_a_client_that_answers_every_sync(tmp_path: Path) -> None:
     """The client may be as slow as it likes: no offset frame comes late."""
     path = write_config(tmp_path, 'pace = "lockstep"\nlockstep_rpdo = ["X:2"]')
@@ -203,6 +206,7 @@ def test_lockstep_waits_for_a_client_that_answers_every_sync(tmp_path: Path) -> 
     assert first["X_offset_um"][3:] == pytest.approx(expected[3:], abs=1e-5)
 
 
+@pytest.mark.usefixtures("processes")
 def test_machine_whose_operator_has_died_serves_until_its_bus_is_left(tmp_path: Path) -> None:
     with TwinProcess(write_config(tmp_path)) as twin:
         with twin.join() as bus:
@@ -213,6 +217,7 @@ def test_machine_whose_operator_has_died_serves_until_its_bus_is_left(tmp_path: 
         assert twin.wait() == (0, "")
 
 
+@pytest.mark.usefixtures("processes")
 def test_lockstep_waits_for_a_client_whose_offset_is_zero_while_a_program_runs(tmp_path: Path) -> None:
     """A guard is held up while the offset that it sends is still 0: the program does not run on without it."""
     path = write_config(tmp_path, 'pace = "lockstep"\nlockstep_rpdo = ["X:2"]')
@@ -233,6 +238,7 @@ def test_lockstep_waits_for_a_client_whose_offset_is_zero_while_a_program_runs(t
         assert twin.events[-1]["late_rpdo"] == {"X": 0, "Y": 0}
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_pipe_that_nobody_writes_to_can_be_left(number: signal.Signals, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.csv")

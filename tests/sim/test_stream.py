@@ -160,6 +160,7 @@ def test_a_stream_without_rows_and_one_that_is_stopped_end() -> None:
     assert twin.run_until("finished", 10)["stopped"]
 
 
+@pytest.mark.usefixtures("processes")
 def test_rows_and_commands_come_by_standard_input(tmp_path: Path) -> None:
     path = write_config(tmp_path, 'pace = "lockstep"')
     rows = corner() + 2.0

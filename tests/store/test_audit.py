@@ -73,6 +73,7 @@ def test_a_line_cut_off_at_any_byte_is_told_and_the_next_one_stands(written: Pat
         assert list(audit.entries(written))[4] == ({**list(audit.entries(written))[4][0], "asked": "disarm"}, None)
 
 
+@pytest.mark.usefixtures("processes")
 def test_writers_of_two_processes_make_one_chain(tmp_path: Path) -> None:
     code = "import sys; from pathlib import Path; from fdhil.store import audit\n"
     code += "audit.LOCKED_S = 300.0\n"  # the other may have all its turns first, on a slow disk

@@ -77,6 +77,7 @@ def places(size: int, page: int, seed: int) -> list[tuple[int, int]]:
     return found
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.fault("F17")
 def test_no_flipped_bit_of_a_history_changes_what_is_read(tmp_path: Path) -> None:
     whole = filled(tmp_path)

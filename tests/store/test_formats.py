@@ -28,6 +28,7 @@ def _table() -> RecordingTable:
     return table_of(window(table_mm=frozen(lacking)))
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("name", tables.RECORDING_FORMATS)
 def test_what_goes_in_comes_out_to_the_last_bit(name: str, tmp_path: Path) -> None:
     table, path = _table(), tmp_path / f"r{SUFFIX[name]}"

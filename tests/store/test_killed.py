@@ -13,6 +13,8 @@ import pytest
 from fdhil.store.windows import WindowStore, list_windows, read_window
 from tests.store.made import same, window
 
+pytestmark = pytest.mark.usefixtures("processes")
+
 STEPS = 14  # the folder: open and fsync of the one above; each window: open, write, fsync, rename, and the folder again
 
 

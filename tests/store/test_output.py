@@ -69,6 +69,7 @@ def test_what_is_no_regular_file_is_left_alone(kind: str, tmp_path: Path, monkey
     assert os.path.samestat(path.lstat(), before)
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("name", ["/dev/stdout", "answer.txt", "/dev/null"])
 def test_standard_output_is_written_to_where_it_stands(name: str, tmp_path: Path) -> None:
     """Also where it is the very file that is named; what was written before stays before it."""

@@ -19,6 +19,8 @@ from tests.fuzz.tasting import FOUND
 from tests.store import failing_reader
 from tests.store.made import window
 
+pytestmark = pytest.mark.usefixtures("processes")
+
 
 @pytest.fixture(autouse=True)
 def _none_before_and_after() -> Iterator[None]:

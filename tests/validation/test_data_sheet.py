@@ -63,6 +63,7 @@ def test_the_scales_of_the_model_are_what_an_identification_finds(shuttle: str) 
         assert (fitted(scaled(shuttle, signal, 1.2)) - true) / np.log(1.2) == pytest.approx(GAINS[signal], abs=0.05)
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("signal", ["voltage", "current"])
 def test_identify_refuses_a_column_times_1_2_where_the_data_sheet_is_known(
     signal: str, shuttle: str, tmp_path: Path

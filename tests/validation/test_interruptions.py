@@ -43,6 +43,7 @@ def _reasons(rows: Rows) -> list[str]:
     return [str(reason) for outcome in _judged(rows) for reason in outcome.verdict.reasons]
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_rapids_are_found_among_feed_moves_under_load() -> None:
     rapid = drives.rates(MOVE)
     feed = drives.rates(Move(distance=0.06, speed=0.1, acceleration=2.0, smoothing=0.02, direction=1))
@@ -152,6 +153,7 @@ def test_a_short_rapid_is_listed_above_60_percent_only() -> None:
     assert _judged(_rows(drives.rates(Move(0.015, 0.5, 4.0, 0.02, 1)))) == []
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("kind", faults.KINDS)
 def test_no_kind_of_fault_is_accepted_and_does_harm(kind: str) -> None:
     for seed in range(2):

@@ -44,6 +44,7 @@ def test_no_sample_near_a_row_passes_for_knowledge_of_the_delay() -> None:
         assert set(maximum_likelihood.finish(fit).missing) <= {"R", "L"}
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_gains_that_do_step_or_drift_are_still_named() -> None:
     for seed, kind in ((0, "voltage gain steps"), (1, "voltage gain drifts"), (7, "gain step"), (8, "gain drift")):
         judged = judge(kind, seed, recording_of(seed, 2, kind))

@@ -38,6 +38,7 @@ def test_what_a_slow_voltage_cannot_tell_is_null_with_its_reason_and_the_window_
     assert all(np.isfinite(outcome.estimate.value(name)) for name in ("K", "Jt", "ft", "Cd"))
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_a_pool_of_windows_that_leave_l_open_is_validated() -> None:
     outcome = _analysed(59, GOOD)
     for refit in (True, False):

@@ -47,6 +47,7 @@ def test_the_other_direction_gives_the_same_drive() -> None:
     assert _values(analyse(turned, SETTINGS)) == pytest.approx(_values(analyse(window, SETTINGS)), rel=1e-6)
 
 
+@pytest.mark.usefixtures("long_computation")
 @settings(max_examples=4, deadline=None)
 @given(order=st.permutations(range(4)))
 def test_the_order_of_windows_changes_nothing(order: list[int]) -> None:

@@ -75,6 +75,7 @@ async def test_a_program_that_changed_since_it_was_shown_is_not_armed(config: Ma
         assert not [request for request in asked if request["request"] == "arm"]
 
 
+@pytest.mark.usefixtures("long_computation")
 async def test_a_program_that_changed_while_it_was_armed_is_disarmed(config: MachineConfig) -> None:
     ensure_token(_made(config))
 

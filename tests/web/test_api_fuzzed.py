@@ -68,6 +68,7 @@ def test_every_kind_of_page_is_described() -> None:
     )
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("label", OPERATIONS)
 def test_whatever_is_sent_is_answered_as_described(label: str, app: FastAPI, session: Any) -> None:
     name = "" if label.startswith("POST /api/session") else "operator"  # a login that is guessed costs its scrypt

@@ -58,6 +58,7 @@ async def status_line(port: int) -> bytes:
     return line
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize(
     "sent", [b"", b"GET / HTT", b"POST /api/session HTTP/1.1\r\nContent-Length: 90\r\n" + HEAD + b"\r\n{"]
 )

@@ -43,6 +43,7 @@ async def _get(client: httpx.AsyncClient, path: str) -> Any:
     return answer.json()
 
 
+@pytest.mark.usefixtures("long_computation")
 async def test_each_axis_is_told_in_few_words(client: httpx.AsyncClient) -> None:
     moved, never = (await _get(client, ""))["axes"]
     assert (moved["axis"], never["axis"]) == ("X", "Y")

@@ -241,6 +241,7 @@ async def test_so_many_may_look_on_and_no_more(tmp_path: Path, monkeypatch: pyte
                     continue
 
 
+@pytest.mark.usefixtures("long_computation")
 async def test_a_stranger_is_told_nothing_and_a_login_that_ends_ends_the_stream(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -95,6 +95,7 @@ async def test_nobody_waits_in_a_line_before_a_silent_daemon(tmp_path: Path, mon
         assert (await daemon.status())["state"] == "OFF"  # a failure is not kept
 
 
+@pytest.mark.usefixtures("processes")
 async def test_a_forecast_that_says_nonsense_has_failed_and_keeps_no_place(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

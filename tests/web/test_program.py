@@ -114,6 +114,7 @@ def planned(machine: MachineConfig) -> Any:
     return correction.plan(load_trajectory(PROGRAM, machine), nominal_models(machine), machine)
 
 
+@pytest.mark.usefixtures("processes")
 def test_a_dropped_program_says_what_the_command_says(judged: dict[str, Any], planned: Any) -> None:
     told = judged["forecast"]
     assert judged["name"] == "bench.ngc"
@@ -196,6 +197,7 @@ def test_a_line_leads_to_its_worst_place_and_to_its_text(client: Client, judged:
     assert "orders no motion" in still.json()["text"]
 
 
+@pytest.mark.usefixtures("processes")
 def test_feeds_that_keep_a_tolerance_are_found(client: Client, judged: dict[str, Any]) -> None:
     path = f"/api/program/{judged['digest']}"
     asked = client.post(f"{path}/advise", params={"tolerance_um": 60}, headers=WRITES)
@@ -262,6 +264,7 @@ class AnyRefusal:
     __hash__ = None  # type: ignore[assignment]
 
 
+@pytest.mark.usefixtures("processes")
 def test_a_faulty_program_is_refused_with_its_line(client: Client) -> None:
     told = over(client, drop(client, "bad.ngc", b"G21 G90\nG1 X10 Y10 F1000\nG1 X1..5\nM2\n"))
     assert told["state"] == "failed"
@@ -272,6 +275,7 @@ def test_a_faulty_program_is_refused_with_its_line(client: Client) -> None:
     assert (early.status_code, early.json()["code"]) == (409, "NotReady")
 
 
+@pytest.mark.usefixtures("processes")
 def test_a_forecast_is_cancelled_and_its_process_ends(client: Client) -> None:
     squares = "\n".join(["G21 G90 F300", *(f"G1 X{100 * (k % 2)} Y{k}" for k in range(40)), "M2"])
     digest = drop(client, "slow.ngc", squares.encode())

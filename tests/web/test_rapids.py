@@ -74,6 +74,7 @@ async def _get(client: httpx.AsyncClient, path: str, **wanted: Any) -> Any:
     return answer.json()
 
 
+@pytest.mark.usefixtures("long_computation")
 async def test_all_rapids_are_listed_newest_first_page_by_page(client: httpx.AsyncClient) -> None:
     page = await _get(client, "", limit=7)
     ids = [rapid["id"] for rapid in page["rapids"]]
@@ -125,6 +126,7 @@ async def test_one_rapid_is_told_as_the_history_has_it(client: httpx.AsyncClient
     assert (first["older_id"], first["alike_id"]) == (None, None)
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("path", ["/Y/31", "/X/999", "/X/31/signals/more", "/Y/31/signals", "/Q/1"])
 async def test_what_there_is_not_is_said_to_be_missing(client: httpx.AsyncClient, path: str) -> None:
     answer = await client.get(f"/api/rapids{path}")
@@ -133,6 +135,7 @@ async def test_what_there_is_not_is_said_to_be_missing(client: httpx.AsyncClient
     assert answer.json()["advice"]
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("number", [1, 13, 31, 36])
 async def test_the_model_that_is_laid_over_is_the_one_that_the_daemon_judged(
     client: httpx.AsyncClient, number: int
@@ -237,6 +240,7 @@ async def test_a_recording_that_is_gone_or_damaged_is_said_to_be(tmp_path: Path)
         assert fault["advice"]
 
 
+@pytest.mark.usefixtures("processes")
 def test_a_replay_that_hangs_is_ended_and_one_that_has_ended_is_started_anew(
     machine: MachineConfig, app: FastAPI, monkeypatch: pytest.MonkeyPatch
 ) -> None:

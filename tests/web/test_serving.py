@@ -113,6 +113,7 @@ def test_what_cannot_be_listened_at_is_told(tmp_path: Path, capsys: Capture) -> 
         assert (found, words in err, "Traceback" in err) == (code, True, False)
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.fault("G10")
 @pytest.mark.goal("R16")
 def test_served_by_tls_it_tells_no_secret_and_ends_in_order(

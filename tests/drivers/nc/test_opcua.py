@@ -39,6 +39,7 @@ async def once(config: MachineConfig) -> NcState:
         return (await source.read())[-1]
 
 
+@pytest.mark.usefixtures("long_computation")
 async def test_a_value_that_is_not_good_is_none_and_decides_nothing() -> None:
     async with OpcUaPeer() as peer:
         await peer.say(MoveKind.RAPID, line=12)

@@ -38,6 +38,7 @@ async def until(source: NcSource, holds: Callable[[NcState], bool]) -> NcState:
                     return state
 
 
+@pytest.mark.usefixtures("long_computation")
 async def test_it_tells_what_the_nc_does_as_far_as_it_can(name: str) -> None:
     async with PEERS[name]() as peer:
         source = load_nc_source(name)(config_of(name, peer))
