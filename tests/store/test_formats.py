@@ -90,6 +90,7 @@ def _refused(path: Path) -> bool:
     return False
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("name", tables.RECORDING_FORMATS)
 @pytest.mark.fault("G8")
 def test_a_damaged_file_is_refused_in_one_sentence_or_read_as_numbers(name: str, tmp_path: Path) -> None:
