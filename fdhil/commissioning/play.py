@@ -297,12 +297,12 @@ class Bench:
     def _played(self, rows: Float, signals: Signals, begin: Callable[[], bool] = lambda: True) -> Played:
         loop = self.loop
         with following(self.masters, self.plan.bounds) as path, signals(path):
-            while path.stopped is None and not begin():
+            while path.stopped is None and loop.turning and not begin():
                 self._watch(path)
             path.play(_in_blocks(rows))
-            while not path.resting:
+            while not path.resting and loop.turning:  # rows that nobody sends any more never end
                 self._watch(path)
-            if path.stopped is None:
+            if path.stopped is None and loop.turning:
                 self.masters[0].wait_cycles(round(SETTLE_S / loop.period_s))
                 watch_power(self.masters, path)
         played = Played(path.played, len(rows), path.stopped, loop.lateness, loop.scheduling)

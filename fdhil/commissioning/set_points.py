@@ -97,7 +97,8 @@ class SetPoints:
 
     def play(self, rows: Iterable[Row]) -> None:
         """Send these rows, in increments, one per cycle; they begin where the axes rest. Ignored once stopped."""
-        self._rows = iter(rows)
+        if self.stopped is None:
+            self._rows = iter(rows)
 
     def stop(self, why: str) -> None:
         """Brake to rest from the next cycle on; the first reason is kept."""
@@ -127,8 +128,9 @@ class SetPoints:
                 self.played += row is not None
                 return self._last if row is None else tuple(map(float, row))
             self.stop(fault)
-        if self.stopped is not None and self._brake is None:
-            self._rows, self._brake = None, self._braking()
+        if self.stopped is not None:
+            self._rows = None  # another thread may have given some while it was stopped
+            self._brake = self._braking() if self._brake is None else self._brake
         braked = None if self._brake is None else next(self._brake, None)
         return self._last if braked is None else braked
 

@@ -18,6 +18,7 @@ import can
 import numpy as np
 import pytest
 
+from fdhil.commissioning.play import Bench, Played, Signals
 from fdhil.commissioning.void import is_void, void_record
 from fdhil.config import MachineConfig, load
 from tests.arming.guard_peer import Guard
@@ -232,6 +233,43 @@ def test_another_master_ends_what_is_played(what: str, floor: Floor) -> None:
     assert "bus can0: an NC is sending" in document["stopped"]
     assert (left in document["stopped"]) is (what == "target")
     assert "0x1016 may be as fdhil wrote" in document["stopped"]
+
+
+def test_axes_that_are_held_at_the_start_are_switched_off_where_an_nc_comes(
+    floor: Floor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = 0
+
+    def wait_for_enter() -> bool:
+        nonlocal asked
+        asked += 1
+        nc.on |= asked == 20
+        return False
+
+    monkeypatch.setattr("fdhil.cli.play._entered", wait_for_enter)
+    with ForeignNc(floor.config.bus["can0"].channel, FOREIGN["SYNC"], lambda _: False) as nc:
+        code, document, _ = floor.play(STROKE, "--yes", "--hold")
+        assert nc.count(SYNC) <= A_FEW
+    assert (code, document["played"]) == (1, 0)
+    assert "an NC is sending SYNC" in document["stopped"]
+    assert all(peer.drive.power.state.name == "SWITCH_ON_DISABLED" for peer in floor.peers.values())
+
+
+def test_play_ends_where_an_nc_came_before_the_path_began(floor: Floor, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between the way to the start and the demand: the drives are off before the path is made."""
+    nc = ForeignNc(floor.config.bus["can0"].channel, FOREIGN["SYNC"], lambda _: False)
+
+    def prepared_late(bench: Bench, signals: Signals) -> Played:
+        nc.on = True
+        bench.loop._landed.wait(60)
+        return play(bench, signals)
+
+    play = Bench.play
+    monkeypatch.setattr(Bench, "play", prepared_late)
+    with nc:
+        code, document, _ = floor.play(STROKE, "--yes")
+    assert (code, document["played"]) == (1, 0)
+    assert "an NC is sending SYNC" in document["stopped"]
 
 
 @pytest.mark.parametrize("what", FOREIGN)

@@ -134,6 +134,15 @@ def test_after_a_long_stall_the_axes_stay_where_the_drives_stand() -> None:
     assert points.stopped == "late"
 
 
+def test_rows_that_come_after_a_stop_are_ignored_and_the_axes_rest() -> None:
+    points = SetPoints((X,), (7,))
+    points.stop("another master")
+    assert points.step() == (7,)
+    points.play(straight((7,), (50_000,), (SPEED,), (ACCELERATION,)))
+    assert points.resting
+    assert sent(points) == [(7,)]
+
+
 def test_a_drive_that_counts_against_the_axis_has_its_travel_turned() -> None:
     axis = machine(drive={"sign": -1}).axis["X"]
     bounds = Bounds.of("X", axis, 0.001, (-10.0, 100.0), speed_mm_s=50.0)
