@@ -12,6 +12,7 @@ from typing import Any
 from fdhil.arming.token import given_credential
 from fdhil.cia402 import COB_RPDO, first_axis_index
 from fdhil.commissioning.identifiers import require_own_identifiers, sent_pdos
+from fdhil.commissioning.offset_writers import INVALID_COB_ID, identifier_of
 from fdhil.commissioning.record import KEY_NAME, CommissioningRecord, load_record, of_config
 from fdhil.commissioning.void import is_void, void_reason
 from fdhil.config import Axis, MachineConfig, OffsetBounds, share_fault
@@ -23,7 +24,6 @@ from fdhil.guard.limits import OffsetLimits
 from fdhil.guard.settings import AxisSettings, Feedforward, Pdo, Settings
 
 SPEED_STEPS = 2.0  # times the motor's power: room for the load's own inertia and for the sensor's noise
-NOT_VALID = 1 << 31  # bit of a COB-ID
 HEARTBEATS_AWAITED = 2.0  # periods of the drive's heartbeat until it counts as lost
 
 
@@ -139,19 +139,19 @@ def _writers(
     By its record those of all RPDOs that map one, valid or not. Besides what its RPDOs have by default: one of them
     that did not exist, or was not valid, when the drive was commissioned was set up by another master since.
     """
-    node = machine.node_id(name)
-    kept = {} if record is None else {int(key, 16): cob_id for key, cob_id in record.options.items() if key[:2] == "14"}
-    harmless = {cob_id for cob_id in kept.values() if not cob_id & NOT_VALID}
+    node, kept = machine.node_id(name), () if record is None else record.rpdos
+    harmless = {identifier_of(cob_id) for cob_id in kept if not cob_id & INVALID_COB_ID}
+    suspect = {identifier_of(cob_id) for cob_id in kept if cob_id & INVALID_COB_ID}
+    suspect |= {base + node for base in COB_RPDO} | {spec.cob_base + node for spec in profile.rpdos}
+    same_bus = {n: axis for n, axis in machine.axis.items() if axis.drive.bus == machine.axis[name].drive.bus}
     known = {
         spec.cob_base + machine.node_id(other)
-        for other, axis in machine.axis.items()
+        for other, axis in same_bus.items()
         for found in (load_profile(axis.drive),)
         for spec in (*found.rpdos, *found.tpdos)
         if spec.valid
     }
-    suspect = {cob_id & ~NOT_VALID for cob_id in kept.values() if cob_id & NOT_VALID}
-    suspect |= {base + node for base in COB_RPDO} | {spec.cob_base + node for spec in profile.rpdos}
-    known |= {axis.table.cob_id or 0 for axis in machine.axis.values() if axis.table is not None}
+    known |= {axis.table.cob_id or 0 for axis in same_bus.values() if axis.table is not None}
     sent = {spec.cob_base + node for spec in sent_pdos(machine, name, profile)}
     return tuple(sorted(cob_id for cob_id in suspect - known - harmless - sent if 0 < cob_id <= 0x7FF))
 

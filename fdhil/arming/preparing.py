@@ -17,6 +17,7 @@ from fdhil.arming.knowledge import SKILL_MOVES, AxisKnowledge
 from fdhil.arming.program_check import reference_blocks
 from fdhil.arming.standstill import AtRest
 from fdhil.commissioning.feedforward import feedforward_object
+from fdhil.commissioning.offset_writers import INVALID_COB_ID, identifier_of
 from fdhil.commissioning.record import CommissioningRecord, holds, load_record
 from fdhil.config import MachineConfig
 from fdhil.correction import gate, online
@@ -256,7 +257,8 @@ def _feeds(record: CommissioningRecord | None, config: MachineConfig, axis: str)
     found = profile.find_rpdo(profile.speed_offset)
     if record is None or found is None:
         return False
-    return record.options.get(feedforward_object(found[0].number)) == found[0].cob_base + config.node_id(axis)
+    cob_id = record.options.get(feedforward_object(found[0].number), INVALID_COB_ID)
+    return not cob_id & INVALID_COB_ID and identifier_of(cob_id) == found[0].cob_base + config.node_id(axis)
 
 
 def standing_facts(

@@ -13,7 +13,7 @@ from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.identifiers import require_own_identifiers
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.offset_writers import compare_heard_writers
-from fdhil.commissioning.record import CommissioningRecord, fingerprint, load_record
+from fdhil.commissioning.record import CommissioningRecord, fingerprint, is_rpdo, load_record
 from fdhil.commissioning.survey import Survey, survey
 from fdhil.commissioning.void import confirm_record, void_mark, void_record
 from fdhil.config import MachineConfig
@@ -51,7 +51,7 @@ def _difference(record: CommissioningRecord, found: Survey) -> str:
         return "its PDOs are set up otherwise"
     for key in sorted({*record.options, *found.options}):
         was, now = record.options.get(key), found.options.get(key)
-        if was != now and not key.startswith("14"):
+        if was != now and not is_rpdo(key):
             return f"0x{key} is {'missing' if now is None else now}, and was {'missing' if was is None else was}"
     return "vendor, product or revision are others"
 

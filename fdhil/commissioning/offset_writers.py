@@ -25,7 +25,7 @@ POINT = "offset writers"
 MOST_RPDOS = 512
 MOST_MISSING, MOST_MISSING_BEHIND = 16, 4
 INVALID_COB_ID = 1 << 31
-COB_ID_BITS = (1 << 29) - 1
+EXTENDED = 1 << 29
 MOST_MAPPED = 64
 LEAST_HELD = 8  # increments: less is found by chance in many frames
 MULTIPLEXED = (254, 255)
@@ -52,6 +52,17 @@ class OtherRpdo:
     def valid(self) -> bool:
         """Whether the drive takes its frames."""
         return not self.cob_id & INVALID_COB_ID
+
+
+def identifier_of(cob_id: int) -> int:
+    """Return the identifier in a COB-ID as a drive has it; bit 29 is kept, so that one of 29 bits is none of 11.
+
+    Bit 30 says nothing of an RPDO (CiA 301, 7.5.2.35), and drives set it or not.
+
+    >>> f"{identifier_of(0xC000_0205):X} {identifier_of(0x2000_0205):X}"
+    '205 20000205'
+    """
+    return cob_id & (EXTENDED | EXTENDED - 1 if cob_id & EXTENDED else 0x7FF)
 
 
 def read_other_rpdos(master: Master) -> tuple[OtherRpdo, ...]:
@@ -128,7 +139,7 @@ def compare_writers(master: Master, rpdos: tuple[OtherRpdo, ...]) -> Finding:
     if wrong is None:
         return Finding(POINT, expected, expected)
     rpdo, why = wrong
-    where = f"RPDO{rpdo.number} (COB-ID {rpdo.cob_id & COB_ID_BITS:03X})"
+    where = f"RPDO{rpdo.number} (COB-ID {identifier_of(rpdo.cob_id) & ~EXTENDED:03X})"
     parameter, mapping = Object.RPDO_PARAMETER + rpdo.number - 1, Object.RPDO_MAPPING + rpdo.number - 1
     advice = f"set bit 31 of 0x{parameter:04X}:01, or change 0x{mapping:04X}, with the NC's or the drive's own tool"
     return Finding(POINT, expected, where, False, f"its {where} {why}", advice)
@@ -144,7 +155,7 @@ def _wrong(master: Master, rpdos: tuple[OtherRpdo, ...]) -> Iterator[tuple[Other
             yield rpdo, f"is multiplexed and can write {written}: another master can step the table"
         elif written:
             yield rpdo, f"writes {written}, as fdhil does: another master that sends it steps the table"
-        elif rpdo.cob_id & COB_ID_BITS in ours and rpdo.mapped:
+        elif identifier_of(rpdo.cob_id) in ours and rpdo.mapped:
             listed = ", ".join(f"{word:08X}" for word in rpdo.mapped)
             yield rpdo, f"has the COB-ID of an RPDO of the profile and maps {listed}: our frames would write that"
 
@@ -157,8 +168,8 @@ def compare_heard_writers(
     By SDO nobody is asked where an NC runs the bus: a frame that carries what the drive holds has written it.
     """
     profile, axis = load_profile(config.axis[name].drive), config.axis[name]
-    options = {} if record is None else record.options
-    known = {cob_id for key, cob_id in options.items() if key.startswith("14")}
+    kept = () if record is None else record.rpdos
+    known = {identifier_of(cob_id) for cob_id in kept if not cob_id & INVALID_COB_ID}
     for each, other in config.axis.items():
         if other.drive.bus == axis.drive.bus:
             found = load_profile(other.drive)

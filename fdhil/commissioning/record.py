@@ -38,8 +38,8 @@ class CommissioningRecord:
     """The findings and proofs of one drive.
 
     ``config_digest`` is :func:`axis_digest`. ``options`` holds 0x6007, 0x605A, 0x605E, 0x6065, 0x6085 and 0x1017 by
-    their hexadecimal index, as far as the drive has them, its software limits, and the COB-ID of the feed-forward's
-    RPDO where it was made valid. ``offset_in_feedforward`` None: could not be told.
+    their hexadecimal index, as far as the drive has them, its software limits, and the COB-IDs of its RPDOs, as
+    :attr:`rpdos` gives them. ``offset_in_feedforward`` None: could not be told.
     ``watchdog`` is ``proven`` when the drive stopped after our heartbeat did.
     """
 
@@ -65,6 +65,11 @@ class CommissioningRecord:
         return None if low is None or high is None else (low, high)
 
     @property
+    def rpdos(self) -> tuple[int, ...]:
+        """The COB-IDs, as the drive has them, of the RPDOs that the profile lacks, and of the feed-forward's."""
+        return tuple(cob_id for key, cob_id in self.options.items() if is_rpdo(key))
+
+    @property
     def fingerprint(self) -> str:
         """The drive as it was signed off, in 16 hexadecimal digits: what a comparison must find again."""
         who = (self.vendor_id, self.product_code, self.revision, self.serial)
@@ -83,9 +88,14 @@ class CommissioningRecord:
         return json.dumps({"schema": SCHEMA, **asdict(self)}, sort_keys=True).encode()
 
 
+def is_rpdo(option: str) -> bool:
+    """Whether an option of a record is the COB-ID of one of the 512 RPDOs that a drive may have (0x1400 to 0x15FF)."""
+    return option[:2] in ("14", "15")
+
+
 def fingerprint(identity: Sequence[int], mapping_fingerprint: str, options: Mapping[str, int]) -> str:
     """SHA-256, 16 hexadecimal digits, of a drive's identity, PDOs and options; an RPDO's COB-ID is in the PDOs."""
-    own = {key: value for key, value in options.items() if not key.startswith("14")}
+    own = {key: value for key, value in options.items() if not is_rpdo(key)}
     text = json.dumps([list(identity), mapping_fingerprint, own], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -18,7 +18,13 @@ from fdhil.commissioning.device_type import describe, is_drive
 from fdhil.commissioning.finding import Finding, has_object, lacks, read_optional
 from fdhil.commissioning.identifiers import compare_identifiers
 from fdhil.commissioning.master import Master
-from fdhil.commissioning.offset_writers import compare_writers, read_other_rpdos, record_options, unreadable
+from fdhil.commissioning.offset_writers import (
+    compare_writers,
+    identifier_of,
+    read_other_rpdos,
+    record_options,
+    unreadable,
+)
 from fdhil.commissioning.record import SOFTWARE_LIMIT_KEYS
 from fdhil.config import CorrectionLimits
 from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
@@ -258,7 +264,7 @@ def compare_pdo(spec: PdoSpec, found: PdoFound, node_id: int) -> Finding:
     cause = ""
     if found.mapped != wanted:
         cause = f"{spec.name} maps {_mapping(found.mapped)} where the profile has {_mapping(wanted)}"
-    elif found.cob_id & 0x7FF != cob_id or bool(found.cob_id & INVALID_COB_ID) == spec.valid:
+    elif identifier_of(found.cob_id) != cob_id or bool(found.cob_id & INVALID_COB_ID) == spec.valid:
         cause = f"{spec.name} has the COB-ID {found.cob_id:08X}, not {cob_id:03X}{'' if spec.valid else ', not valid'}"
     elif spec.valid and found.kind != spec.every_sync:
         cause = f"{spec.name} has transmission type {found.kind} where the profile has {spec.every_sync}"

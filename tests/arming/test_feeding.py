@@ -38,6 +38,8 @@ def test_a_good_machine_is_vouched_for(config: MachineConfig) -> None:
     feeding = prepare_feeding(config, known(config))
     assert isinstance(feeding, Feeding)
     assert feeding.facts == dict.fromkeys(FEEDFORWARD_FACTS.keys() - {"journal_writable"}, True)
+    save_records(config, options={"6007": 1, "1402": 0x40000401})  # bit 30 says nothing of an RPDO
+    assert prepare_feeding(config, known(config)) == feeding
     assert all(parse_law(dict(law)) is not None for law in feeding.laws.values())
     assert feeding.summary()["axes"] == ["X", "Y"]
 

@@ -193,6 +193,43 @@ def test_guard_is_told_the_cob_ids_of_the_record(tmp_path: Path) -> None:
     assert settings_of(settings, "can0", tmp_path, "").axes[0].writers == (0x333, 0x401)
 
 
+def test_bit_30_of_a_cob_id_says_nothing_of_an_rpdo(tmp_path: Path) -> None:
+    """Drives report it or not; the guard hears the same identifiers."""
+    settings = corrected(tmp_path)
+    kept = {"1403": 0x4000_0501, "1404": 0xC000_0333}
+    save_record(replace(RECORD, options=kept), settings.store.directory)
+    assert settings_of(settings, "can0", tmp_path, "").axes[0].writers == (0x333, 0x401)
+
+
+def test_rpdo_of_a_high_number_is_kept_like_any_other(tmp_path: Path) -> None:
+    settings, plain = corrected(tmp_path), replace(RECORD, options={"6007": 1})
+    record = replace(plain, options={**plain.options, "1500": 0x401, "15FF": 0x8000_0333})
+    assert record.fingerprint == plain.fingerprint
+    save_record(record, settings.store.directory)
+    assert settings_of(settings, "can0", tmp_path, "").axes[0].writers == (0x333, 0x501)
+
+
+def test_drive_of_another_bus_makes_no_identifier_harmless(tmp_path: Path) -> None:
+    document = bench_document("XY") | {
+        "bus": {name: {"interface": "virtual", "channel": name} for name in ("can0", "can1")}
+    }
+    document["axis"]["X"]["drive"] = {**document["axis"]["X"].get("drive", {}), "bus": "can0", "node_id": 1}
+    document["axis"]["Y"]["drive"] = {**document["axis"]["Y"].get("drive", {}), "bus": "can1", "node_id": 1}
+    document["axis"]["Y"]["table"] = {"cob_id": 0x501}
+    del document["axis"]["Y"]["correction"]
+    settings = parse(document, folder=tmp_path)
+    assert settings_of(settings, "can0", tmp_path, "").axes[0].writers == (0x401, 0x501)
+
+
+def test_rpdo_of_29_bits_is_none_of_the_profiles(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    """The drive does not take the guard's frames."""
+    drive, settings = peer
+    drive.drive.dictionary.numbers[0x140101] = 0x2000_0301
+    findings = {each.point: each for each in surveyed(settings)[0].findings}
+    assert findings["RPDO2"].ok is False
+    assert "RPDO2 has the COB-ID 20000301, not 301" in findings["RPDO2"].cause
+
+
 def heard(held: int, frames: Mapping[int, bytes]) -> Traffic:
     """What is heard of a drive that holds an offset, beside an NC that sends these frames, too."""
     sent = {0x381: struct.pack("<ii", held + 7, held), 0x201: struct.pack("<Hi", 15, 7), **frames}
@@ -215,7 +252,7 @@ def test_frame_that_carries_the_offset_of_a_drive_makes_its_record_void(
     held: int, frames: Mapping[int, bytes], found: str, tmp_path: Path
 ) -> None:
     """With the NC on nothing is asked."""
-    record = replace(RECORD, options={"1403": 0x501})
+    record = replace(RECORD, options={"1403": 0x4000_0501, "1404": 0x8000_03F0})
     settings, traffic = corrected(tmp_path), heard(held, frames)
     finding = compare_heard_writers(settings, "X", record, traffic)
     assert (finding.ok, found in finding.cause) == (not found, True)
