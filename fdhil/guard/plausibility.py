@@ -71,8 +71,8 @@ def _sampled(
 
     ``axis.sent[0]`` left after that SYNC, ``sent[1]`` after the one before it and was latched at it. The set-point
     followed then was latched ``setpoint_delay_cycles`` earlier, together with its offset.
-    What changes while nothing is ``sending`` was written by another node; so was what is shown between readings that
-    are what was sent.
+    What changes while nothing is ``sending``, but to one of the last that were sent (a drive may be late), was written
+    by another node; so was what is shown between readings that are what was sent.
     """
     axis = axis._replace(foreign=False) if axis.foreign else axis
     error: float = axis.following_error
@@ -89,7 +89,7 @@ def _sampled(
     late = seen.read_back != axis.sent[1] and seen.read_back in axis.sent[2:4]
     wrong = seen.read_back != axis.sent[1] and not late
     strays = min(axis.strays + STRAY, 2 * STRAY) if wrong else max(0, axis.strays - 1)
-    moved = not sending and seen.read_back and axis.read_back not in (None, seen.read_back)
+    moved = not sending and axis.read_back not in (None, seen.read_back) and seen.read_back not in (0, *axis.sent)
     return axis._replace(
         following_error=error,
         read_back=seen.read_back,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import pytest
 
@@ -12,7 +12,7 @@ from fdhil.errors import ConfigError
 from fdhil.guard.protocol import Mode
 from fdhil.guard.settings import from_json, to_json
 from fdhil.guard.state import Request
-from tests.guard.machine import Bench, bench
+from tests.guard.machine import Bench, Drive, Frame, bench
 
 WRITER, PITCH_ERROR, PERIOD = 0x501, 197, 25
 """An RPDO of drive X that carries 60B0; 60.1 um every 25 SYNC, as an NC that compensates a screw's pitch sends them."""
@@ -91,6 +91,38 @@ def test_offset_that_changes_by_itself_is_not_adopted() -> None:
             machine.drives[0].hold(PITCH_ERROR + machine.tick)
     assert machine.frames == []
     assert (machine.mode, cause(machine)) == (Mode.FROZEN, ("OffsetHijack", "X"))
+
+
+@dataclass
+class LateDrive(Drive):
+    """Applies an offset a SYNC later, and shows it with every SYNC."""
+
+    waits: list[int | None] = field(default_factory=lambda: [None])
+
+    def at_sync(self, tick: int) -> list[Frame]:
+        self.waits.append(self.received_offset)
+        self.received_offset = self.waits.pop(0)
+        frames = super().at_sync(tick)
+        extra = [(0x380 + self.node_id, struct.pack("<ii", self.followed or 0, self.offset))] if tick % 10 else []
+        return frames + extra
+
+
+def test_last_offsets_of_a_drive_that_is_late_are_no_other_masters() -> None:
+    """The guard freezes: the drive goes on to what was sent last, and that is not adopted later than it must be."""
+    plain = bench(amplitude=800)
+    axes = [
+        replace(
+            axis,
+            tpdos=tuple(replace(pdo, every_sync=1 if pdo.cob_id >> 7 == 7 else pdo.every_sync) for pdo in axis.tpdos),
+        )
+        for axis in plain.settings.axes
+    ]
+    machine = Bench(replace(plain.settings, axes=tuple(axes)), plain.path, plain.demand, [LateDrive(1), LateDrive(2)])
+    cutting(machine, 200)
+    machine.hear(0x000, b"\x80\x01")
+    machine.run(10)
+    assert machine.mode is Mode.FROZEN
+    assert machine.state.undisturbed_for > 1000
 
 
 @pytest.mark.fault("A19")
