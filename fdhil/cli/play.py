@@ -81,6 +81,7 @@ def play(
 
 def _play(machine: MachineConfig, plan: Plan, program: Path, go_to_start: bool, hold: bool, yes: bool) -> Played:
     """Ask, lead the drives and play; DriveFault when it is refused."""
+    from fdhil.arming.guard_presence import GuardPresence
     from fdhil.cli.bus_lock import lock_place
     from fdhil.commissioning.play import on_bench, valid_records
     from fdhil.commissioning.realtime import before_other_work
@@ -90,7 +91,7 @@ def _play(machine: MachineConfig, plan: Plan, program: Path, go_to_start: bool, 
         for name in dict.fromkeys(axis.drive.bus for axis in machine.axis.values()):
             held.enter_context(lock_place(machine.bus[name], "set-points"))
         held.enter_context(before_other_work())
-        bench = held.enter_context(on_bench(plan, _say, (machine.guard_directory / SOCKET_NAME).exists))
+        bench = held.enter_context(on_bench(plan, _say, GuardPresence(machine.guard_directory).is_there))
         bench.compare(records)
         here = bench.here()
         bench.require_start(here, go_to_start)

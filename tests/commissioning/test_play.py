@@ -6,6 +6,7 @@ import io
 import json
 import os
 import signal
+import socket
 import threading
 import time
 import uuid
@@ -219,8 +220,16 @@ def test_what_leaves_the_travel_is_refused_before_a_bus_is_opened(floor: Floor) 
     assert floor.sent() <= DRIVES
 
 
-@pytest.mark.parametrize("what", ["SYNC", "target"])
+def leave_socket(folder: Path) -> None:
+    """What a guard that was killed leaves behind."""
+    folder.mkdir(parents=True)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as killed:
+        killed.bind(str(folder / "guard.sock"))
+
+
+@pytest.mark.parametrize("what", ["SYNC", "target", "offset"])
 def test_another_master_ends_what_is_played(what: str, floor: Floor) -> None:
+    leave_socket(floor.config.guard_directory)
     with ForeignNc(floor.config.bus["can0"].channel, FOREIGN[what], moves) as nc:
         code, document, _ = floor.play(STROKE, "--yes")
         assert nc.on

@@ -1,0 +1,47 @@
+"""Whether a guard is there: by who listens at its socket, not by the socket's name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from fdhil.arming import guard_presence
+from fdhil.arming.guard_presence import GuardPresence
+from tests.arming.guard_peer import Guard
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    now_s = [100.0]
+    monkeypatch.setattr(guard_presence.time, "monotonic", lambda: now_s[0])
+    return now_s
+
+
+def test_guard_is_there_while_it_listens_and_a_moment_longer(tmp_path: Path, clock: list[float]) -> None:
+    presence, guard = GuardPresence(tmp_path), Guard(tmp_path)
+    assert presence.is_there()
+    (tmp_path / "guard.sock").unlink()  # cleaned away: it makes it again
+    clock[0] += 2.0
+    assert presence.is_there()
+    guard.close()
+    clock[0] += 2.0
+    assert not presence.is_there()
+
+
+def test_socket_that_a_killed_guard_left_is_no_guard(tmp_path: Path, clock: list[float]) -> None:
+    presence = GuardPresence(tmp_path)
+    assert not presence.is_there()
+    Guard(tmp_path).close()
+    clock[0] += 2.0
+    assert (tmp_path / "guard.sock").exists()
+    assert not presence.is_there()
+
+
+def test_guard_that_starts_is_noticed(tmp_path: Path, clock: list[float]) -> None:
+    presence = GuardPresence(tmp_path)
+    assert not presence.is_there()
+    guard = Guard(tmp_path)
+    clock[0] += 2.0
+    assert presence.is_there()
+    guard.close()
