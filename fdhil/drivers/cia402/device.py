@@ -202,5 +202,5 @@ def _cob_base(cob: DeviceObject, own: int | None) -> int | None:
     if not number or (cob.default or 0) & EXTENDED:
         return None
     if cob.relative or own is not None:
-        return number - (own or 0)
+        return number - (own or 0) if number >= (own or 0) else None
     return None if number & 0x7F else number  # without a node-ID: it was left out of the file

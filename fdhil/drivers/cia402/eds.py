@@ -190,6 +190,10 @@ def _store(section: _Section, key: str, value: str, line: int, name: str) -> Non
         if key in ("CompactSubObj", "NrOfEntries") and number > MAX_SUB_INDEX:
             raise EdsError(name, f"line {line}: {key} is {number}, more than an object can have; correct it")
         value = str(number)
+    before = section.values.get(key, "")
+    if key == "NodeID" and value and before and read_number(value) != read_number(before):
+        what = f"line {line}: NodeID is {value[:40]!r}, and {before[:40]!r} in a line above"
+        raise EdsError(name, f"{what}: its COB-IDs are of one of these nodes; leave the other out")
     section.values[key] = value
 
 

@@ -74,6 +74,18 @@ def test_a_dcf_of_an_impossible_node_is_refused() -> None:
         parse_eds(as_dcf(5, "[DeviceComissioning]\nNodeID=128").encode(), "a.dcf")
 
 
+@pytest.mark.parametrize("second", ["NodeID=6", "[DeviceCommissioning]\nNodeId=0x06", "NODEID=0"])
+def test_a_dcf_of_two_nodes_is_refused(second: str) -> None:
+    with pytest.raises(EdsError, match="and '5' in a line above: its COB-IDs are of one of these nodes"):
+        parse_eds(as_dcf(5, f"[DeviceComissioning]\nNodeID=5\n{second}").encode(), "a.dcf")
+    parse_eds(as_dcf(5, "[DeviceComissioning]\nNodeID=5\nNodeID=0x05").encode(), "a.dcf")
+
+
+def test_a_cob_id_below_the_node_id_contains_none(tmp_path: Path) -> None:
+    text = as_dcf(5, "[DeviceComissioning]\nNodeID=5").replace("ParameterValue=0x185", "ParameterValue=0x3")
+    assert device_of(text, tmp_path).tpdos[0].cob_base is None
+
+
 @pytest.mark.parametrize(
     ("written", "base", "valid"),
     [
