@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from fdhil.arming import guard_presence
 from fdhil.arming.guard_presence import GuardPresence
 from tests.arming.guard_peer import Guard
 
@@ -14,7 +14,7 @@ from tests.arming.guard_peer import Guard
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     now_s = [100.0]
-    monkeypatch.setattr(guard_presence.time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr("fdhil.arming.guard_presence.time", SimpleNamespace(monotonic=lambda: now_s[0]))
     return now_s
 
 
