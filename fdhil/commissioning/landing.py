@@ -41,6 +41,10 @@ class Landed(Protocol):
         """Whether its offset is fdhil's to take to zero."""
 
     @property
+    def offset_by_other(self) -> bool:
+        """Whether another master sent its offset."""
+
+    @property
     def held_offset(self) -> int:
         """The offset of a guard that it shows."""
 
@@ -98,9 +102,10 @@ def outcome(drives: Sequence[Landed], written: set[tuple[int, int]]) -> str:
 
 def _left(drive: Landed) -> str:
     zero = ", its offset taken to zero" if drive.zeroes_offset else ""
+    others = ", and may hold an offset of that master: power it off and on again" if drive.offset_by_other else ""
     if drive.stopped_by_other:
-        unknown = ", and may hold an offset: power it off and on again" if drive.zeroes_offset else ""
+        unknown = ", and may hold an offset: power it off and on again" if drive.zeroes_offset else others
         return f"axis {drive.axis} was left to it, which stopped its node{unknown}"
     if drive.led_by_other:
         return f"axis {drive.axis} was left to it{zero}"
-    return f"axis {drive.axis} was stopped{zero} and its drive switched off"
+    return f"axis {drive.axis} was stopped{zero} and its drive switched off{others}"

@@ -168,7 +168,12 @@ class Master:
     @property
     def zeroes_offset(self) -> bool:
         """Whether its offset is ours: neither a guard nor another master sends it."""
-        return not self.loop.beside_guard and not self._offset_ids & self.bus.watch.sent_by_other
+        return not self.loop.beside_guard and not self.offset_by_other
+
+    @property
+    def offset_by_other(self) -> bool:
+        """Whether another master sent its offset."""
+        return bool(self._offset_ids & self.bus.watch.sent_by_other)
 
     @property
     def held_offset(self) -> int:

@@ -152,7 +152,7 @@ def test_another_master_ends_a_step_within_a_few_sync(step: str, what: str, rig:
         rig.require_left_alone(nc, what, braking)
     left = {
         "target": "axis X was left to it, its offset taken to zero",
-        "offset": "X was stopped and its drive switched",
+        "offset": "X was stopped and its drive switched off, and may hold an offset of that master: power it off",
     }
     assert left.get(what, "X was stopped, its offset taken to zero and its drive switched off") in str(told.value)
     assert ("0x1016 may be as fdhil wrote" in str(told.value)) is (step in ("watchdog test", "rapid"))
