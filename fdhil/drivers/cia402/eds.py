@@ -53,6 +53,11 @@ _NUMBER_KEYS = frozenset(
         *(f"Dummy{number:04d}" for number in range(1, 8)),
     }
 )  # fmt: skip
+# of these a note does not do: they decide what objects there are, of what size, and whose drive it is
+_SURE_KEYS = _NUMBER_KEYS & {
+    "DataType", "ObjectType", "CompactSubObj", "NrOfEntries", "NrOfRXPDO", "NrOfTXPDO", "CompactPDO", "Granularity",
+    "VendorNumber", "ProductNumber",
+}  # fmt: skip
 _KNOWN = {key.lower(): key for key in (*_TEXT_KEYS, *_NUMBER_KEYS, "AccessType", "DefaultValue", "LowLimit")} | {
     key.lower(): key for key in ("HighLimit", "ParameterValue", "StorageLocation", "NodeID", "Baudrate", "Denotation")
 }
@@ -187,6 +192,8 @@ def _store(section: _Section, key: str, value: str, line: int, name: str) -> Non
         number = read_number(value) if value else 0
         if number is None:
             raise EdsError(name, f"line {line}: {key} is {value[:40]!r} where a number belongs; correct it")
+        if key in _SURE_KEYS:
+            _require_one_reading(f"line {line}: {key} of [{section.name}]", value, name)
         if key in ("CompactSubObj", "NrOfEntries") and number > MAX_SUB_INDEX:
             raise EdsError(name, f"line {line}: {key} is {number}, more than an object can have; correct it")
         value = str(number)
@@ -228,7 +235,7 @@ def _commissioning(section: _Section, name: str) -> dict[str, str]:
     for key, text in section.values.items():
         number = read_number(text)
         if key == "NodeID" and text:
-            _require_one_reading(section, "NodeID", text, name)
+            _require_one_reading(f"line {section.line}: NodeID of [{section.name}]", text, name)
             if number in _NO_NODE_ID:
                 continue
             if number is None or number not in _NODE_IDS:
@@ -250,7 +257,7 @@ def _complete_values(section: _Section, name: str) -> None:
         text = section.values.get(key, "")
         found = read_expression(text)
         if of_pdo and text:
-            _require_one_reading(section, key, text, name)
+            _require_one_reading(f"line {section.line}: {key} of [{section.name}]", text, name)
             if found is None:
                 what = f"line {section.line}: {key} of [{section.name}] is {text[:40]!r} where a number belongs"
                 raise EdsError(name, f"{what}; correct it or leave it out")
@@ -262,9 +269,8 @@ def _complete_values(section: _Section, name: str) -> None:
             section.values[key] = f"$NODEID+{found[0]}" if found[1] else str(found[0])
 
 
-def _require_one_reading(section: _Section, key: str, text: str, name: str) -> None:
+def _require_one_reading(where: str, text: str, name: str) -> None:
     """EdsError where a number with a leading zero is another in octal than in decimal."""
     if (octal := octal_reading(text)) is not None:
-        what = f"line {section.line}: {key} of [{section.name}] is {text[:40]!r}"
         readings = f"as octal {octal:#x}, as decimal {read_expression(text)[0]:#x}"  # type: ignore[index] # it is one
-        raise EdsError(name, f"{what}: {readings}; write it without the leading zero, or with 0x")
+        raise EdsError(name, f"{where} is {text[:40]!r}: {readings}; write it without the leading zero, or with 0x")

@@ -24,6 +24,10 @@ _TEXTS = frozenset({"parametername", "vendorname", "productname"})
 _ACCESSES = frozenset({"ro", "wo", "rw", "rww", "rwr", "const"})
 _INDICES = re.compile(r"1[0-9a-f]{3}|[2-9a-f][0-9a-f]{3}")
 _DEEPEST_SUB = 254
+_LEADING_ZERO = re.compile(r"(?:^|[-+\s])(0[0-7]+)[uUlL]*(?![\w.])")
+_PDO_SET_UP = re.compile(r"1[4-9ab][0-9a-f]{2}(sub|value)?")
+_VALUE_KEYS = ("defaultvalue", "parametervalue")
+_SURE_KEYS = frozenset(("datatype", "objecttype", "compactsubobj", "nrofentries", "vendornumber", "productnumber"))
 _IDENTITY = ("vendor", "product", "revision")
 
 Keys = Mapping[str, str]
@@ -55,6 +59,7 @@ def read_sheet(path: Path, node_id: int) -> Sheet:
     if len(raw) > MAX_BYTES:
         raise EdsError(path.name, f"it is larger than {MAX_BYTES >> 20} MiB; this is no EDS file")
     sections = _sections(raw)
+    _require_one_reading(sections, path.name)
     device = sections.get("deviceinfo", {})
     given: set[int] = set()
     objects = tuple(_objects(sections, node_id, given))
@@ -82,6 +87,17 @@ def _sections(raw: bytes) -> dict[str, dict[str, str]]:
             key = key.strip().lower()
             current[key] = value.strip() if key in _TEXTS else _COMMENT.sub("", value).strip()
     return sections
+
+
+def _require_one_reading(sections: Mapping[str, Keys], file: str) -> None:
+    """EdsError where a number that sets up PDOs, sizes or the identity is another in octal than in decimal."""
+    for title, keys in sections.items():
+        for key, text in keys.items():
+            of_pdo = _PDO_SET_UP.match(title) and (key in _VALUE_KEYS or key.isdecimal())
+            number = _LEADING_ZERO.search(text) if key in _SURE_KEYS or of_pdo else None
+            if number and (octal := int(number[1], 8)) != int(number[1]):
+                what = f"{key} of [{title}] is {text!r}: as octal {octal:#x}, as decimal {int(number[1]):#x}"
+                raise EdsError(file, f"{what}; write it without the leading zero, or with 0x")
 
 
 def _objects(sections: Mapping[str, Keys], node_id: int, given: set[int]) -> Iterator[Object]:

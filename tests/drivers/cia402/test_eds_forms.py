@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from fdhil.drivers.cia402.eds import MAX_SECTIONS, parse_eds
 from fdhil.drivers.cia402.eds_numbers import read_expression
 from fdhil.drivers.cia402.profile_file import read_profile
 from fdhil.errors import EdsError
+from fdhil.sim.drive.sheet import read_sheet
 from tests.drivers.cia402.eds_text import COMMON, CURRENT, SERVO, U16, U32, Variable, eds_text, pdos
 
 TARGETS = {0x1600: (0x60400010, 0x607A0020), 0x1A00: (0x60640020, 0x606C0020), 0x1A01: (0x60410010, 0x60780010)}
@@ -140,6 +142,26 @@ def test_number_with_leading_zeros_is_not_absent(written: str, value: int, doubt
     assert device.default(0x1017) == value
     assert [doubt in each for each in device.doubts] == [True] * bool(doubt)
     assert answers(text, tmp_path, "a.eds")["heartbeat"] == f"yes: 1017 is {value} ms"
+
+
+@pytest.mark.parametrize(
+    ("line", "other"),
+    [
+        ("[1800sub1]\nDefaultValue=$NODEID+0x180", "[1800sub1]\nDefaultValue=$NODEID+0600"),
+        ("[1A00sub1]\nDefaultValue=0x60640020", "[1A00sub1]\nDefaultValue=014431000040"),
+        ("[6064]\nDataType=0x0004", "[6064]\nDataType=010"),
+        ("[2000]\nDataType=7\nCompactSubObj=8", "[2000]\nDataType=7\nCompactSubObj=010"),
+        ("[DeviceInfo]\nVendorNumber=1", "[DeviceInfo]\nVendorNumber=0123"),
+    ],
+)
+def test_number_in_two_readings_that_decides_the_pdos_is_refused_by_both_readers(
+    line: str, other: str, tmp_path: Path
+) -> None:
+    for written, refused in ((line, False), (other, True)):
+        (tmp_path / "drive.eds").write_text(f"{eds_text(SERVO)}\n{written}\n")
+        for read in (lambda path: read_device(path), lambda path: read_sheet(path, 5)):
+            with pytest.raises(EdsError, match=r"as octal 0x.*, as decimal 0x") if refused else nullcontext():
+                read(tmp_path / "drive.eds")
 
 
 def test_heartbeat_that_the_file_does_not_give_is_not_zero(tmp_path: Path) -> None:
