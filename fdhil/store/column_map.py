@@ -19,7 +19,7 @@ from fdhil.config.section import Finite, Section
 from fdhil.csv_text import shown
 from fdhil.errors import ConfigError, ConfigFault, RecordingError
 from fdhil.records import Float
-from fdhil.store.counter_wraps import unwrap_counter
+from fdhil.store.counter_wraps import jump_of_reading, unwrap_counter, unwrap_turns
 from fdhil.store.recording_table import (
     COLUMNS,
     FORMAT,
@@ -34,6 +34,7 @@ from fdhil.store.sample_times import even_times, usual_step
 from fdhil.store.trace_text import TraceText
 
 SHOWN_NAMES = 12
+SHORTEST_S = 0.01  # of a recording
 PER_REVOLUTION = {"mm/s": 1e-3, "mm/min": 1e-3 / 60, "m/min": 1 / 60, "m/s": 1.0}  # of the table: by pitch to rad/s
 FACTORS: Mapping[str, Mapping[str, float]] = {
     "time_s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "100ns": 1e-7},
@@ -49,7 +50,12 @@ FACTORS: Mapping[str, Mapping[str, float]] = {
 COUNTED = ("time_s", "position_m", "demand_m")  # what a counter may count
 SYNONYMS = {"sec": "s", "msec": "ms", "U/min": "rpm", "r/min": "rpm", "min-1": "rpm", "m/s^2": "m/s2", "m/s²": "m/s2"}
 _MICRO = str.maketrans({"\u00b5": "u", "\u03bc": "u"})
-_IN_NAME = re.compile(r"[\[(]([^\[\]()]+)[\])]$")  # a unit at the end of a name
+# a unit at the end of a name: in brackets, "Current / mA", "Current, mA", "C1 in A", "Current mA", "current_mA"
+_IN_NAME = (
+    re.compile(r"[\[(]([^\[\]()]+)[\])]$"),
+    re.compile(r"(?:/|,|\sin\s)\s*(\S+)$"),
+    re.compile(r"[\s_](\S{2,})$"),  # one letter may as well be a channel's, or stand for the motor
+)
 Signal = Literal[
     "time_s", "voltage_V", "current_A", "speed_rad_per_s", "position_m", "demand_m", "table_mm", "table_m_s2"
 ]
@@ -130,6 +136,9 @@ def mapped(raw: RecordingTable, told: ColumnMap, source: str) -> RecordingTable:
     time_s, note = even_times(np.round(columns["time_s"] - columns["time_s"][0], 9), rate_hz, source)
     columns["time_s"] = np.round(time_s, 9)
     _check_rising(columns["time_s"], source)
+    if columns["time_s"][-1] < SHORTEST_S:
+        lasts = f"lasts {columns['time_s'][-1]:.3g} s by its times, in which no axis moves"
+        raise RecordingError(f"{source} {lasts}: correct the unit of time_s, or sample_rate_hz")
     if rate_hz is None:
         headers["sample_rate_hz"] = f"{1 / usual_step(columns['time_s']):.9g}"
     if "speed_rad_per_s" not in columns:
@@ -190,6 +199,10 @@ def _signals(raw: RecordingTable, told: ColumnMap, pitch_m: float, source: str) 
             bits = None
             if signal in COUNTED:
                 values, bits = unwrap_counter(values)
+            if signal in ("position_m", "demand_m") and bits is None:
+                values, is_turn = _over_turns(values, column, pitch_m / FACTORS[signal][column.unit], source)
+                if is_turn:
+                    notes[f"{column.name} begins again each turn of the screw, and was unwrapped"] = None
             if bits is not None:
                 notes[f"{column.name} jumps by 2^{bits} as a counter of {bits} bits does, and was unwrapped"] = None
             is_clock = column.name in raw.clocks
@@ -201,6 +214,23 @@ def _signals(raw: RecordingTable, told: ColumnMap, pitch_m: float, source: str) 
         _check_lengths(parts, source)
         signals[signal] = np.sum([*parts.values()], axis=0)
     return signals, [*notes]
+
+
+def _over_turns(values: Float, column: Column, pitch: float, source: str) -> tuple[Float, bool]:
+    """Return a reading within one turn as one over all turns, and whether it was one; ``pitch`` in the map's unit.
+
+    RecordingError for one that begins again at another length than the pitch.
+    """
+    turn = pitch / abs(column.factor or 1.0)
+    values, is_turn = unwrap_turns(values, turn)
+    jump = None if is_turn else jump_of_reading(values)
+    if jump is not None:
+        raise RecordingError(
+            f"{source}: {shown(column.name)} jumps by {jump:g} and goes on, as a reading within one turn that begins "
+            f"again, but one turn is {turn:g} by the column map: correct pitch_m_per_rev, unit and factor, or export a "
+            "position over all turns"
+        )
+    return values, is_turn
 
 
 def _check_places(raw: RecordingTable, told: ColumnMap, source: str) -> None:
@@ -220,8 +250,8 @@ def _check_places(raw: RecordingTable, told: ColumnMap, source: str) -> None:
 def _check_unit(raw: RecordingTable, signal: str, column: Column, source: str) -> None:
     """Refuse a unit that is not the one that stands above the column, where the map scales nothing itself."""
     known = {**FACTORS[signal], **(PER_REVOLUTION if signal == "speed_rad_per_s" else {})}
-    in_name = _IN_NAME.search(column.name)
-    texts = [*raw.texts.get(column.name, ()), *([in_name[1]] if in_name else [])]
+    names = [column.name.strip(), *raw.texts.get(column.name, ())]
+    texts = [*names, *(found[1] for name in names for form in _IN_NAME if (found := form.search(name.strip())))]
     units = [unit for unit in map(_unit, texts) if unit in known]
     wrong = units and not any(math.isclose(known[unit], known[column.unit]) for unit in units)
     if wrong and "factor" not in column.model_fields_set and column.name not in raw.clocks:

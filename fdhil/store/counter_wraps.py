@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fdhil.records import Float
+from fdhil.records import Float, Int
 
 BITS = range(10, 33)
 MOST_DECIMALS = 6
@@ -22,21 +22,56 @@ def unwrap_counter(values: Float) -> tuple[Float, int | None]:
     if known.size < 3 or scale is None:
         return values, None
     counts = np.rint(values[known] * scale)
-    jumps = np.abs(np.diff(counts))
     for bits in BITS:
-        period = 2.0**bits
-        low = -period / 2 if counts.min() < 0 else 0.0
-        if counts.min() < low or counts.max() >= low + period or jumps.max() <= period / 2:
-            continue
-        whole = np.unwrap(counts, period=period)
-        steps = np.abs(np.diff(whole))
-        is_wrap = jumps > period / 2
-        nearby = _nearby(np.where(is_wrap, 0.0, steps))
-        if (steps[is_wrap] <= 2 * nearby[is_wrap] + 2).all() and steps.max() < period / 8:
-            unwrapped = values.copy()
-            unwrapped[known] = whole / scale
-            return unwrapped, bits
+        whole = _without_jumps(counts, 2.0**bits, 2.0)
+        if whole is not None:
+            return _placed(values, known, whole / scale), bits
     return values, None
+
+
+def unwrap_turns(values: Float, turn: float) -> tuple[Float, bool]:
+    """Return the values (n,) of a reading that begins again each ``turn``, without those jumps; and whether it does."""
+    known = np.flatnonzero(np.isfinite(values))
+    whole = _without_jumps(values[known], turn, 1e-3 * turn) if known.size > 2 else None
+    return (values, False) if whole is None else (_placed(values, known, whole), True)
+
+
+def jump_of_reading(values: Float) -> float | None:
+    """Return by how much a moving reading jumps, from one end of its range to the other, and goes on; or None.
+
+    One that stands still there is the end of a recording and the beginning of the next.
+    """
+    known = values[np.isfinite(values)]
+    steps = np.diff(known)
+    reach = np.ptp(known) if known.size else 0.0
+    is_jump = np.abs(steps) > 0.8 * reach
+    if reach == 0 or not is_jump.any() or np.count_nonzero(is_jump) > steps.size / 8:
+        return None
+    others = np.where(is_jump, 0.0, np.abs(steps))
+    near = _nearby(others)[is_jump]
+    goes_on = np.sign(steps[is_jump]) == -np.sign(np.median(steps[~is_jump & (steps != 0)]))
+    is_moving = ((near > others.max() / 8) & (near < reach / 8)).all()
+    return float(np.median(np.abs(steps[is_jump]))) if goes_on.all() and is_moving else None
+
+
+def _without_jumps(counts: Float, period: float, resolution: float) -> Float | None:
+    """Return the counts without jumps of a period; None where none, or something else, explains them."""
+    jumps = np.abs(np.diff(counts))
+    low = -period / 2 if counts.min() < 0 else 0.0
+    if counts.min() < low or counts.max() >= low + period or jumps.max() <= period / 2:
+        return None
+    whole: Float = np.unwrap(counts, period=period)
+    steps = np.abs(np.diff(whole))
+    is_wrap = jumps > period / 2
+    nearby = _nearby(np.where(is_wrap, 0.0, steps))
+    is_steady = (steps[is_wrap] <= 2 * nearby[is_wrap] + resolution).all() and steps.max() < period / 8
+    return whole if is_steady else None
+
+
+def _placed(values: Float, known: Int, whole: Float) -> Float:
+    placed = values.copy()
+    placed[known] = whole
+    return placed
 
 
 def _scale(values: Float) -> float | None:

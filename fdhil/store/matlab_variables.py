@@ -81,7 +81,8 @@ def _leaves(name: str, alias: str, value: Any, depth: int) -> Iterator[tuple[str
 
 
 def _vectors(name: str, alias: str, values: np.ndarray[Any, Any]) -> Iterator[tuple[str, str, Float | str]]:
-    """Yield a vector, or the longer ones of a matrix."""
+    """Yield a vector, or the longer ones of a matrix; a scope has those of a signal that is a vector in the third."""
+    values = values.squeeze() if values.ndim > 2 else values
     if values.size == max(values.shape, default=1):
         if values.size > 1:
             yield name, alias, np.asarray(values, dtype=np.float64).ravel()

@@ -11,7 +11,7 @@ from fdhil.errors import FdhilError
 from fdhil.records import Float
 from fdhil.store.matlab_variables import MOST_DEPTH, matlab_table, texts
 from fdhil.store.reading_process import read_apart
-from fdhil.store.recording_table import UNITS, UNREADABLE, RecordingTable, check_size, unreadable
+from fdhil.store.recording_table import UNIT_KEYS, UNITS, UNREADABLE, RecordingTable, check_size, unreadable
 
 KIND = "HDF5 file"
 MATLAB = "MATLAB 7.3 file"
@@ -45,9 +45,15 @@ def read(content: bytes, source: str) -> RecordingTable:
                 name: np.asarray(stored[part], dtype=np.float64).ravel() for name, (stored, part) in found.items()
             }
             headers = {str(key): _text(value) for key, value in file.attrs.items()}
+            units = {name: _units(stored) for name, (stored, _) in found.items()}
     except UNREADABLE as error:
         raise unreadable(source, KIND, error) from None
-    return RecordingTable(headers, columns)
+    return RecordingTable(headers, columns, texts=units)
+
+
+def _units(stored: Any) -> list[str]:
+    """Return the unit that a dataset's attributes say, whatever the case of their names."""
+    return [_text(value) for key, value in stored.attrs.items() if key.lower() in UNIT_KEYS]
 
 
 def read_matlab(content: bytes, source: str) -> RecordingTable:

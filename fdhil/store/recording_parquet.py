@@ -13,7 +13,8 @@ import pyarrow.parquet as pq
 
 from fdhil.records import Float, Window
 from fdhil.store.export import table_of
-from fdhil.store.recording_table import FORMAT, UNITS, UNREADABLE, RecordingTable, check_size, unreadable
+from fdhil.store.recording_table import FORMAT, UNIT_KEYS, UNITS, UNREADABLE, RecordingTable, check_size, unreadable
+from fdhil.store.trace_cells import past_midnight
 from fdhil.store.windows import FORMAT as WINDOW_FORMAT
 from fdhil.store.windows import decode_window, read_window
 
@@ -40,13 +41,20 @@ def decode(content: bytes, source: str) -> RecordingTable:
         told = file.metadata
         check_size(told.num_rows, told.num_columns, source)
         kinds = [*_kinds(file.schema_arrow)]
+        units = {field.name: _units(field) for field in file.schema_arrow}
         read = file.read(columns=[name for name, kind in kinds if _is_number(kind) or pa.types.is_temporal(kind)])
         columns, clocks, doubts = _columns(read)
         others = {name: kind for name, kind in kinds if name not in columns and name not in doubts}
         doubts |= {name: f"is of type {kind}: write it as a number or a time" for name, kind in others.items()}
     except (pa.ArrowException, *UNREADABLE) as error:
         raise unreadable(source, "Parquet file", error) from None
-    return RecordingTable({str(key): str(value) for key, value in headers.items()}, columns, clocks, doubts)
+    return RecordingTable({str(k): str(v) for k, v in headers.items()}, columns, clocks, doubts, texts=units)
+
+
+def _units(field: pa.Field) -> list[str]:
+    """Return the unit in a field's metadata."""
+    said = (field.metadata or {}).items()
+    return [value.decode(errors="replace") for key, value in said if key.decode(errors="replace").lower() in UNIT_KEYS]
 
 
 def _kinds(fields: Iterable[pa.Field], above: str = "") -> Iterator[tuple[str, pa.DataType]]:
@@ -89,7 +97,8 @@ def _seconds(times: pa.ChunkedArray) -> Float:
     counts = times.cast(pa.int32() if kind.bit_width == 32 else pa.int64())
     first = next((value.as_py() for value in counts if value.is_valid), 0)
     per_s = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}[kind.unit]
-    return np.asarray(pc.subtract(counts, pa.scalar(first, counts.type)).cast(pa.float64()).to_numpy()) / per_s
+    seconds = np.asarray(pc.subtract(counts, pa.scalar(first, counts.type)).cast(pa.float64()).to_numpy()) / per_s
+    return past_midnight(seconds) if pa.types.is_time(kind) else seconds
 
 
 def is_recording(path: Path) -> bool:

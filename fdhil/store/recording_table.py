@@ -40,6 +40,7 @@ UNITS: Mapping[str, str] = {
     "table_m_s2": "m/s2",
 }
 STEP_TOLERANCE = 0.01
+UNIT_KEYS = ("unit", "units")  # under which a file says the unit of a column, in small letters
 # what readers of damaged files raise
 UNREADABLE = (
     ArithmeticError, AssertionError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError,

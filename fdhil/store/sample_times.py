@@ -1,4 +1,4 @@
-"""Times of samples that were written with too few digits: the even grid that they stand for, if there is only one."""
+"""Times of samples with too few digits or with jitter: the even grid that they stand for, if there is only one."""
 
 from __future__ import annotations
 
@@ -11,14 +11,47 @@ from fdhil.store.recording_table import STEP_TOLERANCE
 FIT = 1.1  # of the rounding, by which times may leave an even grid
 MULTIPLE = 0.05  # of the rounding, by which a step may be off a multiple of it
 FEW = 4  # steps that are off: as many may be lost samples of an even grid
+MANY = 0.05  # of the steps: as many are off by jitter, fewer by pauses of the recording
 LEAST_SPANS = 20  # of the rounding, that all times must cover to tell the period to a percent
 
 
 def even_times(time_s: Float, rate_hz: float | None, source: str) -> tuple[Float, str]:
-    """Return the times (n,), or the even grid that they were rounded from, and what was done ("" if nothing).
+    """Return the times (n,), or the even grid that they stand for, and what was done ("" if nothing).
 
-    RecordingError where steps may be rounded times or lost samples; ``rate_hz``, where it is given, decides.
+    RecordingError where steps may be rounded or jittered times, or lost or uneven samples; ``rate_hz`` decides.
     """
+    found_s, note = _unrounded(time_s, rate_hz, source)
+    return (found_s, note) if note else _without_jitter(found_s, rate_hz, source)
+
+
+def _without_jitter(time_s: Float, rate_hz: float | None, source: str) -> tuple[Float, str]:
+    """Return the grid of the rate, where many steps are neither as long as most nor a multiple, as time stamps are."""
+    steps = np.diff(time_s)
+    usual = float(np.median(steps)) if rate_hz is None else 1 / rate_hz
+    if steps.size < FEW or not usual > 0 or (steps <= 0).any():
+        return time_s, ""
+    counts = np.maximum(np.rint(steps / usual), 1)
+    is_off = np.abs(steps - counts * usual) > STEP_TOLERANCE * steps
+    if is_off.sum() <= max(FEW, MANY * steps.size):
+        return time_s, ""
+    shown = f"steps of time vary from {steps.min():.3g} to {steps.max():.3g} s"
+    if rate_hz is None:
+        raise RecordingError(
+            f"{source}: {shown}: even samples with jitter in their time stamps, then give sample_rate_hz under "
+            "[headers] of the column map; or samples taken unevenly, then record with a fixed step"
+        )
+    rows = np.concatenate([[0], np.cumsum(counts)])
+    drift_s = (time_s - time_s[0]) - rows * usual
+    if np.ptp(drift_s) > usual:
+        raise RecordingError(
+            f"{source}: {shown}, and leave those of {rate_hz:g} Hz by {np.ptp(drift_s):.3g} s: correct sample_rate_hz, "
+            "or record with a fixed step"
+        )
+    return time_s[0] + rows * usual, f"{shown}, samples are taken as {usual:.6g} s apart"
+
+
+def _unrounded(time_s: Float, rate_hz: float | None, source: str) -> tuple[Float, str]:
+    """Return the times, or the even grid that they were rounded from, and what was done."""
     steps = np.diff(time_s)
     rounding_s = _rounding(steps)
     if steps.size < FEW or rounding_s is None or (steps < 0).any():

@@ -131,7 +131,7 @@ def _clock(text: str) -> tuple[str, float] | None:
 
 def _clock_column(texts: Sequence[str]) -> CellColumn:
     """Return seconds; midnight is where the time falls by half a day or more, and there alone may the date change."""
-    values, day_s, before, dated = np.full(len(texts), np.nan), 0.0, math.nan, ""
+    values, before, dated = np.full(len(texts), np.nan), math.nan, ""
     for k, text in enumerate(texts):
         read = _clock(text)
         if read is None:
@@ -142,6 +142,14 @@ def _clock_column(texts: Sequence[str]) -> CellColumn:
         midnight = before - seconds > HALF_DAY_S
         if not math.isnan(before) and (date != dated) and not midnight:
             return CellColumn(values, k, True)
-        day_s += DAY_S if midnight else 0.0
-        values[k], before, dated = day_s + seconds, seconds, date
-    return CellColumn(values, None, True)
+        values[k], before, dated = seconds, seconds, date
+    return CellColumn(past_midnight(values), None, True)
+
+
+def past_midnight(seconds: Float) -> Float:
+    """Return times of day that go on past midnight: where they fall by half a day or more a day has passed."""
+    known = np.flatnonzero(np.isfinite(seconds))
+    passed = np.cumsum(np.diff(seconds[known]) < -HALF_DAY_S)
+    gone_on = seconds.copy()
+    gone_on[known[1:]] += DAY_S * passed
+    return gone_on

@@ -28,6 +28,16 @@ from fdhil.store.trace_rows import SAMPLE_ROWS, Body, Row, find_body
 SEPARATORS = "\t;,| "  # a blank stands for a run of blanks
 MOST_LINES_IN_ROW = 8
 ENCODINGS = ("utf-8-sig", "cp1252", "cp932")  # tried in turn; of Western and of Japanese programs
+BINARY = {  # what a file begins with -> what it is, and what to do about it
+    b"MDF     4": "an MDF 4 file: name it .mf4",
+    b"MDF     ": "an MDF file of version 3 or older: save it as MDF 4, .mf4",
+    b"MATLAB ": "a MATLAB file: name it .mat",
+    b"\x89HDF": "an HDF5 file: name it .h5 (MATLAB 7.3: .mat)",
+    b"PAR1": "a Parquet file: name it .parquet",
+    b"PK\x03\x04": "a packed file, as a workbook of Excel is: save the sheet as CSV",
+    b"\xd0\xcf\x11\xe0": "an old workbook of Excel: save the sheet as CSV",
+    b"TDSm": "a TDMS file of LabVIEW: export it as CSV or HDF5",
+}
 _EXCEL = re.compile(r"\"?sep=(.)\"?\s*", re.IGNORECASE)
 _WHOLE_LINE = re.compile(r'"((?:[^"]|"")*)"\s*')
 _COMMENT = re.compile(r"\s*(?:#+|%+|//+)\s*")
@@ -63,6 +73,8 @@ def parse_trace(content: bytes, told: TraceText, source: str) -> RecordingTable:
 
 
 def _text(content: bytes, told: TraceText, source: str) -> str:
+    if kind := next((kind for mark, kind in BINARY.items() if content.startswith(mark)), None):
+        raise RecordingError(f"{source} is no text but {kind}")
     if told.encoding is not None:
         try:
             codecs.lookup(told.encoding)

@@ -288,7 +288,7 @@ def test_screen_form_of_candump_is_named(line: str, tmp_path: Path) -> None:
     [
         ("(12.000100) can0 080#0", "a line that is no frame"),
         ("(12.000100) can0 080#010203040506070809", "9 bytes|no frame|larger"),
-        ("(12.000100) can0 080##0010203040506070809", "cannot be read"),
+        ("(12.000100) can0 080##0010203040506070809", "9 bytes in a CAN FD frame, which has 0 to 8, 12"),
         ("(12.000100) can0 8FF#", "identifier 8FF is too large"),
         ("(12.000", "a line that is no frame"),
     ],

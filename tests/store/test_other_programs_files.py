@@ -132,6 +132,9 @@ def test_a_scope_has_its_own_time_and_one_signal_its_label(write: Any, tmp_path:
     wide = {"time": TIME, "signals": {"values": np.column_stack([*VALUES.values()]), "label": "all"}}
     write(tmp_path / "wide.mat", {"ScopeData": wide})
     _assert_read(tmp_path / "wide.mat", _map({n: f"all(:,{k})" for k, n in enumerate(VALUES, 1)}, time=False))
+    deep = {"time": TIME, "signals": {"values": np.array([*VALUES.values()])[:, None, :], "label": "all"}}
+    write(tmp_path / "deep.mat", {"ScopeData": deep})
+    _assert_read(tmp_path / "deep.mat", _map({n: f"all({k},:)" for k, n in enumerate(VALUES, 1)}, time=False))
 
 
 def test_two_signals_of_one_label_are_refused(tmp_path: Path) -> None:
@@ -226,6 +229,22 @@ def test_a_unit_of_an_mdf_channel_is_not_overruled(tmp_path: Path) -> None:
         _table(tmp_path / "r.mf4", _map(time=False))
 
 
+def test_a_unit_of_a_dataset_or_a_field_is_not_overruled(tmp_path: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    with h5py.File(tmp_path / "r.h5", "w") as file:
+        for name, values in {"t": TIME, **VALUES}.items():
+            file[name] = values
+        file["i"].attrs["Units"] = "mA"
+    table = pa.table({"t": TIME, **VALUES})
+    fields = [field.with_metadata({"unit": "mA"}) if field.name == "i" else field for field in table.schema]
+    pq.write_table(table.cast(pa.schema(fields)), tmp_path / "r.parquet")
+    for name in ("r.h5", "r.parquet"):
+        with pytest.raises(RecordingError, match="'i' in mA, the column map says A"):
+            _table(tmp_path / name, _map())
+
+
 @pytest.mark.parametrize("kind", [{"sync_type": 2}, {"sync_type": 0, "channel_type": 0}])
 def test_a_group_over_an_angle_or_over_nothing_has_no_time(kind: Mapping[str, int], tmp_path: Path) -> None:
     import asammdf
@@ -268,13 +287,15 @@ def _times() -> dict[str, Any]:
         "duration[ms]": pa.array(ns // 10**6, pa.duration("ms")),
         "timestamp[us, UTC]": pa.array(ns // 1000 + 1_741_169_723_000_000, pa.timestamp("us", "UTC")),
         "time32[ms]": pa.array((ns // 10**6).astype(np.int32), pa.time32("ms")),
+        "past midnight": pa.array(((ns // 10**6 + 86_399_980) % 86_400_000).astype(np.int32), pa.time32("ms")),
         "time64[ns]": pa.array(ns + 3_600_000_000_000, pa.time64("ns")),
         "double": pa.array(TIME),
     }
 
 
 @pytest.mark.parametrize(
-    "kind", ["duration[ns]", "duration[ms]", "timestamp[us, UTC]", "time32[ms]", "time64[ns]", "double"]
+    "kind",
+    ["duration[ns]", "duration[ms]", "timestamp[us, UTC]", "time32[ms]", "past midnight", "time64[ns]", "double"],
 )
 def test_every_type_of_time_of_parquet_is_read(kind: str, tmp_path: Path) -> None:
     import pyarrow as pa
@@ -354,3 +375,18 @@ def test_a_process_of_its_own_reads_all_that_a_map_may_use(tmp_path: Path) -> No
     _matlab_5(tmp_path / "r.mat", {"a": {"t": TIME, **VALUES}, "b": {"t": TIME}})
     with pytest.raises(RecordingError, match=r"'t' stands for a\.t and b\.t"):
         read_table(tmp_path / "r.mat", _map())
+
+
+def test_a_position_within_one_turn_goes_on_by_the_pitch_or_is_refused() -> None:
+    slope = {**VALUES, "x": np.arange(N) * 1e-3 % 0.02}
+    read = mapped(RecordingTable({}, {"t": TIME, **slope}), _map(), "trace")
+    np.testing.assert_allclose(read.columns["position_m"], np.arange(N) * 1e-3, atol=1e-9)
+    assert "x begins again each turn of the screw" in read.headers[NOTES]
+    other = {**VALUES, "x": np.arange(N) * 1e-3 % 0.03}
+    with pytest.raises(RecordingError, match=r"'x' jumps by 0.029 and goes on, .* one turn is 0.02 by the column map"):
+        mapped(RecordingTable({}, {"t": TIME, **other}), _map(), "trace")
+
+
+def test_a_recording_of_a_wrong_unit_of_time_is_refused() -> None:
+    with pytest.raises(RecordingError, match=r"lasts 5.9e-05 s by its times.*correct the unit of time_s"):
+        mapped(RecordingTable({}, {"t": TIME * 1e-3, **VALUES}), _map(), "trace")

@@ -7,7 +7,7 @@ import pytest
 
 from fdhil.errors import RecordingError
 from fdhil.records import Float
-from fdhil.store.counter_wraps import unwrap_counter
+from fdhil.store.counter_wraps import jump_of_reading, unwrap_counter, unwrap_turns
 from fdhil.store.sample_times import even_times, usual_step
 
 K = np.arange(1000.0)
@@ -39,15 +39,28 @@ def test_samples_lost_between_rounded_times_stay_lost() -> None:
         np.delete(K, 500) * 1e-3,
         np.delete(K, np.random.default_rng(1).choice(998, 30, replace=False) + 1) * 1e-3,
         np.delete(K, [*range(200, 205), *range(400, 405), *range(600, 605), *range(800, 805)]) * 1e-3,
-        K * 1e-3 + np.random.default_rng(1).uniform(-5e-5, 5e-5, 1000),
         np.sort(np.append(K, 500)) * 1e-3,
     ],
-    ids=["even", "one lost", "thirty lost", "four bursts lost", "jitter", "one twice"],
+    ids=["even", "one lost", "thirty lost", "four bursts lost", "one twice"],
 )
 def test_other_times_are_left_as_they_are(time_s: Float) -> None:
     even, note = even_times(time_s, None, "trace")
     assert np.array_equal(even, time_s)
     assert note == ""
+
+
+def test_times_with_jitter_are_refused_unless_the_rate_is_given() -> None:
+    kept = np.delete(K, [400, 401, 700])
+    time_s = kept * 1e-3 + np.random.default_rng(1).uniform(-5e-5, 5e-5, kept.size)
+    with pytest.raises(
+        RecordingError, match=r"vary from .* with jitter in their time stamps.* or samples taken uneven"
+    ):
+        even_times(time_s, None, "trace")
+    even, note = even_times(time_s, 1000.0, "trace")
+    np.testing.assert_allclose(np.diff(even), np.diff(kept) * 1e-3)
+    assert "samples are taken as 0.001 s apart" in note
+    with pytest.raises(RecordingError, match=r"leave those of 990 Hz by 0.01\d* s: correct sample_rate_hz"):
+        even_times(time_s, 990.0, "trace")
 
 
 def test_steps_that_are_rounded_or_lost_are_refused_unless_the_rate_is_given() -> None:
@@ -107,3 +120,19 @@ def test_another_jump_is_left_to_the_checks(counts: Float) -> None:
 def test_the_usual_step_is_the_mean_of_like_ones_or_the_median() -> None:
     assert usual_step(np.array([0.0, 0.333e-3, 0.667e-3, 1e-3, 9.0])) == pytest.approx(1e-3 / 3)
     assert usual_step(np.array([0.0, 1.0, 3.0])) == 1.5
+
+
+@pytest.mark.parametrize("turn", [20.0, 360.0, 10000.0])
+def test_reading_within_one_turn_is_unwrapped_by_the_pitch(turn: float) -> None:
+    over_all = turn * np.concatenate([np.zeros(50), np.linspace(0.0, 6.0, 300), np.full(50, 6.0)])
+    read, is_turn = unwrap_turns(over_all % turn, turn)
+    assert is_turn
+    np.testing.assert_allclose(read, over_all)
+    assert not unwrap_turns(over_all % turn, 0.7 * turn)[1]
+    assert jump_of_reading(over_all % turn) == pytest.approx(turn, rel=0.05)
+
+
+def test_position_of_two_recordings_in_one_file_is_no_reading_within_one_turn() -> None:
+    rapid = np.concatenate([np.zeros(50), np.linspace(0.0, 120.0, 300), np.full(50, 120.0)])
+    for values in (np.tile(rapid, 2), rapid, np.zeros(100), np.where(K[:400] == 200, 0.0, rapid + 1)):
+        assert jump_of_reading(values) is None

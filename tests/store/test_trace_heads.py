@@ -192,3 +192,17 @@ def test_a_row_that_was_not_written_to_its_end_is_left_out(cut: int, kept: int) 
 def test_an_empty_line_after_each_row_is_no_interruption() -> None:
     assert _parsed("Time;U;I\n\n", lambda k: f"{k};{U[k]};{I[k]}\n").interruption == ""
     assert "line 11" in _parsed("", lambda k: f"{k};{U[k]};{I[k]}" + ("\n" if k == 9 else "")).interruption
+
+
+@pytest.mark.parametrize(
+    ("begins", "words"),
+    [
+        (b"MDF     3.30    ", "version 3 or older: save it as MDF 4"),
+        (b"MDF     4.10    ", "an MDF 4 file: name it .mf4"),
+        (b"PK\x03\x04", "workbook of Excel is: save the sheet as CSV"),
+        (b"PAR1", "a Parquet file: name it .parquet"),
+    ],
+)
+def test_a_file_that_is_no_text_is_named(begins: bytes, words: str) -> None:
+    with pytest.raises(RecordingError, match=f"is no text but .*{words}"):
+        parse_trace(begins + bytes(range(256)), TraceText(), "trace")

@@ -20,6 +20,7 @@ from fdhil.drivers.can.logged_frame import (
     LogHeader,
     bus_name,
     error_frame,
+    fd_dlc,
 )
 from fdhil.errors import RecordingError
 
@@ -56,7 +57,7 @@ def _frame(message: can.Message, start_ns: int, of_socketcan: bool) -> LoggedFra
     dlc = message.dlc
     if message.is_fd:
         fd = (RATE_SWITCH if message.bitrate_switch else 0) | (ERROR_STATE if message.error_state_indicator else 0)
-        dlc = FD_LENGTHS.index(len(data))
+        dlc = fd_dlc(len(data))
     t_ns = start_ns + round(message.timestamp * 1e9)
     bus = bus_name(message.channel + 1 if isinstance(message.channel, int) else 1)
     if message.is_error_frame:

@@ -10,11 +10,11 @@ from pathlib import Path
 from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
 from fdhil.drivers.can.logged_frame import (
     CLASSIC_BYTES,
-    FD_LENGTHS,
     IDENTIFIER_MASK,
     LoggedFrame,
     LogHeader,
     decimal_ns,
+    fd_dlc,
     lines_of,
     micros,
 )
@@ -44,7 +44,7 @@ def parse_line(line: str) -> LoggedFrame:
     elif asked is not None:
         dlc = int(asked or "0")
     else:
-        dlc = FD_LENGTHS.index(len(data)) if fd is not None else len(data)
+        dlc = fd_dlc(len(data)) if fd is not None else len(data)
     if dlc > CLASSIC_BYTES and fd is None and raw is None:
         raise ValueError(f"{dlc} bytes in a classic frame")
     can_id = _flagged(int(name, 16), len(name) > 3) | (0 if asked is None else REMOTE_FLAG)

@@ -21,6 +21,13 @@ _MOST_CHARACTERS = 4096  # of a line
 _BY_NUMBER = re.compile(r"can(0|[1-9]\d{0,2})")
 
 
+def fd_dlc(count: int) -> int:
+    """Return the data length code of a CAN FD frame; ValueError where none has so many bytes."""
+    if count not in FD_LENGTHS:
+        raise ValueError(f"{count} bytes in a CAN FD frame, which has 0 to 8, 12, 16, 20, 24, 32, 48 or 64")
+    return FD_LENGTHS.index(count)
+
+
 @dataclass(frozen=True, slots=True)
 class LoggedFrame:
     """A frame at ``t_ns`` (since 1970, or the log's own zero) on ``bus``; ``can_id`` has the flags of SocketCAN.

@@ -14,12 +14,12 @@ from pathlib import Path
 from fdhil.drivers.can.frames import EXTENDED_FLAG, REMOTE_FLAG
 from fdhil.drivers.can.logged_frame import (
     ERROR_STATE,
-    FD_LENGTHS,
     RATE_SWITCH,
     LoggedFrame,
     LogHeader,
     bus_name,
     error_frame,
+    fd_dlc,
     lines_of,
     micros,
     name_remarks,
@@ -116,7 +116,7 @@ def _dlc(row: Mapping[str, str], fd: int | None) -> int:
     """Return the data length code; column l has a length instead."""
     if "L" in row:
         return int(row["L"])
-    return FD_LENGTHS.index(int(row["l"])) if fd is not None else int(row["l"])
+    return fd_dlc(int(row["l"])) if fd is not None else int(row["l"])
 
 
 def write(path: Path, frames: Iterable[LoggedFrame], header: LogHeader) -> None:
