@@ -21,7 +21,7 @@ NODE_ID = "$NODEID"
 class DeviceObject:
     """One variable of the dictionary; ``bits`` 0: it is no integer. ``default`` None: the file gives none.
 
-    ``relative``: the default contains the node-ID. ``doubt`` is how a default with a leading zero can be read, too.
+    ``relative``: the default contains the node-ID. ``doubt`` is what its default is written as that can be read in no or two ways.
     """
 
     key: ObjectKey
@@ -150,11 +150,12 @@ def _objects(dictionary: Any) -> Iterable[DeviceObject]:
         for sub, variable in getattr(entry, "subindices", {0: entry}).items():
             bits, signed = INTEGERS.get(variable.data_type, (0, False))
             written = getattr(variable, "value_raw", None) or getattr(variable, "default_raw", None) or ""
-            value = variable.default if variable.value is None else variable.value
+            value = variable.value if getattr(variable, "value_raw", None) else variable.default
             octal = octal_reading(written) if bits else None
             if octal is not None or (value is None and NODE_ID in written):  # of no node: as of node 0
                 value = (read_expression(written) or (None, False))[0]
-            shown = f"{index:04X}:{sub:02X} is written {written}"
+            doubt = "" if octal is None else f": taken as {value}, it is {octal} if octal is meant"
+            doubt = ", which is no number: taken as not given" if bits and written and value is None else doubt
             yield DeviceObject(
                 key=(index, sub),
                 name=entry.name if entry.name == variable.name else f"{entry.name}: {variable.name}",
@@ -164,7 +165,7 @@ def _objects(dictionary: Any) -> Iterable[DeviceObject]:
                 mappable=bool(variable.pdo_mappable),
                 default=value if isinstance(value, int) else None,
                 relative=NODE_ID in written,
-                doubt="" if octal is None else f"{shown}: taken as {value}, it is {octal} if octal is meant",
+                doubt=f"{index:04X}:{sub:02X} is written {written[:40]}{doubt}" if doubt else "",
             )
 
 

@@ -164,6 +164,14 @@ def test_number_in_two_readings_that_decides_the_pdos_is_refused_by_both_readers
                 read(tmp_path / "drive.eds")
 
 
+@pytest.mark.parametrize("written", ["64h", "100 ms", "0x"])
+def test_default_that_is_no_number_is_noted(written: str, tmp_path: Path) -> None:
+    text = eds_text(SERVO).replace("[1017]", f"[1017]\nParameterValue={written}")
+    device = device_of(text, tmp_path)
+    assert device.default(0x1017) is None
+    assert device.doubts == (f"1017:00 is written {written}, which is no number: taken as not given",)
+
+
 def test_heartbeat_that_the_file_does_not_give_is_not_zero(tmp_path: Path) -> None:
     variables = [each for each in SERVO if each[0] != 0x1017] + [(0x1017, 0, U16, "rw", 0, None)]
     assert answers(eds_text(variables), tmp_path, "a.eds")["heartbeat"] == "yes: its EDS does not say its period (1017)"
