@@ -15,7 +15,7 @@ from fdhil.config import MachineConfig
 from fdhil.config.sensors import ModbusPlace
 from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.modbus.counter_clock import CounterClock
-from fdhil.drivers.modbus.line import Request
+from fdhil.drivers.modbus.line import ModbusRefused, Request
 from fdhil.drivers.modbus.link import ModbusLink
 from fdhil.drivers.modbus.tcp_line import TcpLine
 from fdhil.drivers.modbus.voltage import ModbusVoltage, SensorBlock, parse_block
@@ -80,13 +80,13 @@ async def test_a_sensor_that_stands_still_is_noticed_once() -> None:
     [
         ("silent", DeviceTimeout, "was not answered within 0.2 s"),
         ("exception", ProtocolError, "illegal register address"),
-        ("busy", ProtocolError, "busy"),
+        ("busy", ProtocolError, "is refused (busy); ask it less often"),
         ("short", DeviceError, ""),
         ("nonsense", ProtocolError, "what came is no answer of Modbus TCP"),
         ("other function", ProtocolError, "function 1 is answered where 6 was asked"),
         ("nan", ProtocolError, "sample rate of nan Hz"),
         ("too many", ProtocolError, "101 samples"),
-        ("hang up", DeviceError, ""),
+        ("hang up", ConnectError, "is gone; check its supply and cable, and that it serves so many clients"),
     ],
 )
 async def test_each_misbehaviour_is_one_error(mode: str, error: type[DeviceError], says: str) -> None:
@@ -98,6 +98,14 @@ async def test_each_misbehaviour_is_one_error(mode: str, error: type[DeviceError
             await sensor.poll(TickClock(0.001))
         assert says in str(caught.value)
         sensor.link.close()
+
+
+@pytest.mark.parametrize(
+    ("code", "says"),
+    [(2, "compare the register map"), (4, "its own"), (11, "check unit, and the line behind the gateway")],
+)
+def test_exception_of_a_unit_or_gateway_has_its_own_advice(code: int, says: str) -> None:
+    assert says in str(ModbusRefused("voltage sensor X", 0, code))
 
 
 @pytest.mark.parametrize("other", [0, 1, 255])

@@ -21,7 +21,7 @@ NODE_ID = "$NODEID"
 class DeviceObject:
     """One variable of the dictionary; ``bits`` 0: it is no integer. ``default`` None: the file gives none.
 
-    ``relative``: the default contains the node-ID. ``doubt`` is what its default is written as that can be read in no or two ways.
+    ``relative``: the default contains the node-ID. ``doubt`` says of a default that it can be read in no or two ways.
     """
 
     key: ObjectKey

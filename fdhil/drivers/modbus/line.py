@@ -22,6 +22,12 @@ EXCEPTIONS = {
     10: "gateway path unavailable",
     11: "gateway target does not answer",
 }
+ADVICE = {
+    **dict.fromkeys((1, 2, 3), "compare the register map with the config"),
+    **dict.fromkeys((5, 6), "ask it less often"),
+    10: "check the gateway's own settings",
+    11: "check unit, and the line behind the gateway",
+}
 
 
 class ModbusRefused(ProtocolError):
@@ -30,7 +36,8 @@ class ModbusRefused(ProtocolError):
     def __init__(self, device: str, address: int, code: int) -> None:
         self.code = code
         what = EXCEPTIONS.get(code, f"exception {code}")
-        super().__init__(device, f"register {address} is refused ({what}); compare the register map with the config")
+        advice = ADVICE.get(code, "check the device: the fault is its own")
+        super().__init__(device, f"register {address} is refused ({what}); {advice}")
 
 
 class DamagedAnswer(ProtocolError):

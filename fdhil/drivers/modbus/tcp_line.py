@@ -137,8 +137,6 @@ class TcpLine:
             text = "what came is no answer of Modbus TCP, the connection is made anew; compare host and port"
             raise DamagedAnswer(request.name, "ModbusShape", text) from None
         except ModbusException as error:
-            if not self.connected:
-                raise self._gone(request) from error
             raise self._silent(request) from error
         task = asyncio.current_task()
         if task is not None and task.cancelling():
@@ -149,10 +147,14 @@ class TcpLine:
         return answer
 
     def _gone(self, request: Request) -> ConnectError:
-        text = f"the connection to the Modbus device {self._where} is gone; check its supply and cable"
+        text = f"the connection to the Modbus device {self._where} is gone"
+        text += "; check its supply and cable, and that it serves so many clients"
         return ConnectError(request.name, text)
 
     def _silent(self, request: Request) -> DeviceError:
+        if not self.connected:  # the device ended it, which the library does not tell who waits
+            self.close()
+            return self._gone(request)
         # a late answer must not be taken for the next one's: the connection is made anew
         self.close()
         return no_answer(request, SILENT_ADVICE)
