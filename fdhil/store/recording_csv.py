@@ -32,7 +32,11 @@ def parse_table(text: str, source: str) -> RecordingTable:
         raise RecordingError(f"{source} is truncated: it has headers but no columns; record it again")
     check_lengths(lines[k:], k + 1, source)
     names = [name.strip() for name in lines[k].split(",")]
-    headers = check_headers(_headers(lines[:k]), dict.fromkeys(names), source)
+    headers = check_headers(_headers(lines[:k], len(names), source), dict.fromkeys(names), source)
+    for name in names:
+        if name and names.count(name) > 1:
+            places = " and ".join(f"#{j + 1}" for j, other in enumerate(names) if other == name)
+            raise RecordingError(f"{source} has {shown(name)} above {places} (line {k + 1}): rename or take out one")
     if not text.endswith("\n"):
         raise RecordingError(
             f"{source} is truncated: line {len(lines)} has no end of line, so its last number may be cut; copy it again"
@@ -41,9 +45,19 @@ def parse_table(text: str, source: str) -> RecordingTable:
     return RecordingTable(headers, {name: table[:, k] for k, name in reversed([*enumerate(names)])})
 
 
-def _headers(lines: list[str]) -> dict[str, str]:
-    told = (line[1:].partition(":") for line in lines)
-    return {key.strip(): value.strip() for key, colon, value in told if colon}
+def _headers(lines: list[str], width: int, source: str) -> dict[str, str]:
+    """Return the headers, without the empty cells that a spreadsheet writes behind each."""
+    empty = "," * (width - 1)
+    if all(line.endswith(empty) for line in lines):
+        lines = [line.removesuffix(empty) for line in lines]
+    headers: dict[str, str] = {}
+    for number, line in enumerate(lines, 1):
+        key, colon, value = line[1:].partition(":")
+        key, value = key.strip(), value.strip()
+        if colon and headers.setdefault(key, value) != value:
+            both = f"{shown(headers[key])} and again, in line {number}, {shown(value)}"
+            raise RecordingError(f"{source} has header {shown(key)} = {both}: take out the wrong one")
+    return headers
 
 
 def encode(table: RecordingTable) -> bytes:

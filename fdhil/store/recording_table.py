@@ -47,6 +47,7 @@ UNREADABLE = (
     TypeError, ValueError, struct.error, zlib.error,
 )  # fmt: skip
 MIN_ROWS = 16
+MOST_SHOWN = 12  # names in an error
 MAX_VALUES = 64_000_000  # half a gigabyte
 MAX_SAMPLES_CHARS = 16 * 1024 * 1024
 PITCH_M = (1e-5, 0.8)
@@ -141,7 +142,10 @@ def check_headers(headers: Mapping[str, str], columns: Mapping[str, object], sou
         )
     absent = [name for name in COLUMNS if name not in columns]
     if absent:
-        raise RecordingError(f"{source} has no column {', '.join(absent)}: it needs {','.join(COLUMNS)}")
+        has = ", ".join([shown(name) for name in columns][:MOST_SHOWN]) or "no columns"
+        raise RecordingError(
+            f"{source} has no column {', '.join(absent)}; it has {has}: rename, or give --columns with a column map"
+        )
     return dict(headers)
 
 

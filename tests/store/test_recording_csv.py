@@ -211,3 +211,20 @@ def test_sensors_at_the_table_may_lack_rows_and_other_columns_may_not() -> None:
         parse_recording(bench.table_text(0.001, columns | {"current_A": lacking}))
     with pytest.raises(RecordingError, match="line 13 has the non-finite value 'inf'"):
         parse_recording(bench.table_text(0.001, columns | {"table_mm": np.where(np.isnan(lacking), np.inf, 1.0)}))
+
+
+def test_what_stands_twice_is_refused_and_empty_cells_of_a_spreadsheet_are_not() -> None:
+    text = _text()
+    with pytest.raises(
+        RecordingError, match=r"header 'axis' = 'X' and again, in line \d+, 'Y': take out the wrong one"
+    ):
+        parse_recording(text.replace("# axis: X\n", "# axis: X\n# axis: Y\n"))
+    with pytest.raises(RecordingError, match=r"'current_A' above #3 and #4 \(line \d+\)"):
+        parse_recording(text.replace("current_A,speed", "current_A,current_A,speed"))
+    saved = "".join(line + "," * 5 * line.startswith("#") + "\n" for line in text.splitlines())
+    assert parse_recording(saved).headers == parse_recording(text).headers
+
+
+def test_a_recording_saved_with_other_separators_shows_what_it_has() -> None:
+    with pytest.raises(RecordingError, match=r"no column time_s, .*; it has 'time_s;voltage_V;.*--columns"):
+        parse_recording(_text().replace(",", ";"))
