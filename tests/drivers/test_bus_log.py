@@ -344,6 +344,14 @@ End TriggerBlock
     ]
 
 
+def test_name_where_an_identifier_belongs_is_refused_with_its_line(tmp_path: Path) -> None:
+    (tmp_path / "bus.asc").write_text("base hex  timestamps absolute\n   0.5 1  Engine             Rx   d 1 16\n")
+    with pytest.raises(
+        RecordingError, match=r"line 2: 'Engine' where a number belongs \(record with numbers, not names"
+    ):
+        converted_log(tmp_path / "bus.asc", "asc", "candump")
+
+
 def test_decimal_asc_without_a_date_is_read_and_that_is_told(tmp_path: Path) -> None:
     (tmp_path / "bus.asc").write_text("base dec  timestamps absolute\n   0.5 1  385             Rx   d 2 16 255\n")
     told = converted_log(tmp_path / "bus.asc", "asc", "candump")

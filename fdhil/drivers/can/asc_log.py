@@ -23,6 +23,7 @@ from fdhil.drivers.can.logged_frame import (
     micros,
     name_remarks,
     named_by,
+    reason_of,
 )
 from fdhil.errors import RecordingError
 
@@ -126,8 +127,7 @@ def read(path: Path, skipped: Counter[str]) -> Iterator[LoggedFrame]:
         try:
             frame = _frame(event[2].split(), (head.start_ns or 0) + now_ns, head)
         except (ValueError, IndexError) as error:
-            what = str(error) if isinstance(error, ValueError) else "half a frame"
-            raise RecordingError(f"{path}, line {number}: {what}; copy the log again") from None
+            raise RecordingError(f"{path}, line {number}: {reason_of(error)}; copy the log again") from None
         if frame is None:
             skipped[OTHER_EVENTS] += 1
         else:

@@ -124,6 +124,14 @@ def named_by(line: str) -> Iterator[tuple[int, str]]:
         yield int(match[1]), match[2]
 
 
+def reason_of(error: Exception) -> str:
+    """Return why a line cannot be read, of what reading its numbers raised."""
+    text = str(error)
+    if text.startswith("invalid literal for int()"):  # Python's own words
+        return f"{text.rpartition(': ')[2][:40]} where a number belongs (record with numbers, not names)"
+    return text if isinstance(error, ValueError) else "it ends in the middle of a frame"
+
+
 def lines_of(path: Path, encoding: str) -> Iterator[tuple[int, str]]:
     """Yield the lines of a log with their numbers; RecordingError for one that no log has: it may never end."""
     try:

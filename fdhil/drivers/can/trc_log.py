@@ -24,6 +24,7 @@ from fdhil.drivers.can.logged_frame import (
     micros,
     name_remarks,
     named_by,
+    reason_of,
 )
 from fdhil.errors import RecordingError
 
@@ -82,8 +83,7 @@ def read(path: Path, skipped: Counter[str]) -> Iterator[LoggedFrame]:
                 skipped[NO_DATE] += head.start_ns is None
             frame = _frame(line, columns, head)
         except (ValueError, LookupError, InvalidOperation) as error:
-            what = str(error) if isinstance(error, ValueError) else "half a row"
-            raise RecordingError(f"{path}, line {number}: {what}; copy the log again") from None
+            raise RecordingError(f"{path}, line {number}: {reason_of(error)}; copy the log again") from None
         if frame is None:
             skipped[OTHER_ROWS] += 1
         else:
