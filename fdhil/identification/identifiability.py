@@ -11,6 +11,7 @@ from fdhil.identification.physical_bounds import beyond_chance
 from fdhil.records import PARAMETERS, Estimate, Float, Reason, Result
 
 CONDITION_LIMIT = 1e6
+MOST_SHOWN_PERCENT = 999_999
 RELATIVE_STD_LIMIT: Mapping[str, float] = {"R": 0.10, "L": 0.25, "K": 0.05, "Jt": 0.10, "ft": 0.5, "Cd": 0.5}
 FRICTION_SHARE, TORQUE_SHARE = 0.25, 0.02
 SIGNALS = "check the scale, sign, timing and order of these signals"
@@ -90,7 +91,8 @@ def _unknown(estimate: Estimate, top_rad_s: float, top_nm: float) -> dict[str, R
         size = max(abs(value), least.get(name, 0.0))
         share = std / size if size else np.inf
         if share > limit:
-            text = f"the standard deviation of {name} is {100 * share:.0f} % of its size, limit {100 * limit:.0f} %"
+            shown = f"{min(100 * share, MOST_SHOWN_PERCENT):.0f} %"
+            text = f"the standard deviation of {name} is {shown} of its size, limit {100 * limit:.0f} %"
             advice = f"record rapids at other speeds and in both directions, or check {ESTIMATED_FROM[name]}"
             missing[name] = Reason("LowExcitation", text, advice)
     return missing

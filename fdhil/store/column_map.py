@@ -133,12 +133,12 @@ def mapped(raw: RecordingTable, told: ColumnMap, source: str) -> RecordingTable:
     if "time_s" not in columns:
         columns = {"time_s": _time(raw, rate_hz, len(columns["position_m"]), source), **columns}
     columns = _whole_rows(columns, source)
+    if 0 < (lasts_s := np.ptp(columns["time_s"])) < SHORTEST_S:
+        lasts = f"lasts {lasts_s:.3g} s by its times, in which no axis moves"
+        raise RecordingError(f"{source} {lasts}: correct the unit of time_s, or sample_rate_hz")
     time_s, note = even_times(np.round(columns["time_s"] - columns["time_s"][0], 9), rate_hz, source)
     columns["time_s"] = np.round(time_s, 9)
     _check_rising(columns["time_s"], source)
-    if columns["time_s"][-1] < SHORTEST_S:
-        lasts = f"lasts {columns['time_s'][-1]:.3g} s by its times, in which no axis moves"
-        raise RecordingError(f"{source} {lasts}: correct the unit of time_s, or sample_rate_hz")
     if rate_hz is None:
         headers["sample_rate_hz"] = f"{1 / usual_step(columns['time_s']):.9g}"
     if "speed_rad_per_s" not in columns:

@@ -28,7 +28,7 @@ UNITS_MISTAKEN: Mapping[float, str] = {
     1e3: "as a position in mm where m belong",
     1e6: "as a position in um where m belong",
     1e3 / 25.4: "as a position in inches where m belong",
-    1e-3: "as a screw pitch in mm where m belong",
+    1e-3: "as a screw pitch in mm where m belong, or times in ms where s belong",
     math.pi / 30: "as a speed in 1/min where rad/s belong",
     math.pi / 180: "as a speed in degrees per second where rad/s belong",
     -1.0: "as a position that counts against the speed",

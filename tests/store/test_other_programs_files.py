@@ -378,15 +378,19 @@ def test_a_process_of_its_own_reads_all_that_a_map_may_use(tmp_path: Path) -> No
 
 
 def test_a_position_within_one_turn_goes_on_by_the_pitch_or_is_refused() -> None:
-    slope = {**VALUES, "x": np.arange(N) * 1e-3 % 0.02}
+    slope: dict[str, Float] = {**VALUES, "x": np.arange(N) * 1e-3 % 0.02}
     read = mapped(RecordingTable({}, {"t": TIME, **slope}), _map(), "trace")
     np.testing.assert_allclose(read.columns["position_m"], np.arange(N) * 1e-3, atol=1e-9)
     assert "x begins again each turn of the screw" in read.headers[NOTES]
-    other = {**VALUES, "x": np.arange(N) * 1e-3 % 0.03}
+    other: dict[str, Float] = {**VALUES, "x": np.arange(N) * 1e-3 % 0.03}
     with pytest.raises(RecordingError, match=r"'x' jumps by 0.029 and goes on, .* one turn is 0.02 by the column map"):
         mapped(RecordingTable({}, {"t": TIME, **other}), _map(), "trace")
 
 
 def test_a_recording_of_a_wrong_unit_of_time_is_refused() -> None:
-    with pytest.raises(RecordingError, match=r"lasts 5.9e-05 s by its times.*correct the unit of time_s"):
-        mapped(RecordingTable({}, {"t": TIME * 1e-3, **VALUES}), _map(), "trace")
+    for factor, lasts in (
+        (1e-3, "5.9e-05"),
+        (1 / 86400, "6.83e-07"),
+    ):  # seconds where ms are said; days of a spreadsheet
+        with pytest.raises(RecordingError, match=rf"lasts {lasts} s by its times.*correct the unit of time_s"):
+            mapped(RecordingTable({}, {"t": TIME * factor, **VALUES}), _map(), "trace")

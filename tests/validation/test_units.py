@@ -46,7 +46,7 @@ def speeds(recording: Recording, factor: float) -> Recording:
         ("speed", 30 / math.pi, "as a speed in 1/min"),
         ("speed", 180 / math.pi, "degrees per second"),
         ("position", -1.0, "counts against the speed"),
-        ("pitch", 1e3, "as a screw pitch in mm where m belong"),
+        ("pitch", 1e3, "as a screw pitch in mm where m belong, or times in ms where s belong"),
     ],
 )
 def test_a_unit_is_named(signal: str, factor: float, words: str, recording: Recording) -> None:
