@@ -378,11 +378,11 @@ def test_a_process_of_its_own_reads_all_that_a_map_may_use(tmp_path: Path) -> No
 
 
 def test_a_position_within_one_turn_goes_on_by_the_pitch_or_is_refused() -> None:
-    slope: dict[str, Float] = {**VALUES, "x": np.arange(N) * 1e-3 % 0.02}
+    slope = {**VALUES, "x": np.fmod(TIME, 0.02)}
     read = mapped(RecordingTable({}, {"t": TIME, **slope}), _map(), "trace")
     np.testing.assert_allclose(read.columns["position_m"], np.arange(N) * 1e-3, atol=1e-9)
     assert "x begins again each turn of the screw" in read.headers[NOTES]
-    other: dict[str, Float] = {**VALUES, "x": np.arange(N) * 1e-3 % 0.03}
+    other = {**VALUES, "x": np.fmod(TIME, 0.03)}
     with pytest.raises(RecordingError, match=r"'x' jumps by 0.029 and goes on, .* one turn is 0.02 by the column map"):
         mapped(RecordingTable({}, {"t": TIME, **other}), _map(), "trace")
 
