@@ -78,7 +78,7 @@ nightly: setup   ## what takes hours: fuzzing by the million, Monte-Carlo studie
 	@$(MAKE) mutants
 	@$(MAKE) faults
 
-faults: setup    ## the fault matrix, row by row, and the goals R1 to R20: to docs/studies/faults.md; needs what make test-full needs
+faults: setup    ## the fault matrix, row by row, and the goals R1 to R20: to docs/studies/faults.md; needs what make test-system needs
 	@$(BIN)/python -m pytest -q -p tests.fault_table --fault-table docs/studies/faults.md -m "(fault or goal) and not socketcan"
 	@$(VCAN) -w docs/studies $(BIN)/python -m pytest -q -p no:cacheprovider -p tests.fault_table --fault-table docs/studies/faults.md --on-socketcan -m "fault and socketcan" tests/socketcan tests/integration tests/foreign
 
