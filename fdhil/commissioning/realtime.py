@@ -12,7 +12,7 @@ from collections.abc import Iterator
 CYCLE = 50  # as the interrupt threads of a real-time kernel have it, above all ordinary work
 BESIDE = 45  # the other threads of its process: the cycle waits for one that holds the interpreter and may not run
 SWITCH_INTERVAL_S = 0.0002  # the cycle must not wait 5 ms for a thread that only looks on
-_MCL_CURRENT, _MCL_FUTURE = 1, 2
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # on fault: what is reserved and never touched takes no memory
 
 
 def prioritise(priority: int) -> str:
@@ -34,7 +34,7 @@ def before_other_work() -> Iterator[None]:
     policy, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
     gc.collect()
     gc.freeze()
-    libc.mlockall(_MCL_CURRENT | _MCL_FUTURE)
+    libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     prioritise(BESIDE)
     try:
