@@ -44,6 +44,7 @@ def flips(whole: bytes, most: int, seed: int) -> Iterator[bytes]:
         yield bytes(flipped)
 
 
+@pytest.mark.usefixtures("real_time")
 def test_no_flipped_bit_of_the_guards_settings_is_believed(tmp_path: Path) -> None:
     path, true = tmp_path / "guard.json", settings()
     path.write_text(to_json(true))

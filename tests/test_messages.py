@@ -72,6 +72,7 @@ def test_each_refusal_tells_class_cause_and_next_action() -> None:
     assert short == []
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.goal("R19")
 def test_every_class_is_in_the_documents_with_effect_and_next_action(
     record_property: Callable[[str, object], None],

@@ -307,6 +307,7 @@ def vertical(config: MachineConfig, k: int, load_nm: float) -> Window:
     return replace(made, start_tick=2000 * k)
 
 
+@pytest.mark.usefixtures("real_time")
 def test_a_load_is_published_and_no_set_flips_with_the_direction(config: MachineConfig) -> None:
     pipeline, sets = AxisPipeline("X", config), []
     for k in (1, 2, 3, 4, 5, 7, 9, 11, 13):  # from the fifth on all in one direction

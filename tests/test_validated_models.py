@@ -62,6 +62,7 @@ def identified(plant: real.Mechanics) -> FileResult:
     return FileResult("recording.csv", "X", tuple(outcomes), estimate, verdict)
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_most_plants_are_validated() -> None:
     """Else there would be nothing to take."""
     assert sum(identified(plant).verdict.accepted for plant in PLANTS.values()) >= 9

@@ -16,12 +16,14 @@ from pathlib import Path
 
 import pytest
 
-SYSTEM_FIXTURES = frozenset({"processes", "long_computation"})
+SYSTEM_FIXTURES = frozenset({"processes", "long_computation", "real_time"})
 SYSTEM_MARKS = ("debian", "socketcan")
 MOST_SLEEP_S = 0.1
 MOST_PROCESSOR_S = 5.0  # a guard against what grew by a factor: the slowest test needs a third of it
 STARTS_PROCESS = frozenset({"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.exec"})
-WHOLE_MODULE = re.compile(r"^pytestmark = .*(\"(processes|long_computation)\"|mark\.(debian|socketcan))", re.MULTILINE)
+WHOLE_MODULE = re.compile(
+    r"^pytestmark = .*(\"(processes|long_computation|real_time)\"|mark\.(debian|socketcan))", re.MULTILINE
+)
 
 
 class AuditTrail:
@@ -55,6 +57,11 @@ def processes() -> None:
 @pytest.fixture(scope="session")
 def long_computation() -> None:
     """Allow a test to compute for longer than the fast tier can afford: it is of the system tier."""
+
+
+@pytest.fixture(scope="session")
+def real_time() -> None:
+    """Allow a test to wait for a second and more, as for the silence of a bus: it is of the system tier."""
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -91,6 +91,7 @@ def test_a_guard_that_does_not_answer_is_let_go(guard: Guard, folder: Path) -> N
     link.close()
 
 
+@pytest.mark.usefixtures("real_time")
 async def test_a_slow_guard_still_hears_that_the_daemon_lives(
     config: MachineConfig, guard: Guard, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -19,6 +19,8 @@ from tests.arming.test_passes import heard, measured
 from tests.arming.test_preparing import save_records
 from tests.daemon.machine import config_of
 
+pytestmark = pytest.mark.usefixtures("real_time")
+
 WAVE_MM = 2e-3
 
 

@@ -97,6 +97,7 @@ def measured(told: Sequence[Notice], count: int) -> bool:
     return sum(notice.code == "PassMeasured" for notice in told) == count
 
 
+@pytest.mark.usefixtures("real_time")
 async def test_each_pass_is_told_beside_what_was_predicted(
     config: MachineConfig, mill: Mill, program: Path, planned: Correction, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -219,6 +219,7 @@ async def test_disarm_is_ok_at_zero_only(config: MachineConfig, guard: Guard, fo
     desk.guard.close()
 
 
+@pytest.mark.usefixtures("real_time")
 async def test_disarm_that_never_reaches_zero_is_no(
     config: MachineConfig, guard: Guard, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -92,6 +92,7 @@ def made(line: int, feed: float, error_um: float = 30.0) -> Advice:
     )
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_lines_that_follow_each_other_are_one_range(capsys: pytest.CaptureFixture[str]) -> None:
     """Not over a line between them that keeps its feed, and not where one may run at twice the feed of another."""
     slow = [made(line, 2100.0, 34.0 if line == 260 else 30.0) for line in range(120, 481, 2)]

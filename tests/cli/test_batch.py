@@ -46,6 +46,7 @@ def test_each_window_and_each_pool_is_a_step_of_its_file(recordings: list[Path])
     assert shares == pytest.approx([1 / 3] * 6)
 
 
+@pytest.mark.usefixtures("real_time")
 @pytest.mark.parametrize("limit", ["MANY_FILES", "MANY_WINDOWS"])
 def test_other_processes_give_the_same(recordings: list[Path], limit: str, monkeypatch: pytest.MonkeyPatch) -> None:
     recordings = recordings if limit == "MANY_FILES" else recordings[:1]
@@ -62,6 +63,7 @@ def test_other_processes_give_the_same(recordings: list[Path], limit: str, monke
         assert one.pooled.values.tobytes() == other.pooled.values.tobytes()
 
 
+@pytest.mark.usefixtures("real_time")
 def test_a_process_that_dies_is_a_sentence(recordings: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batch, "MANY_FILES", 1)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)

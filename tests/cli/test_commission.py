@@ -317,6 +317,7 @@ def test_an_nc_that_is_switched_on_in_the_sign_test_leaves_no_record(what: str, 
     assert in_the_audit(bench)[-1] == ("commission", "X", "ForeignMaster")
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize(
     ("question", "sync"),
     [

@@ -156,6 +156,7 @@ def test_a_scan_lists_the_drives_with_their_eds(fdhil: Said, bench: Bench) -> No
     assert bus["nodes"][0]["heartbeat_s"] == pytest.approx(0.1, rel=0.5)
 
 
+@pytest.mark.usefixtures("real_time")
 def test_a_scan_reads_well(fdhil: Said, bench: Bench) -> None:
     code, out, err = fdhil("scan", bench.config())
     assert (code, err) == (0, "")
@@ -171,6 +172,7 @@ def test_an_eds_that_is_none_is_told(fdhil: Said, bench: Bench) -> None:
     assert "wrong.eds: line 1: it has no object at all" in err
 
 
+@pytest.mark.usefixtures("real_time")
 def test_a_machine_that_matches_is_told(fdhil: Said, bench: Bench) -> None:
     code, out, err = fdhil("check", bench.config())
     assert (code, err) == (0, "")
@@ -211,6 +213,7 @@ DIFFERENT = {
 }
 
 
+@pytest.mark.usefixtures("real_time")
 @pytest.mark.parametrize("point", DIFFERENT)
 def test_what_differs_is_told_with_what_to_do(fdhil: Said, point: str, bench: Bench) -> None:
     old, new, found = DIFFERENT[point]
@@ -224,6 +227,7 @@ def test_what_differs_is_told_with_what_to_do(fdhil: Said, point: str, bench: Be
     assert (told["expected"], told["found"]) != ("", told["expected"])
 
 
+@pytest.mark.usefixtures("real_time")
 def test_a_sensor_is_read_and_a_silent_one_is_told(fdhil: Said, bench: Bench) -> None:
     sensor = bench.twin.ready["modbus"]["X"]
     voltage = f'source = "modbus"\nhost = "{sensor["host"]}"\nport = {sensor["port"]}\nunit = {sensor["unit"]}'
@@ -293,6 +297,7 @@ def test_what_is_seen_while_drives_are_compared_speaks_against_them(
     assert [is_void(store, axis) for axis in "XY"] == [True, False]
 
 
+@pytest.mark.usefixtures("real_time")
 def test_nobody_moves_without_a_yes(fdhil: Said, bench: Bench) -> None:
     config = bench.config("asked.toml")
     with overheard(bench) as heard:
@@ -308,6 +313,7 @@ def test_nobody_moves_without_a_yes(fdhil: Said, bench: Bench) -> None:
     assert load_record(config.parent / "fdhil-data", "X") is None
 
 
+@pytest.mark.usefixtures("real_time")
 def test_pdos_are_written_after_a_yes_and_nothing_moves(fdhil: Said, bench: Bench) -> None:
     """By a profile that differs from the drive in one PDO; then by the one that the other tests need."""
     own = bench.folder / "own.toml"
@@ -419,6 +425,7 @@ def test_an_unknown_axis_is_told(fdhil: Said, bench: Bench) -> None:
     assert "there is no axis Z (one of X, Y)" in err
 
 
+@pytest.mark.usefixtures("real_time")
 def test_a_bus_without_a_node_is_told(fdhil: Said, tmp_path: Path) -> None:
     hub = HubThread(Hub("can0"))
     hub.start()
@@ -460,12 +467,14 @@ def undisturbed(fdhil: Said, cut: Bench, *arguments: object, code: int = 0) -> s
     return out + err
 
 
+@pytest.mark.usefixtures("real_time")
 def test_a_scan_beside_an_nc_only_listens(fdhil: Said, cut: Bench) -> None:
     said = undisturbed(fdhil, cut, "scan", cut.config())
     assert "an NC runs it (SYNC heard), so no node was asked" in said
     assert "operational" in said
 
 
+@pytest.mark.usefixtures("real_time")
 def test_a_check_beside_an_nc_compares_what_is_heard(fdhil: Said, cut: Bench) -> None:
     config = cut.config("counted.toml", "[machine]", '[guard]\nclock = "sync"\n[machine]')  # a busy host is late
     found = json.loads(undisturbed(fdhil, cut, "check", config, "--json"))
@@ -475,6 +484,7 @@ def test_a_check_beside_an_nc_compares_what_is_heard(fdhil: Said, cut: Bench) ->
     assert {"bus can0 SYNC", "axis X TPDO1", "axis Y TPDO3", "axis X RPDO1"} <= set(points(found, "ok"))
 
 
+@pytest.mark.usefixtures("real_time")
 def test_another_sync_period_is_told(fdhil: Said, cut: Bench) -> None:
     config = cut.config("period.toml", "sync_period_s = 0.001", "sync_period_s = 0.0005")
     said = undisturbed(fdhil, cut, "check", config, code=1)

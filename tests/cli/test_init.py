@@ -153,6 +153,7 @@ def test_a_wrong_answer_is_told_by_its_key(tables: dict[str, Any], words: str, f
     assert "Traceback" not in err
 
 
+@pytest.mark.usefixtures("real_time")
 def test_the_drive_tells_its_scales_and_the_operator_the_rest(
     fdhil: Said, peer: DrivePeer, bus: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -225,6 +226,7 @@ def test_what_a_file_says_cannot_break_the_comments(fdhil: Said, tmp_path: Path)
     assert machine_config.load(tmp_path / "m.toml").axis["X"].drive.increments_per_rev == 10000
 
 
+@pytest.mark.usefixtures("real_time")
 def test_beside_an_nc_nothing_is_sent(
     fdhil: Said, peer: DrivePeer, bus: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -251,6 +253,7 @@ def test_beside_an_nc_nothing_is_sent(
     assert "an NC runs it (SYNC heard), so no drive was asked" in out
 
 
+@pytest.mark.usefixtures("real_time")
 def test_an_answer_that_the_drive_contradicts_is_noted(
     fdhil: Said, peer: DrivePeer, bus: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -274,6 +277,7 @@ def test_limits_that_were_left_open_are_such_that_coarse_increments_can_keep(fdh
         assert (found.max_offset_um, found.max_speed_mm_s, found.max_acceleration_mm_s2) == limits
 
 
+@pytest.mark.usefixtures("real_time")
 def test_an_axis_without_a_drive_is_refused(fdhil: Said, peer: DrivePeer, bus: dict[str, Any], tmp_path: Path) -> None:
     sheet = SHEET | RAPID
     answers = written(tmp_path, axis={"X": sheet, "Y": sheet}, bus=bus)
@@ -286,6 +290,7 @@ def test_an_axis_without_a_drive_is_refused(fdhil: Said, peer: DrivePeer, bus: d
     assert "axis.X.drive.node_id: is 9, which is not on the bus (node 1 (fdhil twin drive" in err
 
 
+@pytest.mark.usefixtures("real_time")
 def test_a_drive_that_was_given_to_an_axis_is_not_proposed_to_another(
     fdhil: Said, peer: DrivePeer, bus: dict[str, Any], tmp_path: Path
 ) -> None:

@@ -46,7 +46,7 @@ class Shop:
 
 
 @pytest.fixture(scope="module")
-def shop(tmp_path_factory: pytest.TempPathFactory) -> Shop:
+def shop(tmp_path_factory: pytest.TempPathFactory, long_computation: None) -> Shop:
     """Identify the drive once and write its model file."""
     folder = tmp_path_factory.mktemp("filtered")
     shop = Shop(folder, folder / "filtered.csv", folder / "bench.toml", folder / "model.json")

@@ -31,7 +31,7 @@ def claim(trials: Sequence[Trial]) -> Claim:
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
+def told(tmp_path_factory: pytest.TempPathFactory, long_computation: None) -> tuple[dict[str, Any], Path]:
     """What the command wrote, with few runs: its document, and the folder."""
     out = tmp_path_factory.mktemp("paper")
     with pytest.MonkeyPatch.context() as patch:
@@ -63,7 +63,6 @@ def test_what_is_no_number_shows_nothing_and_stays_out_of_json() -> None:
     assert json.loads(json.dumps(document, allow_nan=False))["claims"][0]["trials"][0]["value"] is None
 
 
-@pytest.mark.usefixtures("long_computation")
 def test_every_verdict_of_the_document_is_that_of_its_trials(told: tuple[dict[str, Any], Path]) -> None:
     for stated in told[0]["claims"]:
         assert stated["trials"], stated["key"]

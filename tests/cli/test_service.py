@@ -85,6 +85,7 @@ def test_status_as_a_table_and_as_json(machine: Path, tmp_path: Path, capsys: An
     assert json.loads(out)["axes"]["X"]["parameters"]["K"]["value"] == 0.8
 
 
+@pytest.mark.usefixtures("real_time")
 @pytest.mark.parametrize(
     ("guard", "shown"),
     [

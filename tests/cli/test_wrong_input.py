@@ -146,6 +146,7 @@ def test_a_standard_error_that_takes_nothing_leaves_the_exit_code(command: str, 
     assert said_by_shell(command, "2> /dev/full")[0] == code
 
 
+@pytest.mark.usefixtures("real_time")
 def test_a_bus_without_drives_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     hub = HubThread(Hub("can0"))
     hub.start()

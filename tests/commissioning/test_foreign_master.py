@@ -158,6 +158,7 @@ def test_another_master_ends_a_step_within_a_few_sync(step: str, what: str, rig:
     assert ("0x1016 may be as fdhil wrote" in str(told.value)) is (step in ("watchdog test", "rapid"))
 
 
+@pytest.mark.usefixtures("real_time")
 @pytest.mark.parametrize("what", FOREIGN)
 def test_a_single_frame_of_another_master_is_enough(what: str, rig: Rig) -> None:
     with rig.nc(what, is_offset, often=False) as nc:

@@ -166,6 +166,7 @@ def test_a_drive_that_boots_while_it_plays_is_not_vouched_for(floor: Floor) -> N
     assert "axis Y" not in err
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_nothing_is_sent_beside_an_nc(floor: Floor, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 60.0)  # until it is heard
     ended = threading.Event()
@@ -227,6 +228,7 @@ def leave_socket(folder: Path) -> None:
         killed.bind(str(folder / "guard.sock"))
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("what", ["SYNC", "target", "offset"])
 def test_another_master_ends_what_is_played(what: str, floor: Floor) -> None:
     leave_socket(floor.config.guard_directory)
@@ -281,6 +283,7 @@ def test_play_ends_where_an_nc_came_before_the_path_began(floor: Floor, monkeypa
     assert "an NC is sending SYNC" in document["stopped"]
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("what", FOREIGN)
 def test_nothing_leaves_where_an_nc_came_while_the_question_stood(
     what: str, floor: Floor, monkeypatch: pytest.MonkeyPatch

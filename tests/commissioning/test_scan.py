@@ -152,6 +152,7 @@ def test_a_drives_text_cannot_steer_a_terminal(text: bytes) -> None:
     assert len(printable(text)) <= 80
 
 
+@pytest.mark.usefixtures("real_time")
 def test_a_node_that_lacks_objects_is_listed_all_the_same(
     peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -320,6 +321,7 @@ def test_a_drive_says_so_itself_or_as_the_first_of_several_devices(
     assert finding.ok is ok
 
 
+@pytest.mark.usefixtures("real_time")
 def test_a_bus_of_another_bit_rate_is_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     for where in ("scan", "config_check"):
         monkeypatch.setattr(f"fdhil.commissioning.{where}.LISTEN_S", 2.0)

@@ -97,6 +97,7 @@ class SleepyPeer(DrivePeer):
         return super().take(can_id, data)
 
 
+@pytest.mark.usefixtures("real_time")
 def test_a_simulated_drive_may_sleep() -> None:
     settings = config()
     with SleepyPeer(settings), Master(settings, "X") as master:
@@ -123,6 +124,7 @@ class SlowPeer(DrivePeer):
             super()._send([frame])
 
 
+@pytest.mark.usefixtures("real_time")
 def test_a_simulated_drive_that_slept_answers_one_sync_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """The TPDOs of every tenth SYNC are waited for as well: a guard counts in which SYNC they come."""
     settings = config()
@@ -256,6 +258,7 @@ class HastyMaster(Master):
         super().wait(condition, timeout_s / self.patience if never else timeout_s, otherwise)
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
@@ -488,6 +491,7 @@ def test_on_a_silent_bus_the_drive_alone_is_asked_what_it_is(monkeypatch: pytest
         assert sent == {(0x601, read), (0x601, given_up)}
 
 
+@pytest.mark.usefixtures("real_time")
 @pytest.mark.fault("A29")
 def test_a_bus_of_another_bit_rate_gets_no_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(survey, "LISTEN_S", 2.0)
@@ -562,6 +566,7 @@ def enabled_and_rolled_back(settings: MachineConfig, step: Callable[[Master], ob
         step(master)
 
 
+@pytest.mark.usefixtures("real_time")
 @pytest.mark.parametrize("interrupt_at", [12, 33])
 def test_a_ramp_that_is_stopped_on_its_way_turns_round_there(interrupt_at: int) -> None:
     settings = config()

@@ -99,6 +99,7 @@ def test_no_room_sends_nothing(bench: Bench) -> None:
     assert bench.peer.heard == []
 
 
+@pytest.mark.usefixtures("real_time")
 def test_software_limits_that_are_nearer_are_respected(bench: Bench) -> None:
     bench.peer.drive.set_object(0x607D, 1, -3277)
     bench.peer.drive.set_object(0x607D, 2, 820_000)
@@ -120,6 +121,7 @@ def test_a_drive_that_was_set_up_anew_is_not_moved(bench: Bench) -> None:
     assert not {0x000, 0x080, 0x201} & set(bench.peer.heard)
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize(
     ("step", "braking", "what"),
     [("jog", 50, "target"), ("jog", 50, "offset"), ("test rapids", 200, "SYNC"), ("test rapids", 200, "target")],

@@ -87,6 +87,7 @@ def test_a_daemon_that_hangs_up_or_talks_nonsense_is_told(tmp_path: Path, listen
         thread.join()
 
 
+@pytest.mark.usefixtures("real_time")
 async def test_what_takes_its_time_tells_its_progress_and_ends_when_nobody_waits(tmp_path: Path) -> None:
     """The daemon's side and the command line's: two tellings, then the answer; who hangs up abandons it."""
     turn = {"count": 0}

@@ -126,6 +126,7 @@ async def fill_the_pool() -> None:
     await asyncio.gather(*(asyncio.to_thread(met.wait, 60.0) for _ in range(most)))
 
 
+@pytest.mark.usefixtures("real_time")
 @pytest.mark.fault("F10")
 async def test_clients_that_come_and_go_leave_descriptors_and_threads_as_they_were(tmp_path: Path) -> None:
     """Two hundred clients, of which half leave without a word."""

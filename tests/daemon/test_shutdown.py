@@ -83,6 +83,7 @@ async def test_daemon_stops_between_two_failures_of_its_source(tmp_path: Path) -
     await stopped(Service(config_of(tmp_path), open_source), seen)
 
 
+@pytest.mark.usefixtures("real_time")
 async def test_device_that_does_not_close_is_reported_and_left(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

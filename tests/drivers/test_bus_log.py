@@ -247,6 +247,7 @@ def expected_of(frame: LoggedFrame, name: str) -> LoggedFrame | None:
     return frame
 
 
+@pytest.mark.usefixtures("real_time")
 @settings(deadline=None)
 @given(st.lists(frames(), min_size=1, max_size=30), st.sampled_from(FORMATS))
 def test_any_frames_come_back_or_are_counted(tmp_path_factory: Any, sent: list[LoggedFrame], name: str) -> None:
@@ -429,6 +430,7 @@ def test_a_log_is_no_recording_and_an_empty_one_is_told(tmp_path: Path, capsys: 
     assert not (tmp_path / "bus.blf").exists()
 
 
+@pytest.mark.usefixtures("real_time")
 @settings(deadline=None, max_examples=60)
 @given(st.sampled_from(FORMATS), st.binary(max_size=200), st.integers(0, 900))
 def test_any_bytes_are_read_or_refused(tmp_path_factory: Any, name: str, junk: bytes, keep: int) -> None:

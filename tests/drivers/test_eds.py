@@ -127,6 +127,7 @@ def test_a_missing_file_is_the_same_error(tmp_path: Path) -> None:
         load_eds(tmp_path / "none.eds")
 
 
+@pytest.mark.usefixtures("real_time")
 @settings(deadline=None, max_examples=60)
 @given(st.data())
 @pytest.mark.fault("G5")

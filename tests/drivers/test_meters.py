@@ -288,6 +288,7 @@ async def test_a_wrong_type_or_word_order_is_told_and_not_used(read_as: dict[str
         sensor.link.close()
 
 
+@pytest.mark.usefixtures("real_time")
 async def test_a_sensor_that_is_asked_too_often_is_told_once() -> None:
     async with shop({"source": "modbus", "type": "float32", "period_s": 0.002}) as served:
         served.memory["X"].faults.slow_s = 0.005

@@ -235,6 +235,7 @@ def test_damage_of_a_register_is_checked(at: int, value: int) -> None:
     assert block.volts.size <= 100
 
 
+@pytest.mark.usefixtures("real_time")
 @settings(max_examples=40, deadline=None)
 @given(
     drift=st.floats(-100e-6, 100e-6),
@@ -328,6 +329,7 @@ def test_a_count_of_two_moments_is_left_out_once_and_believed_when_it_stays(tear
     assert taken[-1] == newest
 
 
+@pytest.mark.usefixtures("real_time")
 def test_late_stamps_of_sync_do_not_move_the_samples() -> None:
     rng = np.random.default_rng(1)
     sensor = ModbusVoltage("X", config(1))

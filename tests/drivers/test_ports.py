@@ -141,6 +141,7 @@ def test_an_interface_that_is_not_there_is_said() -> None:
         CanBus("can9", BusSettings(interface="socketcan", channel="nocan9"))
 
 
+@pytest.mark.usefixtures("real_time")
 def test_a_full_ring_holds_the_hub_back(hub: MiniHub) -> None:
     line = b"< frame 181 1700000000.000100 1122334455667788 >"
     with CanBus("can0", settings_of(hub.port), ring_frames=64) as bus:

@@ -121,6 +121,7 @@ def slcan(can_id: int, data: bytes) -> str:
     return f"t{can_id:03X}{len(data)}{data.hex().upper()}"
 
 
+@pytest.mark.usefixtures("real_time")
 def test_a_drive_is_sampled_through_it_as_through_any_bus(
     adapter: SerialAdapter, monkeypatch: pytest.MonkeyPatch
 ) -> None:

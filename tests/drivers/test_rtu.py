@@ -101,6 +101,7 @@ SPOILT: dict[str, serial_peer.Spoil] = {
 }
 
 
+@pytest.mark.usefixtures("real_time")
 @pytest.mark.parametrize("what", SPOILT)
 @pytest.mark.fault("B3", "B4", "B8")
 @patiently
@@ -191,6 +192,7 @@ async def test_the_answer_of_another_unit_is_not_taken_and_ours_is_waited_for() 
         link.close()
 
 
+@pytest.mark.usefixtures("real_time")
 @pytest.mark.fault("B7")
 @patiently
 async def test_a_late_answer_is_not_taken_for_the_next() -> None:

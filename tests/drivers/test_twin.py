@@ -120,6 +120,7 @@ def test_commissioning_of_the_process(twin: Twin, monkeypatch: pytest.MonkeyPatc
     assert record.sign_test_um == pytest.approx(10, abs=3)
 
 
+@pytest.mark.usefixtures("real_time")
 def test_a_window_that_is_off_is_refused(twin: Twin, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 0.3)
     settings = twin.config()
@@ -130,6 +131,7 @@ def test_a_window_that_is_off_is_refused(twin: Twin, monkeypatch: pytest.MonkeyP
         commission(settings.model_copy(update={"axis": {"X": wrong}}), "X")
 
 
+@pytest.mark.usefixtures("real_time")
 async def test_a_rapid_is_recorded_whole(twin: Twin) -> None:
     twin.tell(command="nc", on=True)
     trace = twin.folder / "trace.csv"

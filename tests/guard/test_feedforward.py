@@ -281,6 +281,7 @@ def test_a_mismatch_that_ended_at_zero_is_over() -> None:
     assert not bench.state.feed.may_stand
 
 
+@pytest.mark.usefixtures("real_time")
 def test_a_guard_that_ends_over_a_torque_says_so(tmp_path: Path) -> None:
     """The bus is gone while it acts: exit code, the last line and the journal say what may still be applied."""
     with closing(Shop(tmp_path, commissioned(fed_settings()))) as shop:

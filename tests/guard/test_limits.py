@@ -21,12 +21,14 @@ def braking_way(rate: int, acceleration: int) -> int:
     return way
 
 
+@pytest.mark.usefixtures("real_time")
 @given(st.integers(0, 500), st.integers(1, 60))
 def test_stopping_is_the_sum_of_what_is_left(rate: int, acceleration: int) -> None:
     assert stopping(rate, acceleration) == braking_way(rate, acceleration)
     assert type(stopping(rate, acceleration)) is int
 
 
+@pytest.mark.usefixtures("real_time")
 @given(st.integers(0, 5000), st.integers(1, 60))
 def test_approach_is_the_fastest_rate_that_still_stops(distance: int, acceleration: int) -> None:
     rate = approach(distance, acceleration)
@@ -87,6 +89,7 @@ def test_brake_comes_to_rest_inside_the_limits() -> None:
         assert rate == 0, start
 
 
+@pytest.mark.usefixtures("real_time")
 @given(st.lists(st.integers(-60, 60), min_size=1, max_size=60), st.data())
 def test_following_anything_keeps_every_limit(goals: list[int], data: st.DataObject) -> None:
     offset, rate = data.draw(st.sampled_from(starts(SMALL)))

@@ -567,6 +567,7 @@ def test_a_guard_that_was_told_to_stop_arms_nothing_more(make: Make) -> None:
     assert (shop.state, shop.guard.run()) == ("OFF", 0)
 
 
+@pytest.mark.usefixtures("real_time")
 def test_an_arming_that_waits_when_it_is_told_to_stop_is_refused(make: Make) -> None:
     shop = make()
     arming, disarming = shop.connect(), shop.connect()

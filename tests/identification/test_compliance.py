@@ -121,6 +121,7 @@ def test_it_joins_the_estimate_with_the_doubt_that_windows_share() -> None:
     assert again.value("resonance") == pytest.approx(50.0, rel=0.1)
 
 
+@pytest.mark.usefixtures("real_time")
 @pytest.mark.parametrize(("configured", "codes"), [(None, []), (80.0, []), (60.0, ["ResonanceDiffers"])])
 def test_a_configuration_that_says_otherwise_is_warned_of(configured: float | None, codes: list[str]) -> None:
     found = seen(rapid(80.0), table_m_s2=None)
@@ -132,6 +133,7 @@ def test_a_configuration_that_says_otherwise_is_warned_of(configured: float | No
     assert beside_the_config(found, None) == []
 
 
+@pytest.mark.usefixtures("real_time")
 def test_the_table_s_true_error_is_told() -> None:
     window = replace(rapid(80.0), table_m_s2=None)
     at_table = analyse(window, Identification()).at_table

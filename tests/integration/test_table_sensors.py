@@ -110,6 +110,7 @@ def test_the_resonance_is_found_in_each_rapid_and_the_rapid_believed(axis: str) 
         assert abs(estimate.value("resonance_damping") - 0.02) < 4 * estimate.std("resonance_damping")
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_the_model_with_it_knows_what_the_motors_encoder_does_not_see() -> None:
     for told in (o.at_table for o in recorded()["X"]):
         assert told is not None

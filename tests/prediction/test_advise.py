@@ -152,6 +152,7 @@ def test_a_path_within_the_tolerance_needs_no_advice() -> None:
     assert advise(source, MODELS, CONFIG, 250.0) == ()
 
 
+@pytest.mark.usefixtures("real_time")
 def test_a_tight_tolerance_is_held_by_one_percent_of_the_feed() -> None:
     """Dry friction leaves 10 um of a corner down to a few hundredths of 15 m/min; a twentieth of them no feed holds."""
     source = program_source(list(interpret(PROGRAM[:3], Budget.of(CONFIG.nc))), CONFIG)

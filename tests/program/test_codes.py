@@ -253,6 +253,7 @@ def test_a_million_lines_are_read_in_flat_memory(tmp_path: Path) -> None:
     assert held[2] < 1_000_000
 
 
+@pytest.mark.usefixtures("real_time")
 def test_lines_that_are_made_as_they_are_read_are_kept_in_four_megabytes_at_most() -> None:
     """They might be needed again by a loop: beyond 4 Mbyte they go to the disk."""
     motions = interpret(f"G1 X{number % 997} F600 ({'x' * 3900})" for number in range(1500))

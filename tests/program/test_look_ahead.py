@@ -100,6 +100,7 @@ def test_every_axis_keeps_its_limits(profile: str, corner: Corner) -> None:
         np.testing.assert_allclose(columns(reference)[-1], last.end[:2], atol=1e-9)
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("tolerance_mm", [0.0, 0.01, 0.1])
 def test_the_path_is_left_by_no_more_than_p(profile: str, tolerance_mm: float) -> None:

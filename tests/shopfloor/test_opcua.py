@@ -51,7 +51,7 @@ class Stage:
 
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
-async def stage(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Stage]:
+async def stage(tmp_path_factory: pytest.TempPathFactory, long_computation: None) -> AsyncIterator[Stage]:
     opcua = {"port": 0, "manufacturer": "Example Maker", "serial_number": "4711"}
     config = config_of(tmp_path_factory.mktemp("opcua"), "XY", publish={"opcua": opcua})
     async with serving(config) as served:
@@ -114,6 +114,7 @@ async def test_a_machine_tool_stands_where_clients_look_for_it(client: Client) -
     assert await (await program.get_child(f"{tool}:Name")).read_value() == "part.ngc"
 
 
+@pytest.mark.usefixtures("long_computation")
 async def test_the_program_runs_or_is_interrupted_as_the_nc_says_and_no_mode_is_made_up(
     stage: Stage, client: Client
 ) -> None:

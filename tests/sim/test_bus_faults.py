@@ -133,6 +133,7 @@ def test_lockstep_does_not_wait_for_what_a_fault_took(listed: list[str]) -> None
     assert twin.machine.waits()  # the next one may come
 
 
+@pytest.mark.usefixtures("real_time")
 def test_what_the_page_shows_is_a_script_and_a_plan(tmp_path: Path) -> None:
     page = (Path(__file__).parents[2] / "docs" / "how-to" / "rehearse-a-fault.md").read_text("utf-8")
     (script,) = re.findall(r"^```toml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)

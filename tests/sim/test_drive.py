@@ -262,6 +262,7 @@ def test_every_object_that_may_be_read_can_be_read_by_the_library() -> None:
             assert entry.size in (None, len(data))
 
 
+@pytest.mark.usefixtures("real_time")
 def test_a_master_brings_it_up_over_a_virtual_bus() -> None:
     rig = Rig()
     with over_virtual_bus(rig.drive) as node:

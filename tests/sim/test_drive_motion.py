@@ -198,6 +198,7 @@ def run_to(rig: Rig, target_mm: float, word: int, cycles: int) -> list[int]:
     return demands
 
 
+@pytest.mark.usefixtures("real_time")
 def test_profile_position_runs_a_trapezoid_and_tells_its_arrival() -> None:
     rig = profile_rig()
     assert rig.read(0x6061) == 1
@@ -219,6 +220,7 @@ def test_profile_position_runs_a_trapezoid_and_tells_its_arrival() -> None:
     assert rig.drive.table_mm == pytest.approx(30.0, abs=2e-3)
 
 
+@pytest.mark.usefixtures("real_time")
 def test_profile_position_relative_buffered_at_once_and_halted() -> None:
     rig = profile_rig()
     run_to(rig, 10, 0x1F, 600)
@@ -338,6 +340,7 @@ def drive_path(path_mm: Float) -> tuple[Float, Float]:
     return np.array(reference)[2:], np.array(actual)[2:]
 
 
+@pytest.mark.usefixtures("real_time")
 @pytest.mark.parametrize(
     ("feed_m_min", "smoothing_s", "rms_um", "max_um"),
     [(10, (0.060, 0.030), 24.2, 99), (20, (0.060, 0.030), 64, 218), (20, (0.030, 0.015), 760, 2600)],

@@ -226,6 +226,7 @@ def test_what_is_sent_periodically_goes_through_the_plan(pair: tuple[FaultBus, c
     assert bytes(got.data) == b"\xfa"
 
 
+@pytest.mark.usefixtures("real_time")
 def test_a_canopen_network_gets_the_faults_of_its_bus(pair: tuple[FaultBus, can.BusABC]) -> None:
     """The first answer to an SDO request is lost, the library asks again."""
     bus, other = pair

@@ -134,6 +134,7 @@ HARMLESS = {"tcp": {"split", "stale"}, "rtu": {"noisy", "split"}}
 NOT_MET = {("tcp", "flipped"), ("rtu", "stale"), ("tcp", "torn"), ("rtu", "torn")}
 
 
+@pytest.mark.usefixtures("real_time")
 @pytest.mark.parametrize(
     ("unit", "kind"),
     [(wire, kind) for wire in HARMLESS for kind in ANSWER_FAULTS if (wire, kind) not in NOT_MET],

@@ -268,6 +268,7 @@ def test_guarding_toggles_and_its_end_is_a_lost_connection() -> None:
     assert rig.send(0x701, b"") == [(0x701, b"\x7f")]
 
 
+@pytest.mark.usefixtures("real_time")
 def test_the_library_guards_over_a_bus() -> None:
     rig = Rig()
     with over_virtual_bus(rig.drive) as node:

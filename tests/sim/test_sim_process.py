@@ -66,6 +66,7 @@ def test_the_ready_event_tells_how_to_join(twin: TwinProcess) -> None:
     assert 0.7 < ready["bus_load"]["can0"] < 1.0 < ready["bus_load_worst"]["can0"] < 1.1
 
 
+@pytest.mark.usefixtures("real_time")
 def test_the_canopen_library_finds_configures_and_reads(twin: TwinProcess, bus: can.BusABC) -> None:
     network = canopen.Network(bus)
     network.connect()
@@ -129,6 +130,7 @@ def test_panel_mistakes_are_events(twin: TwinProcess, tmp_path: Path) -> None:
     assert "missing.csv" in twin.event("error")["text"]
 
 
+@pytest.mark.usefixtures("real_time")
 def test_the_nc_plays_in_real_time_and_no_sync_is_lost(twin: TwinProcess, tmp_path: Path) -> None:
     demand = write_demand(tmp_path / "corner.csv", corner())
     trace = tmp_path / "trace.csv"

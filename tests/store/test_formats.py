@@ -110,6 +110,7 @@ def test_a_damaged_file_is_refused_in_one_sentence_or_read_as_numbers(name: str,
         read_recording(path)
 
 
+@pytest.mark.usefixtures("processes")
 @pytest.mark.fault("G8")
 def test_a_file_that_declares_more_than_a_recording_has_is_refused_before_it_is_read(tmp_path: Path) -> None:
     import h5py

@@ -77,6 +77,7 @@ def test_a_common_dialect_is_read(dialect: Dialect) -> None:
     _assert_equal(_read(dialect), dialect)
 
 
+@pytest.mark.usefixtures("long_computation")
 @given(st.fixed_dictionaries({}, optional={habit: st.sampled_from(values) for habit, values in HABITS.items()}))
 @example({"separator": ",", "decimal": ",", "time": "none"})
 @example({"separator": " ", "thousands": " "})

@@ -57,6 +57,7 @@ def test_dead_signals_are_named_with_what_the_speed_travels(names: tuple[str, ..
     assert "the integral of speed travels 399.9 mm" in text
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("name", ["bench", "slow", "screw"])
 def test_faults_of_one_and_two_signals_are_never_wrong_in_silence(name: str) -> None:
     own = plant(name)
@@ -174,6 +175,7 @@ def test_good_table_sensors_are_used_without_a_warning(at_table: Window) -> None
     assert not any("table" in warning.text for warning in good.verdict.warnings)
 
 
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize(
     ("field", "change", "text"),
     [

@@ -156,6 +156,7 @@ async def test_no_name_leads_out_of_the_folder(config: MachineConfig, tmp_path: 
             assert (answer.status_code, answer.json()["code"]) == (422, "BadRequest"), name
 
 
+@pytest.mark.usefixtures("real_time")
 async def test_who_goes_away_while_a_program_is_checked_has_nothing_armed(config: MachineConfig) -> None:
     ensure_token(_made(config))
     gone, abandoned = asyncio.Event(), asyncio.Event()

@@ -53,6 +53,7 @@ async def test_each_axis_is_told_in_few_words(client: httpx.AsyncClient) -> None
     assert (never["state"], never["says"], never["newest_time"]) == ("none", ["Nothing was identified yet."], None)
 
 
+@pytest.mark.usefixtures("long_computation")
 async def test_courses_have_intervals_limits_and_the_figures_of_the_store(
     client: httpx.AsyncClient, machine: MachineConfig
 ) -> None:

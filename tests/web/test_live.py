@@ -128,6 +128,7 @@ def feed(stream: LiveStream, first: int, blocks: int) -> None:
         stream.take(block(np.arange(first + k * BLOCK, first + (k + 1) * BLOCK)))
 
 
+@pytest.mark.usefixtures("real_time")
 async def test_what_passes_is_told_as_columns_and_kept_as_samples_over_a_daemon_that_begins_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -164,6 +165,7 @@ async def test_what_passes_is_told_as_columns_and_kept_as_samples_over_a_daemon_
     assert told["axes"]["X"]["temperature_c"]["low"] == [None] * 20
 
 
+@pytest.mark.usefixtures("real_time")
 async def test_a_browser_that_does_not_draw_is_waited_for_and_then_told_in_wider_columns(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -139,6 +139,7 @@ def test_forecast_uses_the_loops_that_the_newest_set_was_validated_with(tmp_path
     assert used.axis["Y"] == own.axis["Y"]
 
 
+@pytest.mark.usefixtures("real_time")
 def test_few_points_keep_the_largest_error_and_stay_on_the_path(
     client: Client, judged: dict[str, Any], planned: Any
 ) -> None:

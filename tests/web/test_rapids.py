@@ -84,6 +84,7 @@ async def test_all_rapids_are_listed_newest_first_page_by_page(client: httpx.Asy
     assert ids == list(range(2 * RAPIDS, 0, -1))
 
 
+@pytest.mark.usefixtures("long_computation")
 async def test_they_are_chosen_by_axis_verdict_and_reason(client: httpx.AsyncClient) -> None:
     counts = await _get(client, "/counts")
     assert counts["axes"] == ["X", "Y"]

@@ -58,6 +58,7 @@ class _CancelledWithAnswer(asyncio.CancelledError):
     """As asyncua's wait ends that is cancelled just as the answer comes."""
 
 
+@pytest.mark.usefixtures("real_time")
 async def test_a_time_out_that_meets_the_answer_is_a_time_out_and_a_cancellation_is_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -82,6 +83,7 @@ async def test_a_time_out_that_meets_the_answer_is_a_time_out_and_a_cancellation
             await source._values()
 
 
+@pytest.mark.usefixtures("real_time")
 async def test_a_node_that_lacks_is_named_and_an_optional_one_is_not_missed(tmp_path: Path) -> None:
     async with OpcUaPeer() as peer:
         await peer.server.delete_nodes([peer.nodes["tool"]])

@@ -60,6 +60,7 @@ async def test_stamps_rise_and_are_of_this_computers_clock(name: str) -> None:
     assert stamps == sorted(stamps)
 
 
+@pytest.mark.usefixtures("real_time")
 async def test_nobody_there_is_a_connect_error_that_names_the_place(name: str) -> None:
     async with PEERS[name]() as peer:
         source = load_nc_source(name)(config_of(name, peer))
