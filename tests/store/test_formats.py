@@ -123,6 +123,7 @@ def test_a_file_that_declares_more_than_a_recording_has_is_refused_before_it_is_
         read_recording(path)
 
 
+@pytest.mark.usefixtures("processes")
 def test_matlab_7_3_is_read_as_the_hdf5_that_it_is(tmp_path: Path) -> None:
     import h5py
 
