@@ -9,9 +9,6 @@ VCAN   := bash tests/integration/vcan-vm.sh -t 1800 -M 2048
 # tests against LinuxCNC stand in these folders; of it a computer runs one at a time
 LINUXCNC := tests/linuxcnc tests/program
 
-# with COVERAGE=1 the tests note which branches of the guard they take
-PYTEST  = $(BIN)/python $(if $(COVERAGE),-m coverage run) -m pytest
-
 # of make fuzz: inputs to each way in, and when to go on to the next one before that
 N       ?= 2000
 SECONDS ?= 100000
@@ -50,7 +47,7 @@ demo: setup      ## the whole loop on the simulated machine; the report is out/r
 	@$(BIN)/fdhil demo --out out
 
 test: setup      ## the fast tests: no processes, no Debian packages
-	@$(PYTEST) -q -m "not system" -n 2 --dist loadfile
+	@$(BIN)/python -m pytest -q -m "not system" -n 2 --dist loadfile
 
 test-system: setup ## the tests with processes, terminals, browsers, brokers and other people's programs; needs Debian packages
 	@command -v rs274 >/dev/null || { echo "make test-system needs rs274: apt-get install linuxcnc-uspace" >&2; exit 1; }
@@ -61,8 +58,8 @@ test-system: setup ## the tests with processes, terminals, browsers, brokers and
 	@command -v strace >/dev/null && command -v faketime >/dev/null || { echo "make test-system needs strace and faketime: apt-get install strace faketime" >&2; exit 1; }
 	@PATH="$$PATH:/usr/sbin"; command -v nats-server >/dev/null && ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 || { echo "make test-system needs nats-server and PostgreSQL: apt-get install nats-server postgresql" >&2; exit 1; }
 	@npm ci --prefix tests/foreign --ignore-scripts --no-audit --no-fund --silent
-	@$(PYTEST) -q -m "system and debian and not socketcan" $(LINUXCNC)
-	@$(PYTEST) -q -m "system and not socketcan" $(LINUXCNC:%=--ignore %) -n 3 --dist loadfile
+	@$(BIN)/python -m pytest -q -m "system and debian and not socketcan" $(LINUXCNC)
+	@$(BIN)/python -m pytest -q -m "system and not socketcan" $(LINUXCNC:%=--ignore %) -n 3 --dist loadfile
 
 test-full: test test-system ## both
 
@@ -90,7 +87,7 @@ guard: setup     ## the guard's own tests, in its processes too; a branch of it 
 	@$(BIN)/python -m coverage erase
 	@$(BIN)/python -m coverage run -m pytest -q -m "not socketcan and not debian" -n 2 --dist loadfile tests/guard
 	@$(BIN)/python -m coverage combine -q
-	@$(BIN)/python -m coverage report --show-missing --skip-covered --fail-under 100
+	@$(BIN)/python -m coverage report --include 'fdhil/guard/*' --show-missing --skip-covered --fail-under 100
 	@$(BIN)/python -m coverage erase
 
 mutants: setup   ## what the guard's tests notice of mistakes put into it, one at a time (hours); the page is docs/studies/mutants.md

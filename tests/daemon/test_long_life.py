@@ -72,7 +72,7 @@ async def test_a_rapid_more_and_a_client_more_take_no_memory_more(
             status = await status_when(
                 path, lambda s, n=done: s["axes"]["X"]["accepted"] + s["axes"]["X"]["refused"] == n
             )
-            while any("ControlServer" in repr(task) for task in asyncio.all_tasks()):  # noqa: ASYNC110 - no event
+            while any("ControlServer._accept" in repr(task) for task in asyncio.all_tasks()):  # noqa: ASYNC110 - no event
                 await asyncio.sleep(0.01)  # a client has left, its task not yet
             gc.collect()
             descriptors = len(list(Path("/proc/self/fd").iterdir()))

@@ -62,6 +62,11 @@ LED = pytest.mark.parametrize("outfit", [o for o in OUTFITS if o.led], ids=lambd
 GENTLE_MM_S2 = 400.0
 
 
+def node_of(outfit: Outfit, place: int) -> dict[str, int]:
+    """Return the node-ID of a device with two axes: its second one has the PDO identifiers of the node after it."""
+    return {"node_id": 1 + 2 * place} if "logical_axis" in outfit.drive else {}
+
+
 def dressed(outfit: Outfit, folder: Path, axes: str = "X", *, noise: bool = False, **sections: Any) -> MachineConfig:
     """Return the bench with drives of this make, simulated in their dress."""
     eds = write_eds(outfit.sheet, folder)
@@ -69,7 +74,7 @@ def dressed(outfit: Outfit, folder: Path, axes: str = "X", *, noise: bool = Fals
     rapid: dict[str, Any] = {"max_acceleration_mm_s2": GENTLE_MM_S2} if outfit.narrow else {}
     document: dict[str, Any] = {
         "machine": {"name": "bench"},
-        "axis": {axis: bench_axis(drive=dict(drive), **rapid) for axis in axes},
+        "axis": {axis: bench_axis(drive=drive | node_of(outfit, k), **rapid) for k, axis in enumerate(axes)},
         "sim": {"axis": {axis: {"eds": str(eds)} for axis in axes}} | ({} if noise else {"noise": NO_NOISE}),
         "guard": {"clock": "sync"},
         **sections,
