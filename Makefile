@@ -58,10 +58,10 @@ test-system: setup ## the tests with processes, terminals, browsers, brokers and
 	@command -v strace >/dev/null && command -v faketime >/dev/null || { echo "make test-system needs strace and faketime: apt-get install strace faketime" >&2; exit 1; }
 	@PATH="$$PATH:/usr/sbin"; command -v nats-server >/dev/null && ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 || { echo "make test-system needs nats-server and PostgreSQL: apt-get install nats-server postgresql" >&2; exit 1; }
 	@npm ci --prefix tests/foreign --ignore-scripts --no-audit --no-fund --silent
-	@$(BIN)/python -m pytest -q -m "system and debian and not socketcan" $(LINUXCNC)
+	@$(BIN)/python -m pytest -q -m "system and not socketcan" $(LINUXCNC)
 	@$(BIN)/python -m pytest -q -m "system and not socketcan" $(LINUXCNC:%=--ignore %) -n 3 --dist loadfile
 
-test-full: test test-system ## both
+test-full: test test-system ## both tiers
 
 test-vcan: setup ## the integration suite and the socket tests on a real SocketCAN interface
 	@$(VCAN) $(BIN)/python -m pytest -q -p no:cacheprovider -m socketcan tests/socketcan tests/integration tests/foreign
