@@ -59,7 +59,7 @@ test-system: setup ## the tests with processes, terminals, browsers, brokers and
 	@PATH="$$PATH:/usr/sbin"; command -v nats-server >/dev/null && ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 || { echo "make test-system needs nats-server and PostgreSQL: apt-get install nats-server postgresql" >&2; exit 1; }
 	@npm ci --prefix tests/foreign --ignore-scripts --no-audit --no-fund --silent
 	@$(BIN)/python -m pytest -q -m "system and not socketcan" $(LINUXCNC)
-	@$(BIN)/python -m pytest -q -m "system and not socketcan" $(LINUXCNC:%=--ignore %) -n 3 --dist loadfile
+	@$(BIN)/python -m pytest -q -m "system and not socketcan" $(LINUXCNC:%=--ignore %) -n 2 --dist loadfile
 
 test-full: test test-system ## both tiers
 
