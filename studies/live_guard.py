@@ -186,7 +186,8 @@ class LiveGuard:
         self.wrong: list[str] = []
         self.events: list[dict[str, Any]] = []
         self.wires = [Wire(axis.limits, 0) for axis in self.settings.axes]
-        self.sending = self.playing = self.idle = False
+        self.state = ""
+        self.playing = self.idle = False
         self.waits, self.tamper, self.insert = True, None, []
         self._next_s = self._heard_s = 0.0
         self._send([frame for _, frame in self.machine.power_on()])
@@ -269,7 +270,12 @@ class LiveGuard:
         for line in lines:
             event = json.loads(line)
             self.events.append(event)
-            self.sending = event.get("state") not in (None, "OFF", "FROZEN") if "state" in event else self.sending
+            self.state = event.get("state", self.state)
+
+    @property
+    def sending(self) -> bool:
+        """Whether the guard sends offsets, as far as its journal was read."""
+        return self.state not in ("", "OFF", "FROZEN")
 
     def _judge(self, axis: int, value: int) -> None:
         """Judge a frame by those before it on the wire and by what the drive holds.
@@ -366,7 +372,7 @@ class LiveGuard:
         """Kill it, and return when it is dead."""
         os.kill(self.guard, signal.SIGKILL)
         self.guard_ended()
-        self.sending = False
+        self.state = ""
 
     def guard_ended(self) -> int:
         """Wait for its end; its exit code."""
@@ -390,8 +396,9 @@ class LiveGuard:
         time_s: Float = np.arange(ROWS, dtype=np.float64) * PERIOD_S
         self.program = Trajectory(PERIOD_S, time_s, places, nothing.astype(bool), nothing)
         self.idle = True  # whoever is to arm has the processor to himself
+        seen = len(self.events)
         daemon = self.daemon = Daemon(self.folder, increments, offsets)
-        self.until(lambda: daemon.armed, "armed")
+        self.until(lambda: daemon.armed and self.was("ARMED", seen), "armed")
         self.idle = False
 
     def play(self) -> None:
@@ -405,21 +412,20 @@ class LiveGuard:
         A guard that was held up and lost frames ends a correction before it begins, as it should: it is armed again.
         """
         for _ in range(TRIES):
-            seen = len(self.events)
             self.arm()
             self.play()
-            self.until(lambda seen=seen: any(self.offsets) or self.was("OFF FROZEN", seen), "an offset")  # type: ignore[misc]
+            self.until(lambda: any(self.offsets) or not self.sending, "an offset")
             if any(self.offsets):
                 self.run(int(self.rng.integers(0, ROWS - 2 * RESTING - 40)))
                 return
-            self._give_up()
+            self.give_up()
         raise RuntimeError(f"no program began in {TRIES} tries; {self.events[-5:]}")
 
-    def _give_up(self) -> None:
+    def give_up(self) -> None:
         """End the daemon whose correction the guard has ended, and a guard that is frozen."""
         if self.daemon is not None:
             self.daemon.kill()
-        if self.events[-1].get("state") == "FROZEN":
+        if self.state == "FROZEN":
             self.kill_guard()
             self.start_guard()
 

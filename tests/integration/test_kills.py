@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from fdhil.guard import core
 from fdhil.guard.limits import OffsetLimits
 from studies import kills
 from studies.fault_rows import RAMPED, Descent, descent
+from studies.live_guard import LiveGuard
 from tests.fault_matrix import ROWS
 
 LIMITS = OffsetLimits(offset=819, rate=65, acceleration=6, variation=9830, window=1000)
@@ -43,6 +46,19 @@ def test_faults_of_the_bus_end_at_zero_between_processes() -> None:
     found = kills.live_part("faults", 3, 5)
     assert found.wrong == []
     assert sum(map(len, found.descents.values())) == 3
+
+
+@pytest.mark.usefixtures("processes")
+def test_rig_arms_again_after_it_gave_up_a_correction(tmp_path: Path) -> None:
+    live = LiveGuard(tmp_path)
+    try:
+        live.start_guard()
+        live.arm()
+        live.give_up()
+        live.into_the_cut()
+        assert any(live.offsets)
+    finally:
+        live.close()
 
 
 @pytest.mark.socketcan
