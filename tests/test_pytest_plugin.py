@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -9,45 +10,9 @@ import pytest
 
 pytest_plugins = ["pytester"]
 
-MASTER = """
-import canopen
-import pytest
+PAGE = Path(__file__).parents[1] / "docs/how-to/test-your-master.md"
 
-
-def test_a_master_made_with_canopen_moves_a_drive(feed_drive_bench):
-    bench = feed_drive_bench(axes="X")
-    network = canopen.Network()
-    network.connect(**bench.bus_arguments)
-    try:
-        node = network.add_node(bench.drive()["node_id"], bench.drive()["eds"])
-        node.sdo.RESPONSE_TIMEOUT = 60.0  # of a computer that is busy
-        node.nmt.state = "OPERATIONAL"
-        node.sdo[0x6060].raw = 1  # profile position
-        for word in (0x06, 0x07, 0x0F):
-            node.sdo[0x6040].raw = word
-        goal = round(2.0 * bench.drive()["increments_per_mm"])
-        node.sdo[0x607A].raw = goal
-        node.sdo[0x6040].raw = 0x1F
-        while not node.sdo[0x6041].raw & 0x400 or abs(node.sdo[0x6064].raw - goal) > 50:
-            pass
-        assert bench.position_mm() == pytest.approx(2.0, abs=0.05)
-    finally:
-        network.disconnect()
-
-
-def test_an_emergency_is_heard(feed_drive_bench):
-    bench = feed_drive_bench(axes="X", changes={"axis": {"X": {"drive": {"node_id": 9}}}})
-    bus = bench.join()
-    bench.command("nc", on=True)
-    bench.wait_for("nc")
-    bench.fault("trip", value=0x3210)
-    bench.command("override", percent=50)  # that the drive has tripped by now is no answer to it
-    for message in bus:
-        if message.arbitration_id == 0x89:
-            break
-    assert message.data[:2] == b"\x10\x32"
-
-
+OTHERS = """
 def test_its_own_nc_plays_a_program(feed_drive_bench, tmp_path):
     bench = feed_drive_bench(pace="lockstep")
     bench.play("G0 X3 Y1", trace=tmp_path / "trace.csv")
@@ -64,8 +29,9 @@ def test_what_it_cannot_do_fails_the_test(feed_drive_bench):
 
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("bus", ["virtual", "hub"])
-def test_a_suite_of_somebody_else_uses_it(bus: str, pytester: pytest.Pytester) -> None:
-    pytester.makepyfile(MASTER)
+def test_page_and_other_tests_run_in_a_suite_of_their_own(bus: str, pytester: pytest.Pytester) -> None:
+    shown = re.findall(r"^```python\n(.*?)^```", PAGE.read_text("utf-8"), re.MULTILINE | re.DOTALL)
+    pytester.makepyfile("\n\n".join([*shown, OTHERS]))
     pytester.makeini("[pytest]\nasyncio_default_fixture_loop_scope = function\n")
     named = () if entry_points(group="pytest11", name="fdhil") else ("-p", "fdhil.pytest_plugin")  # not installed yet
     result = pytester.runpytest_subprocess("-q", *named, f"--feed-drive-bus={bus}")

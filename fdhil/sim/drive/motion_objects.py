@@ -12,7 +12,7 @@ from fdhil.sim.drive.dictionary import ARRAY, I8, I16, I32, U8, U16, U32, DataTy
 
 NO_WINDOW = 0xFFFFFFFF
 HERE = 37  # homing method: the current position
-_WINDOW_MM, _WINDOW_MS = 0.1, 0
+_WINDOW_MM, _WINDOW_MS = 0.01, 10
 _SPEED_WINDOW_RAD_S = 1.0
 _REST_MS = 5
 _HEADROOM = 2.0  # of the highest speed above the axis' own, of the highest acceleration above the quick stop's
