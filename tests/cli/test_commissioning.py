@@ -25,6 +25,7 @@ from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.record import load_record
 from fdhil.commissioning.void import is_void, void_record
 from fdhil.config import load
+from fdhil.sim.drive.objects import serial_number
 from fdhil.sim.wire.hub import Hub
 from tests.arming.guard_peer import Guard
 from tests.sim.hub_thread import HubThread
@@ -147,7 +148,7 @@ def test_a_scan_lists_the_drives_with_their_eds(fdhil: Said, bench: Bench) -> No
         "vendor_id": 0x46444849,
         "product_code": 0x402,
         "revision": 0x10000,
-        "serial": 1002,
+        "serial": serial_number(load(bench.config()), "Y"),
     }
     assert answers["name"] == "fdhil twin drive"
     assert answers["device_type"] & 0xFFFF == 402
@@ -362,7 +363,7 @@ def test_an_axis_is_commissioned_and_signed_off(fdhil: Said, bench: Bench) -> No
     assert "axis X is commissioned: moved +" in out
     record = load_record(config.parent / "fdhil-data", "X")
     assert record is not None
-    assert (record.watchdog, record.serial, record.options["1017"]) == ("proven", 1001, 100)
+    assert (record.watchdog, record.serial, record.options["1017"]) == ("proven", serial_number(load(config), "X"), 100)
 
 
 @pytest.mark.usefixtures("long_computation")

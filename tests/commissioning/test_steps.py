@@ -60,7 +60,7 @@ def test_a_good_drive_is_signed_off_and_left_as_it_was(peer: tuple[DrivePeer, Ma
     assert record.watchdog == "proven"
     assert record.sign_test_um == pytest.approx(10.0, abs=3.0)
     assert record.options == {"6007": 1, "605A": 2, "605E": 2, "6065": 32768, "6085": 26214400, "1017": 100}
-    assert record.serial == 1001
+    assert record.serial == drive.drive.dictionary.number(0x1018, 4)
     assert record.following_error_window_um == 10_000.0
     assert steps[0] == "listen"
     assert steps[-1] == "restore"

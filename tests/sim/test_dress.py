@@ -17,12 +17,13 @@ from fdhil import config
 from fdhil.errors import EdsError
 from fdhil.sim.drive.dictionary import DataType
 from fdhil.sim.drive.eds import eds_text as own_eds_text
+from fdhil.sim.drive.objects import serial_number
 from fdhil.sim.drive.sheet import Sheet, read_sheet
 from tests.bench import bench_document
 from tests.eds import SHEETS, eds_text, write_eds
 from tests.sim.bench_twin import TwinInHand, corner
 from tests.sim.canopen_peer import direct
-from tests.sim.rig import NO_NOISE, Abort, Rig
+from tests.sim.rig import NO_NOISE, Abort, Rig, machine
 
 RPM = 65536 / 60  # increments/s
 NODE = 1
@@ -177,7 +178,8 @@ def test_a_drive_can_wear_whatever_a_file_says(tmp_path: Path, lines: list[str],
 
 
 def test_identity_types_access_and_defaults_are_those_of_the_file(epos4: Rig) -> None:
-    assert [epos4.read(0x1018, sub) for sub in (1, 2, 3, 4)] == [0xFB, 0x60500000, 0x01500000, 1001]
+    assert [epos4.read(0x1018, sub) for sub in (1, 2, 3)] == [0xFB, 0x60500000, 0x01500000]
+    assert epos4.read(0x1018, 4) == serial_number(machine(), "X")
     assert epos4.read(0x605A) == 6
     assert epos4.read(0x6007) == 3
     assert epos4.read(0x1014) == 0x81

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from fdhil import config
 from fdhil.sim.drive.eds import write_eds
+from fdhil.sim.drive.objects import serial_number
 from fdhil.sim.drive.servo import Drive
 from tests.bench import bench_document
 from tests.sim.canopen_peer import dictionary, over_virtual_bus
@@ -243,7 +244,7 @@ def test_the_eds_says_what_the_drive_is(tmp_path: Path) -> None:
                 assert described.default == entry.default
                 assert (described.min, described.max) == (entry.low, entry.high)
     assert isinstance(od[0x1600], canopen.objectdictionary.ODRecord)
-    assert od[0x1018][4].default == 1002
+    assert od[0x1018][4].default == serial_number(machine("XY"), "Y")
     elsewhere: Any = canopen.import_od(str(tmp_path / "sub" / "y.eds"), 9)
     assert elsewhere[0x1800][1].default == 0x40000189
     assert elsewhere[0x1402][1].default == 0x80000409

@@ -13,14 +13,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fdhil.config import parse
 from fdhil.sim.drive.dictionary import AbortCode, DataType, Dictionary, var
+from fdhil.sim.drive.objects import serial_number
 from fdhil.sim.drive.sdo import SdoServer
 from fdhil.sim.wire.attach import SocketCan
+from tests.bench import bench_document
 from tests.sim.canopen_peer import direct, over_virtual_bus
 from tests.sim.rig import Abort, Rig, emergencies, machine
 from tests.sim.test_sdo import abort_code, head
 
-IDENTITY = (0x46444849, 0x0402, 0x00010000, 1001)
+SERIALS = tuple(serial_number(machine("XY"), axis) for axis in "XY")
+IDENTITY = (0x46444849, 0x0402, 0x00010000, SERIALS[0])
 
 
 # -- block download
@@ -210,7 +214,7 @@ def test_an_id_that_is_none_is_refused(lss: tuple[Any, Rig, Rig]) -> None:
 
 def test_unconfigured_nodes_are_found_by_fastscan(lss: tuple[Any, Rig, Rig]) -> None:
     master, first, second = lss
-    for rig, serial in ((first, 1001), (second, 1002)):
+    for rig, serial in zip((first, second), SERIALS, strict=True):
         assert master.send_switch_state_selective(*IDENTITY[:3], serial) is True
         master.configure_node_id(255)
         master.send_switch_state_global(master.WAITING_STATE)
@@ -218,7 +222,7 @@ def test_unconfigured_nodes_are_found_by_fastscan(lss: tuple[Any, Rig, Rig]) -> 
         assert rig.drive.wall_clock(1.0) == []
         assert rig.send(0x601, bytes([0x40, 0, 0x10, 0]) + bytes(4)) == []
     master.send_identify_non_configured_remote_slave()
-    for node_id, expected in ((30, IDENTITY), (31, (*IDENTITY[:3], 1002))):
+    for node_id, expected in zip((30, 31), sorted((*IDENTITY[:3], serial) for serial in SERIALS), strict=True):
         found, identity = master.fast_scan()
         assert found
         assert tuple(identity) == expected
@@ -236,7 +240,7 @@ def test_the_rest_of_lss() -> None:
     def ask(*data: int) -> list[bytes]:
         return [answer for can_id, answer in rig.send(0x7E5, bytes(data).ljust(8, b"\0")) if can_id == 0x7E4]
 
-    for place, number in enumerate((*IDENTITY[:2], 0x10000, 0x10000, 1000, 1002)):
+    for place, number in enumerate((*IDENTITY[:2], 0x10000, 0x10000, SERIALS[0] - 1, SERIALS[0] + 1)):
         answers = ask(0x46 + place, *number.to_bytes(4, "little"))
     assert answers == [b"\x4f" + bytes(7)]
     assert ask(0x11, 5) == []  # it waits
@@ -385,3 +389,11 @@ def test_objects_that_drives_have() -> None:
     assert rig.read(0x6502) == 0x3AD
     rig.drive.wall_clock(2.5)
     assert rig.read(0x1013) == 2_500_000
+
+
+def test_drives_of_two_machines_have_serial_numbers_of_their_own() -> None:
+    """A record made on another simulator's drive is void on this one."""
+    machines = [parse(bench_document("XY") | {"machine": {"name": name}}) for name in "AB"]
+    numbers = [serial_number(machine, axis) for machine in machines for axis in "XY"]
+    assert len(set(numbers)) == 4
+    assert numbers == [serial_number(machine, axis) for machine in machines for axis in "XY"]

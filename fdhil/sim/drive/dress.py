@@ -17,7 +17,15 @@ from typing import Any
 from fdhil.config import MachineConfig, SimAxis
 from fdhil.sim.drive.dictionary import DataType, Dictionary, Entry, Object, Value
 from fdhil.sim.drive.modes import CYCLIC, CYCLIC_POSITION, SUPPORTED_MODES
-from fdhil.sim.drive.objects import DEVICE_NAME, PRODUCT_CODE, REVISION, VENDOR_ID, Ratings, drive_objects
+from fdhil.sim.drive.objects import (
+    DEVICE_NAME,
+    PRODUCT_CODE,
+    REVISION,
+    VENDOR_ID,
+    Ratings,
+    drive_objects,
+    serial_number,
+)
 from fdhil.sim.drive.sheet import Sheet, read_sheet
 
 _MODES, _TARGET, _INTERPOLATION, _SPEED_UNIT = 0x650200, 0x607A00, 0x60C101, 0x60A900
@@ -119,8 +127,8 @@ def dress(config: MachineConfig, axis: str) -> Dress:
     ratings = Ratings.of(config, axis)
     exchange = _Exchange(_AXIS_STEP * (config.axis[axis].drive.logical_axis - 1))
     sheet = exchange.sheet(read_sheet(path, ratings.node_id))
-    serial = 1001 + list(config.axis).index(axis)
-    return exchange.dress(_Tailor(sheet, own, ratings, tailoring(sheet.vendor), serial).dress())
+    tailor = _Tailor(sheet, own, ratings, tailoring(sheet.vendor), serial_number(config, axis))
+    return exchange.dress(tailor.dress())
 
 
 @cache

@@ -6,6 +6,7 @@ of 0x6076, the vendor's terminal voltage (0x2101) in 0.02 V: the mean over the S
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 
 from fdhil.config import Axis, MachineConfig
@@ -85,6 +86,11 @@ def drive_objects(config: MachineConfig, axis: str) -> tuple[Object, ...]:
     return tuple(sorted(objects, key=lambda item: item.index))
 
 
+def serial_number(config: MachineConfig, axis: str) -> int:
+    """Return a serial number (0x1018:04) that differs between machines of different names, and stays the same."""
+    return zlib.crc32(f"{config.machine.name}/{axis}".encode()) or 1
+
+
 def _communication(config: MachineConfig, axis: str, ratings: Ratings) -> list[Object]:
     node = ratings.node_id
     return [
@@ -118,7 +124,7 @@ def _communication(config: MachineConfig, axis: str, ratings: Ratings) -> list[O
             Entry(0x1018, 1, "Vendor-ID", U32, "ro", VENDOR_ID),
             Entry(0x1018, 2, "Product code", U32, "ro", PRODUCT_CODE),
             Entry(0x1018, 3, "Revision number", U32, "ro", REVISION),
-            Entry(0x1018, 4, "Serial number", U32, "ro", 1000 + list(config.axis).index(axis) + 1),
+            Entry(0x1018, 4, "Serial number", U32, "ro", serial_number(config, axis)),
         ),
         var(0x1019, "Synchronous counter overflow value", U8, "rw", 240 if config.sim.nc else 0),
         record(
