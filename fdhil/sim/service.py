@@ -8,6 +8,7 @@ in force is waited for as long as it may sleep on a busy host, unless it has lef
 
 from __future__ import annotations
 
+import math
 import os
 import select
 import tempfile
@@ -40,7 +41,7 @@ Emit = Callable[[dict[str, Any]], None]
 WALL_CLOCK_S = 0.004  # how often heartbeats and their time-outs are looked at
 ALONE_S = 0.001  # the same while a drive moves by its own clock
 IDLE_PERIODS = 4  # in lockstep, of a machine that stands: whoever listens is not kept busy for nothing
-LOCKSTEP_WAIT_S = 2.0  # a guard may be held up for so long before a machine that stands goes on without it
+LOCKSTEP_WAIT_S = 2.0  # a guard or a SYNC producer may be held up for so long before a machine at rest goes on
 LOCKSTEP_HOLDING_WAIT_S = 8.0  # a listener takes ten seconds without SYNC for a bus that is dead
 _MIN_SPACING = 0.75  # of a period, between two SYNCs after a late one
 _CATCH_UP = 0.95  # of a period, between two SYNCs while a stream's rows pile up
@@ -80,6 +81,30 @@ class Pace:
         self._next_s = max(self._next_s + spacing_s, now_s + _MIN_SPACING * self._period_s)
 
 
+class DriveClock:
+    """The time on which the drives' heartbeats and time-outs run.
+
+    When the host was late it passes slower: a drive has no such pauses. In lockstep it passes with SYNC, whoever
+    produces it, until SYNC has been missing for LOCKSTEP_WAIT_S.
+    """
+
+    def __init__(self, period_s: float, *, lockstep: bool) -> None:
+        self._period_s, self._lockstep = period_s, lockstep
+        self._time_s, self._read_s, self._read_tick = 0.0, 0.0, 0
+        self._sync_s = -math.inf
+
+    def at(self, now_s: float, tick: int) -> float:
+        """Return the drives' time, s, at a monotonic time and a count of SYNC."""
+        passed_s = now_s - self._read_s if self._read_s else WALL_CLOCK_S
+        cycles = tick - self._read_tick
+        self._read_s, self._read_tick = now_s, tick
+        self._sync_s = now_s if cycles else self._sync_s
+        if self._lockstep and now_s - self._sync_s < LOCKSTEP_WAIT_S:
+            passed_s = min(passed_s, cycles * self._period_s)
+        self._time_s += min(passed_s, 2 * WALL_CLOCK_S)
+        return self._time_s
+
+
 class SimService:
     """The simulated machine with its ports open. :meth:`run` serves it until :meth:`stop`, then closes everything.
 
@@ -106,15 +131,16 @@ class SimService:
         self._streaming = False
         self.serving = False  # until then what is to be played is read, which has no end where a pipe has none
         self._ending = False
-        self._drive_time_s = 0.0
-        self._wall_s = self._told_s = 0.0
+        self._wall_s = 0.0
         self._loads: list[tuple[Path, Future[Trajectory]]] = []
         self._given: deque[tuple[str, Future[str]]] = deque()
         self._closed = False
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="ThreadPoolExecutor-sim")
         self._pipe = WakePipe()
         self._left = 0
-        self._pace = Pace(config.machine.sync_period_s, lockstep=config.sim.pace == "lockstep")
+        lockstep = config.sim.pace == "lockstep"
+        self._pace = Pace(config.machine.sync_period_s, lockstep=lockstep)
+        self._drive_clock = DriveClock(config.machine.sync_period_s, lockstep=lockstep)
         self._buses: dict[str, Attachment] = {}
         self._sensors: SensorWires | None = None
         self._streams: dict[str, StreamPort] = {}
@@ -272,6 +298,7 @@ class SimService:
             ready, _, _ = select.select(readers, writers, (), 0.0)
         if ready:
             self._read(ready)
+        self._take_loads()
         now_s = time.monotonic()
         if now_s >= self._wall_s:
             self._wall_clock(now_s)
@@ -290,7 +317,6 @@ class SimService:
     def _read(self, ready: Sequence[object]) -> None:
         if self._pipe in ready:
             self._pipe.clear()
-            self._take_loads()
             self._take_given()
         if self._panel_fd is not None and self._panel_fd in ready:
             self._serve_panel()
@@ -321,11 +347,8 @@ class SimService:
         return sum(bus.senders_left for bus in self._buses.values())
 
     def _wall_clock(self, now_s: float) -> None:
-        """Let the drives' own time pass. When the host was late it passes slower: a drive has no such pauses."""
-        passed_s = now_s - self._told_s if self._told_s else WALL_CLOCK_S
-        self._told_s = now_s
-        self._drive_time_s += min(passed_s, 2 * WALL_CLOCK_S)
-        frames = self.machine.wall_clock(self._drive_time_s)
+        """Let the drives' own time pass."""
+        frames = self.machine.wall_clock(self._drive_clock.at(now_s, self.machine.tick))
         self._wall_s = now_s + (ALONE_S if self.machine.moves_alone else WALL_CLOCK_S)
         if frames:
             self._send(frames)
@@ -409,7 +432,8 @@ class SimService:
         future.add_done_callback(lambda _: self._pipe.wake())
 
     def _take_loads(self) -> None:
-        while self._loads and self._loads[0][1].done():
+        """Have the NC play what was read; what follows a stop waits until the axes stand."""
+        while self._loads and self._loads[0][1].done() and not self.machine.nc.is_stopping:
             file, future = self._loads.pop(0)
             try:
                 self.machine.nc.play(str(file), future.result())

@@ -20,7 +20,7 @@ from fdhil.cli.sim import _lines, _tell_json
 from fdhil.config import MachineConfig
 from fdhil.errors import ProgramError
 from fdhil.records import Trajectory
-from fdhil.sim.service import SimService
+from fdhil.sim.service import LOCKSTEP_WAIT_S, WALL_CLOCK_S, DriveClock, SimService
 from tests.bench import bench_document
 from tests.sim.bench_twin import corner, trajectory
 from tests.sim.hub_thread import frames_of
@@ -108,6 +108,19 @@ def test_what_cannot_be_read_does_not_end_the_machine(tmp_path: Path) -> None:
         assert not twin._thread.is_alive()
 
 
+def test_program_played_after_a_stop_begins_when_the_axes_stand(tmp_path: Path) -> None:
+    with running(load_corner, tmp_path, port=0) as twin:
+        twin.event("ready")
+        twin.command("nc", on=True)
+        twin.command("play", file="first.csv")
+        twin.event("playing")
+        twin.command("stop")
+        twin.command("play", file="second.csv")
+        assert twin.event("finished")["file"] == "first.csv"
+        assert twin.event("playing")["file"] == "second.csv"
+        assert twin.event("finished")["rows"] == len(corner())
+
+
 def test_the_eds_lies_where_the_machine_runs(tmp_path: Path) -> None:
     run = tmp_path / "run"
     run.mkdir()
@@ -145,3 +158,15 @@ def test_events_are_one_line_of_json_each(capsys: pytest.CaptureFixture[str]) ->
 )
 def test_people_get_sentences(event: dict[str, Any], text: str) -> None:
     assert _lines(event) == [text]
+
+
+def test_drive_time_follows_sync_in_lockstep_and_the_clock_once_sync_is_missing() -> None:
+    clock, real = DriveClock(0.001, lockstep=True), DriveClock(0.001, lockstep=False)
+    clock.at(10.0, 0)
+    for k in range(100):  # a busy host: a SYNC every 5 ms
+        lockstep_s, real_s = clock.at(10.0 + 0.005 * k, k), real.at(10.0 + 0.005 * k, k)
+    assert lockstep_s == pytest.approx(WALL_CLOCK_S + 0.099)
+    assert real_s == pytest.approx(WALL_CLOCK_S + 0.495)
+    stopped_s = 10.0 + 0.005 * 99
+    assert clock.at(stopped_s + 0.9 * LOCKSTEP_WAIT_S, 99) == lockstep_s
+    assert clock.at(stopped_s + 1.1 * LOCKSTEP_WAIT_S, 99) == lockstep_s + 2 * WALL_CLOCK_S

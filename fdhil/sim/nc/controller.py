@@ -142,6 +142,11 @@ class NcController:
         return bool(self._stages) or self._job is not None or self.phase in (Phase.CONFIGURE, Phase.ENABLE)
 
     @property
+    def is_stopping(self) -> bool:
+        """Whether it slows down to give the rest of a path up."""
+        return self.on and (self._stopping or (self._given_up and self._job is not None))
+
+    @property
     def on(self) -> bool:
         """Whether it has the bus."""
         return self.phase is not Phase.OFF

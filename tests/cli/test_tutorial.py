@@ -1,0 +1,150 @@
+"""The tutorial, typed as it is written: terminals are processes, the panel is the simulator's standard input."""
+
+from __future__ import annotations
+
+import queue
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fdhil.child import ending_with_parent
+from tests.ports import free_port
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs/tutorial/an-hour.md"
+PATIENCE_S = 900.0  # only ends what hangs
+SERVERS = {"fdhil sim": "is ready", "fdhil run": " ready: ", "fdhil-guard": '"event": "ready"'}
+TYPED_BY_THE_TEST = ("make setup", ". .venv", "mkdir", "cd ")
+RAPIDS = 20
+
+
+class Terminal:
+    """A command that stays in its terminal; what it prints is read line by line."""
+
+    def __init__(self, words: list[str], folder: Path) -> None:
+        self._child = subprocess.Popen(
+            ending_with_parent(words),
+            cwd=folder,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self._printed: list[str] = []
+        self._lines: queue.Queue[str | None] = queue.Queue()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self._child.stdout is not None
+        for line in self._child.stdout:
+            self._lines.put(line)
+        self._lines.put(None)
+
+    def type(self, line: str) -> None:
+        """Type a line and return."""
+        assert self._child.stdin is not None
+        self._child.stdin.write(line + "\n")
+        self._child.stdin.flush()
+
+    def wait_for(self, text: str, times: int = 1) -> None:
+        """Read on until this text was printed so many times."""
+        while times:
+            line = self._lines.get(timeout=PATIENCE_S)
+            assert line is not None, "".join(self._printed)
+            self._printed.append(line)
+            times -= text in line
+
+    def end(self) -> None:
+        """End the command and wait for it."""
+        self._child.terminate()
+        self._child.communicate(timeout=PATIENCE_S)
+        self._reader.join()
+
+
+class Desk:
+    """The user's terminals, and the folder ``hour`` that the tutorial makes."""
+
+    def __init__(self, folder: Path) -> None:
+        self._ports = {"29536": str(free_port()), "port = 5020": "port = 0", "port = 5021": "port = 0"}
+        shutil.copytree(ROOT / "configs", folder / "configs", symlinks=True)
+        shipped = folder / "configs/sim.toml"
+        shipped.write_text(self._with_free_ports(shipped.read_text("utf-8")), "utf-8")
+        self.folder = folder / "hour"
+        self.folder.mkdir()
+        self.open: dict[str, Terminal] = {}
+
+    def _with_free_ports(self, text: str) -> str:
+        for usual, free in self._ports.items():
+            text = text.replace(usual, free)
+        return text
+
+    def do(self, language: str, block: str) -> str:
+        """Do what a fenced block of the page says; return what was printed last."""
+        match language:
+            case "toml":
+                (self.folder / "answers.toml").write_text(self._with_free_ports(block), "utf-8")
+                return ""
+            case "sh":
+                return [self._command(line) for line in block.splitlines()][-1]
+            case "text":
+                return [self._panel(line) for line in block.splitlines()][-1]
+            case "python":
+                return self._run([sys.executable, "-c", block])
+        raise AssertionError(f"the page has a block of {language}")
+
+    def _command(self, line: str) -> str:
+        if line.startswith(TYPED_BY_THE_TEST):
+            return ""
+        name, *arguments = shlex.split(line)
+        module = {"fdhil": "fdhil", "fdhil-guard": "fdhil.cli.guard"}[name]
+        words = [sys.executable, "-m", module, *arguments]
+        for server, ready in SERVERS.items():
+            if line.startswith(server):
+                self.open[server] = Terminal(words, self.folder)
+                self.open[server].wait_for(ready)
+                return ""
+        return self._run(words)
+
+    def _run(self, words: list[str]) -> str:
+        done = subprocess.run(words, cwd=self.folder, input="y\n" * 20, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, f"{words}: {done.stdout}{done.stderr}"
+        return done.stdout
+
+    def _panel(self, line: str) -> str:
+        self.open["fdhil sim"].type(line)
+        if "shuttle" in line:
+            self.open["fdhil run"].wait_for("accepted", RAPIDS)
+        elif "play" in line:
+            self.open["fdhil sim"].wait_for("finished")
+        return ""
+
+    def close(self) -> None:
+        """End all, the guard after the daemon, the machine last."""
+        for server in ("fdhil run", "fdhil-guard", "fdhil sim"):
+            if server in self.open:
+                self.open[server].end()
+
+
+@pytest.fixture
+def desk(tmp_path: Path, processes: None) -> Iterator[Desk]:
+    del processes
+    made = Desk(tmp_path)
+    yield made
+    made.close()
+
+
+def test_tutorial_ends_with_a_corrected_cut(desk: Desk) -> None:
+    blocks = re.findall(r"^```(\w+)\n(.*?)^```", PAGE.read_text("utf-8"), re.MULTILINE | re.DOTALL)
+    printed = {block: desk.do(language, block) for language, block in blocks}
+    (compared,) = (text for block, text in printed.items() if block.startswith("import numpy"))
+    before_um, after_um = (float(um) for um in re.findall(r" ([\d.]+) um RMS", compared))
+    assert after_um < 0.1 * before_um
+    assert (desk.folder / "report.html").stat().st_size > 10_000
