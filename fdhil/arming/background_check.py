@@ -6,9 +6,6 @@ import asyncio
 import contextlib
 import hashlib
 import json
-import os
-import signal
-import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,13 +13,13 @@ from typing import Any
 from fdhil.arming.checked_program import Block, CheckedProgram
 from fdhil.arming.code_digest import MAKER
 from fdhil.arming.program_check import SCHEMA, part_file
+from fdhil.bounded_process import BoundedProcess
 from fdhil.config import MachineConfig
 from fdhil.prediction.model_terms import values_of
 from fdhil.records import Parameters, Reason
 from fdhil.store.atomic import store_error
 
 FOLDER = "checked"
-MAX_LINE = 1 << 20
 
 Enough = Callable[[CheckedProgram], bool]
 
@@ -122,9 +119,9 @@ class _RunningCheck:
         self.ended = self._abandoned = False
         self._program = str(request["program"])
         self.progress: Mapping[str, Any] = {}
-        self._hear({"progress": {"checked_s": 0.0, "line": 0, "times_real_time": 0.0, "refused": 0}})
         self._news = asyncio.Event()
-        self._process: asyncio.subprocess.Process | None = None
+        self._take({"progress": {"checked_s": 0.0, "line": 0, "times_real_time": 0.0, "refused": 0}})
+        self._process = BoundedProcess(MAKER)
         self.task = asyncio.create_task(self._follow(request), name=f"check of {self._program}")
 
     async def passed(self, enough: Enough) -> CheckedProgram | tuple[Reason, ...]:
@@ -141,33 +138,13 @@ class _RunningCheck:
         """End the process; return whether it ran."""
         running = not self.ended
         self._abandoned = self._abandoned or running
-        self._kill()
+        self._process.kill()
         return running
 
-    def _kill(self) -> None:
-        if self._process is not None and self._process.returncode is None:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(self._process.pid, signal.SIGKILL)  # its own kill() may take the exit code from who waits
-
     async def _follow(self, request: Mapping[str, Any]) -> None:
-        """Take what the process says until it ends."""
+        """Take what the process reports until it ends."""
         try:
-            self._process = process = await asyncio.create_subprocess_exec(
-                sys.executable,
-                "-m",
-                MAKER,
-                stdin=asyncio.subprocess.PIPE,
-                stdout=asyncio.subprocess.PIPE,
-                limit=MAX_LINE,
-            )
-            if self._abandoned:
-                self._kill()
-            try:
-                await self._converse(process, request)
-            finally:
-                self._kill()
-                await process.wait()
-            self._conclude(process.returncode)
+            self._conclude(await self._process.run(request, self._take))
         except OSError as error:
             text = f"the check cannot be started ({error.strerror or error})"
             self.checked.refused += (Reason("InternalError", text, "free memory and processes, then arm again"),)
@@ -175,21 +152,9 @@ class _RunningCheck:
             self.ended = True
             self._news.set()
 
-    async def _converse(self, process: asyncio.subprocess.Process, request: Mapping[str, Any]) -> None:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        with contextlib.suppress(ConnectionError):  # a process that ended already is told by its silence
-            process.stdin.write(json.dumps(request).encode() + b"\n")
-            await process.stdin.drain()
-        async for line in process.stdout:
-            with contextlib.suppress(ValueError):  # half a line is what an ended process leaves
-                told = json.loads(line)
-                if isinstance(told, dict):
-                    self._hear(told)
-            self._news.set()
-
-    def _hear(self, told: Mapping[str, Any]) -> None:
+    def _take(self, told: Mapping[str, Any]) -> None:
         checked = self.checked
+        self._news.set()
         if "progress" in told:
             self.progress = {"program": self._program, **told["progress"]}
         elif "block" in told:
@@ -202,7 +167,7 @@ class _RunningCheck:
         elif refused := told.get("refused") or told.get("error"):
             checked.refused += (Reason(**refused),)
 
-    def _conclude(self, code: int | None) -> None:
+    def _conclude(self, code: int) -> None:
         """A check that ended without a word on the whole has died."""
         if self.checked.whole or (self.checked.refused and code == 0):
             return

@@ -13,8 +13,6 @@ import hashlib
 import json
 import math
 import os
-import sys
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,6 +23,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from fdhil.arming.code_digest import code_digest
+from fdhil.bounded_process import limit_process, receive_request, report
 from fdhil.config import MachineConfig
 from fdhil.correction import gate
 from fdhil.correction.streaming import StreamBlock, stream
@@ -275,38 +274,24 @@ def keep(folder: Path, key: str, request: Callable[[BinaryIO], dict[str, Any]]) 
     return header
 
 
-def end_with_who_asked() -> None:
-    """End this process when the one that asked is gone: for a thread that waits for nothing else."""
-    # the other end of the pipe is closed then; unbuffered: a lock that is held here would spoil the exit
-    while os.read(0, 1):
-        pass
-    os._exit(1)
-
-
 def main() -> None:
     """Answer the one request; each line that is written is a JSON object, the last one is the answer."""
-    with contextlib.suppress(OSError):  # a sandbox may forbid even this; then the check competes
-        os.nice(NICENESS)
-    request = json.loads(sys.stdin.buffer.readline())
-    threading.Thread(target=end_with_who_asked, daemon=True).start()
-
-    def say(answer: Mapping[str, Any]) -> None:
-        sys.stdout.write(json.dumps(answer) + "\n")
-        sys.stdout.flush()
-
+    limit_process(NICENESS, {})
+    request = receive_request()
     config = MachineConfig.model_validate(request["config"])
     models = {axis: Parameters.of(values) for axis, values in request["models"].items()}
 
     def run(body: BinaryIO) -> dict[str, Any]:
-        return check(Path(request["program"]), request["program_digest"], models, config, body, say)
+        return check(Path(request["program"]), request["program_digest"], models, config, body, report)
 
     try:
         header = keep(Path(request["folder"]), request["key"], run)
-        say({"header": {name: value for name, value in header.items() if name != "blocks"}})  # they were told
+        report({"header": {name: value for name, value in header.items() if name != "blocks"}})  # they were told
     except StoreError as error:
-        say({"error": {"code": error.code, "text": str(error), "advice": "free the disk, then arm again"}})
+        report({"error": {"code": error.code, "text": str(error), "advice": "free the disk, then arm again"}})
     except FdhilError as error:
-        say({"error": {"code": type(error).__name__, "text": str(error), "advice": "mend the program, then arm again"}})
+        advice = "mend the program, then arm again"
+        report({"error": {"code": type(error).__name__, "text": str(error), "advice": advice}})
 
 
 if __name__ == "__main__":

@@ -7,15 +7,14 @@ is gone or has not asked for a while: what it has loaded takes 200 MB.
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 import resource
 import select
 import sys
 from collections.abc import Mapping
 from typing import Any
 
+from fdhil.bounded_process import limit_process
 from fdhil.config import MachineConfig
 from fdhil.daemon.outcome_store import WINDOWS_FOLDER
 from fdhil.errors import FdhilError
@@ -64,18 +63,9 @@ class Replays:
             return "-" + json.dumps({"status": status_of(error), **document_of(error)})
 
 
-def _bound() -> None:
-    """Bound what this process may take; a sandbox may forbid it."""
-    with contextlib.suppress(OSError):
-        os.nice(NICENESS)
-    for what, most in {resource.RLIMIT_AS: MEMORY_BYTES, resource.RLIMIT_CORE: 0}.items():
-        with contextlib.suppress(OSError, ValueError):
-            resource.setrlimit(what, (most, most))
-
-
 def main() -> None:
     """Answer until whoever asks is gone, or has not asked for a while."""
-    _bound()
+    limit_process(NICENESS, {resource.RLIMIT_AS: MEMORY_BYTES})
     with open(0, "rb", buffering=0, closefd=False) as lines:  # what a buffer holds back select does not see
         told = json.loads(lines.readline())
         replays = Replays(MachineConfig.model_validate(told["config"]), str(told["digest"]))

@@ -7,8 +7,7 @@ import json
 import math
 import os
 import sqlite3
-import threading
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -50,11 +49,9 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> MachineConfig:
 
 
 @pytest.fixture(scope="module")
-def app(machine: MachineConfig) -> Iterator[FastAPI]:
+def app(machine: MachineConfig) -> FastAPI:
     """The pages of that machine."""
-    app = make_app(machine)
-    yield app
-    replayer_of(app).close()
+    return make_app(machine)
 
 
 @pytest.fixture
@@ -62,6 +59,7 @@ async def client(app: FastAPI) -> AsyncIterator[httpx.AsyncClient]:
     """A browser on this computer."""
     async with _client(app) as client:
         yield client
+    await replayer_of(app).close()
 
 
 def _client(app: FastAPI) -> httpx.AsyncClient:
@@ -242,30 +240,35 @@ async def test_a_recording_that_is_gone_or_damaged_is_said_to_be(tmp_path: Path)
 
 
 @pytest.mark.usefixtures("processes")
-def test_a_replay_that_hangs_is_ended_and_one_that_has_ended_is_started_anew(
+async def test_a_replay_that_hangs_is_ended_and_one_that_has_ended_is_started_anew(
     machine: MachineConfig, app: FastAPI, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hung = Replayer(machine)
     monkeypatch.setattr(replayer, "LONGEST_S", 0.0)
     with pytest.raises(Refused) as refused:
-        hung.signals("X", 1)
+        await hung.signals("X", 1)
     assert refused.value.document["code"] == "ReplayFailed"
     monkeypatch.undo()
     running = replayer_of(app)
-    before = running.signals("X", 1)
+    before = await running.signals("X", 1)
     process = running._process
     assert process is not None
-    process.terminate()
-    process.wait()
-    assert running.signals("X", 1) == before
+    await process.end()
+    assert await running.signals("X", 1) == before
     assert running._process is not process
+    await running.close()
 
 
 async def test_who_asks_beyond_the_few_that_may_wait_for_a_replay_is_told_to_come_again(
     machine: MachineConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    app, replayed = make_app(machine), threading.Event()
-    monkeypatch.setattr(replayer_of(app), "_asked", lambda _: b"+{}\n" if replayed.wait() else b"")
+    app, replayed = make_app(machine), asyncio.Event()
+
+    async def answer(*_: object) -> bytes:
+        await replayed.wait()
+        return b"+{}\n"
+
+    monkeypatch.setattr(replayer_of(app), "_ask", answer)
     more = 3
     async with _client(app) as client:
         asked = [asyncio.create_task(client.get("/api/rapids/X/1/signals")) for _ in range(replayer.MOST_ASKING + more)]

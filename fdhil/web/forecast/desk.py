@@ -7,13 +7,10 @@ shown and never a path.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import hashlib
-import json
 import os
 import shutil
 import signal
-import sys
 import tempfile
 from collections import OrderedDict
 from collections.abc import AsyncIterable, Mapping
@@ -21,6 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from fdhil.bounded_process import BoundedProcess
 from fdhil.config import MachineConfig
 from fdhil.web.answers import Refused
 from fdhil.web.forecast.kept import Forecast, read_advice
@@ -30,7 +28,6 @@ KEPT = 6
 MOST_WAITING = 3
 LONGEST_S = 600.0  # beside a busy machine; processor time is bounded by the process itself
 LONGEST_NAME = 100
-MAX_LINE = 1 << 20
 STATES = Literal["waiting", "computing", "done", "failed", "cancelled"]
 ADVICE = {
     "ProgramError": "mend the program, then drop it again",
@@ -222,24 +219,14 @@ class Desk:
             work.state = "cancelled"
 
     async def _compute(self, job: Job, work: Work) -> None:
-        process = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", MAKER,
-            stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, limit=MAX_LINE,
-        )  # fmt: skip
-        try:
-            await self._converse(process, job, work)
-        finally:
-            if process.returncode is None:
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(process.pid, signal.SIGKILL)
-            await asyncio.shield(process.wait())
-        if work.fault is None:
-            await _conclude(job, work, process.returncode)
+        """Have a process compute, and take what it reports until it ends."""
 
-    async def _converse(self, process: asyncio.subprocess.Process, job: Job, work: Work) -> None:
-        """Ask the process, and take what it says until it ends."""
-        assert process.stdin is not None
-        assert process.stdout is not None
+        def take(told: Mapping[str, Any]) -> None:
+            if "progress" in told:
+                work.progress = told["progress"]
+            elif error := told.get("error"):
+                work.fail(error["code"], error["text"], ADVICE.get(error["code"], ""), error.get("line"))
+
         request = {
             "program": str(job.program),
             "name": job.name,
@@ -247,18 +234,12 @@ class Desk:
             "folder": str(job.folder),
             "tolerance_um": work.tolerance_um,
         }
-        with contextlib.suppress(ConnectionError):  # one that ended already is told by its silence
-            process.stdin.write(json.dumps(request).encode() + b"\n")
-            await process.stdin.drain()
-        async for line in process.stdout:
-            told = json.loads(line)
-            if "progress" in told:
-                work.progress = told["progress"]
-            elif error := told.get("error"):
-                work.fail(error["code"], error["text"], ADVICE.get(error["code"], ""), error.get("line"))
+        code = await BoundedProcess(MAKER).run(request, take)
+        if work.fault is None:
+            await _conclude(job, work, code)
 
 
-async def _conclude(job: Job, work: Work, code: int | None) -> None:
+async def _conclude(job: Job, work: Work, code: int) -> None:
     """Take up what the process has left; one that died has left nothing."""
     try:
         if code != 0:

@@ -7,14 +7,9 @@ history and writes into the folder that it is given; nothing is sent to any mach
 
 from __future__ import annotations
 
-import contextlib
 import itertools
-import json
 import math
-import os
 import resource
-import sys
-import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from fdhil import correction
-from fdhil.arming.program_check import end_with_who_asked
+from fdhil.bounded_process import limit_process, receive_request, report
 from fdhil.config import MachineConfig
 from fdhil.correction.advised import advised, entry, sources
 from fdhil.correction.document import correction_document
@@ -43,7 +38,7 @@ MOST_ROWS = 600_000
 """Ten minutes at 1 kHz: they take six seconds and half a gigabyte; the unit of the pages has one."""
 MOST_ZONES = 20
 NICENESS = 15
-CPU_S, MEMORY_BYTES, FILE_BYTES = 300, 6 << 30, 1 << 30
+LIMITS = {resource.RLIMIT_CPU: 300, resource.RLIMIT_AS: 6 << 30, resource.RLIMIT_FSIZE: 1 << 30}
 
 Tell = Callable[[Mapping[str, Any]], None]
 
@@ -180,50 +175,29 @@ def _single(reference: Trajectory) -> list[tuple[str, str]]:
     return [(moving, other)]
 
 
-def _bound() -> None:
-    """Bound what this process may take; a sandbox may forbid it, then the one that asked ends it by the clock."""
-    with contextlib.suppress(OSError):
-        os.nice(NICENESS)
-    with contextlib.suppress(OSError):  # where memory ends, it is this process that has to go
-        Path("/proc/self/oom_score_adj").write_text("1000", "ascii")
-    bounds = {
-        resource.RLIMIT_CPU: CPU_S,
-        resource.RLIMIT_AS: MEMORY_BYTES,
-        resource.RLIMIT_FSIZE: FILE_BYTES,
-        resource.RLIMIT_CORE: 0,
-    }
-    for what, most in bounds.items():
-        with contextlib.suppress(OSError, ValueError):
-            resource.setrlimit(what, (most, most))
-
-
 def main() -> None:
     """Answer the one request; each line that is written is a JSON object, the last one is the answer."""
-    _bound()
-    request = json.loads(sys.stdin.buffer.readline())
-    threading.Thread(target=end_with_who_asked, daemon=True).start()
+    limit_process(NICENESS, LIMITS)
+    request = receive_request()
     program, name = Path(request["program"]), str(request["name"])
-
-    def say(answer: Mapping[str, Any]) -> None:
-        sys.stdout.write(json.dumps(answer) + "\n")
-        sys.stdout.flush()
 
     try:
         config = MachineConfig.model_validate(request["config"])
         tolerance_um = request["tolerance_um"]
         if tolerance_um is None:
-            forecast(program, name, config, Path(request["folder"]), lambda told: say({"progress": told}))
+            forecast(program, name, config, Path(request["folder"]), lambda told: report({"progress": told}))
         else:
-            lines = advice(program, name, config, tolerance_um, lambda told: say({"progress": told}))
+            lines = advice(program, name, config, tolerance_um, lambda told: report({"progress": told}))
             kept.write_advice(Path(request["folder"]), tolerance_um, lines)
     except FdhilError as error:
         line = getattr(error, "line", None)
-        say({"error": {"code": type(error).__name__, "text": str(error).replace(str(program), name), "line": line}})
+        report({"error": {"code": type(error).__name__, "text": str(error).replace(str(program), name), "line": line}})
     except MemoryError:
-        say({"error": {"code": "TooLarge", "text": f"{name} takes more memory than a browser's program may; cut it"}})
+        text = f"{name} takes more memory than a browser's program may; cut it"
+        report({"error": {"code": "TooLarge", "text": text}})
     except OSError as error:
         text = f"the result cannot be written ({error.strerror or error}); free the disk"
-        say({"error": {"code": "DiskFault", "text": text}})
+        report({"error": {"code": "DiskFault", "text": text}})
 
 
 if __name__ == "__main__":

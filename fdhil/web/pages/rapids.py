@@ -39,7 +39,7 @@ async def _replaying(app: FastAPI) -> AsyncIterator[None]:
     try:
         yield
     finally:
-        replayer_of(app).close()
+        await replayer_of(app).close()
 
 
 def replayer_of(app: FastAPI) -> Replayer:
@@ -103,9 +103,9 @@ def rapid(here: Here, axis: Axis, number: Number) -> RapidTold:
 
 
 @router.get("/{axis}/{number}/signals", response_model=RapidSignals)
-def signals(replayer: Replaying, axis: Axis, number: Number) -> Response:
+async def signals(replayer: Replaying, axis: Axis, number: Number) -> Response:
     """Return a rapid's signals with the model laid over them, as a replay finds it now."""
-    return Response(replayer.signals(axis, number), media_type="application/json")
+    return Response(await replayer.signals(axis, number), media_type="application/json")
 
 
 def _folder(here: Context) -> FilePath:
