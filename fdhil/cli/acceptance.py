@@ -9,11 +9,11 @@ import click
 
 from fdhil.cli.compiling import forewarn
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import FILE, OutputFile, Positive, Writing
+from fdhil.cli.options import AS_JSON, CONFIG, FILE, OutputFile, Positive, Writing
 
 
 @click.command(cls=Writing)
-@click.argument("config", type=FILE)
+@CONFIG
 @click.option("--out", required=True, type=OutputFile(), help="The HTML file to write.")
 @click.option("--pdf", type=OutputFile(".pdf"), help="Also print it as PDF (needs chromium).")
 @click.option("--by", default="", metavar="NAME", help="Who proved it; stands above the signature.")
@@ -30,7 +30,7 @@ from fdhil.cli.options import FILE, OutputFile, Positive, Writing
 )
 @click.option("--contour-um", type=Positive(), help="The largest contour error of PROGRAM that is accepted.")
 @click.option("--circle-um", type=Positive(), help="The largest bi-directional circular deviation that is accepted.")
-@click.option("--json", "as_json", is_flag=True, help="Print what the page says as one JSON document.")
+@AS_JSON
 @verdict
 def acceptance(
     config: Path,

@@ -14,7 +14,7 @@ import click
 
 from fdhil.cli.compiling import forewarn
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import FILE, OutputFile, Positive, Writing
+from fdhil.cli.options import AS_JSON, FILE, OutputFile, Positive, Writing
 from fdhil.cli.prediction import inputs
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ UNHELD = "; {} of its lines leave the tolerance at every feed that was tried, wi
     help="Largest contour error allowed.",
 )
 @click.option("--out", type=OutputFile(), help="Write PROGRAM with these feeds, those without the correction.")
-@click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
+@AS_JSON
 @verdict
 def advise(
     program: Path,

@@ -11,13 +11,13 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import FILE
+from fdhil.cli.options import AS_JSON, CONFIG
 
 
 @click.command()
-@click.argument("config", type=FILE)
+@CONFIG
 @click.option("--last", type=click.IntRange(min=1), default=20, show_default=True, help="How many entries to show.")
-@click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
+@AS_JSON
 @verdict
 def audit(config: Path, last: int, as_json: bool) -> int:
     """Show who asked the machine of CONFIG for what, what he was answered, and whether no line was changed since.

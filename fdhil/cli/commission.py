@@ -17,7 +17,7 @@ from fdhil.cli.commission_guide import Asked, Guide, confirm, room_of, told
 from fdhil.cli.commission_steps import FEEDFORWARD, STEPS, moves_of, planned, trial_moves
 from fdhil.cli.commission_trial import try_commissioned
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import FILE
+from fdhil.cli.options import AS_JSON, CONFIG
 from fdhil.errors import ConfigError, ConfigFault, DriveFault
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ SCHEMA = "fdhil-commission-1"
 
 
 @click.command()
-@click.argument("config", type=FILE)
+@CONFIG
 @click.option("--axis", "only", help="Commission this axis; left out: all, one after the other.")
 @click.option("--room", nargs=2, type=float, metavar="BACK FORWARD",
               help="How far, mm, each axis may go from where it stands: -20 200. It is then tried by a jog and rapids, "
@@ -41,7 +41,7 @@ SCHEMA = "fdhil-commission-1"
     "--set-pdos", is_flag=True, help="Write the PDOs of the drives' profiles, save them in the drives; no more."
 )
 @click.option("--yes", is_flag=True, help="Do not ask before an axis moves, or PDOs are written.")
-@click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
+@AS_JSON
 @verdict
 def commission(
     config: Path,

@@ -14,7 +14,7 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import FILE
+from fdhil.cli.options import AS_JSON, CONFIG, FILE
 from fdhil.errors import DeviceError
 from fdhil.guard.protocol import SOCKET_NAME
 
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from fdhil.config import MachineConfig
 
 TellGuard = Callable[[Mapping[str, str]], Sequence[Mapping[str, str]] | None]
-CONFIG = click.argument("config", type=FILE)
-AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
 SCAN_HEAD = ("node\naxis", "NMT state\nheartbeat", "device\nprofile", "vendor\nproduct", "revision\nserial", "EDS")
 STATES: Mapping[bool | None, tuple[str, str]] = {
     True: ("ok", "green"),

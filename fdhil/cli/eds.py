@@ -13,7 +13,7 @@ import click
 
 from fdhil import tables
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import FILE
+from fdhil.cli.options import AS_JSON, FILE
 from fdhil.errors import ConfigError, ConfigFault
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ MOST_NAMED = 6
 @click.command()
 @click.argument("file", type=FILE)
 @click.option("--profile", "name", help="Judge by this profile, a packaged name or a TOML file; left out: its maker's.")
-@click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
+@AS_JSON
 @verdict
 def eds(file: Path, name: str | None, as_json: bool) -> int:
     """Tell from FILE, an EDS or DCF, what fdhil can and cannot do with this drive, and why.

@@ -11,11 +11,9 @@ from typing import Any
 import click
 
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import FILE
+from fdhil.cli.options import AS_JSON, CONFIG, FLEET, LINES
 from fdhil.errors import FdhilError
 
-AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
-LINES = click.option("--json", "as_json", is_flag=True, help="Write each line of the log as a JSON object to stdout.")
 BY = click.option("--by", default="type", show_default=True, help="The label by which machines are of one kind.")
 ELSEWHERE: Mapping[str, str] = {
     **dict.fromkeys(("service", "services", "retain", "export", "web", "web-user"), "fdhil.cli.fleet_works"),
@@ -36,7 +34,7 @@ def with_extra() -> Iterator[None]:
 
 
 @click.command()
-@click.argument("config", type=FILE)
+@CONFIG
 @LINES
 def uplink(config: Path, as_json: bool) -> None:
     """Send what the daemon of CONFIG records to the works, over NATS JetStream.
@@ -82,7 +80,7 @@ def fleet() -> None:
 
 
 @fleet.command()
-@click.argument("fleet", type=FILE)
+@FLEET
 @LINES
 def collect(fleet: Path, as_json: bool) -> None:
     """Gather what the machines tell in the database of FLEET.
@@ -115,7 +113,7 @@ def _answer(fleet: Path, question: str, **given: str | None) -> dict[str, Any]:
 
 
 @fleet.command()
-@click.argument("fleet", type=FILE)
+@FLEET
 @AS_JSON
 def status(fleet: Path, as_json: bool) -> None:
     """Show all machines, and what is due.
@@ -129,7 +127,7 @@ def status(fleet: Path, as_json: bool) -> None:
 
 
 @fleet.command()
-@click.argument("fleet", type=FILE)
+@FLEET
 @click.option("--machine", required=True, help="The machine, by its name in the works.")
 @click.option("--axis", required=True, help="Its axis.")
 @click.option("--parameter", required=True, type=PARAMETER)
@@ -148,7 +146,7 @@ def trend(fleet: Path, machine: str, axis: str, parameter: str, as_json: bool) -
 
 
 @fleet.command()
-@click.argument("fleet", type=FILE)
+@FLEET
 @click.option("--parameter", required=True, type=PARAMETER)
 @BY
 @click.option("--axis", help="One axis letter only.")
@@ -165,7 +163,7 @@ def compare(fleet: Path, parameter: str, by: str, axis: str | None, as_json: boo
 
 
 @fleet.command()
-@click.argument("fleet", type=FILE)
+@FLEET
 @BY
 @click.option("--axis", help="One axis letter only.")
 @AS_JSON

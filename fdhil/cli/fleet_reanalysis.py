@@ -14,8 +14,8 @@ import click
 
 from fdhil import tables
 from fdhil.cli.failing import verdict
-from fdhil.cli.fleet import AS_JSON, BY, with_extra
-from fdhil.cli.options import FILE
+from fdhil.cli.fleet import BY, with_extra
+from fdhil.cli.options import AS_JSON, FILE, FLEET
 
 if TYPE_CHECKING:
     from fdhil.config import MachineConfig
@@ -25,7 +25,7 @@ DAY = click.DateTime(["%Y-%m-%d", "%Y-%m-%dT%H:%M:%S"])
 
 
 @click.command()
-@click.argument("fleet", type=FILE)
+@FLEET
 @click.option("--since", type=DAY, help="Windows from this day on (UTC) only.")
 @click.option("--until", type=DAY, help="Windows before this day (UTC) only.")
 @click.option("--machine", help="One machine only, by its name in the works.")

@@ -12,14 +12,13 @@ import click
 
 from fdhil.cli.failing import verdict
 from fdhil.cli.fleet import with_extra
-from fdhil.cli.options import FILE, OutputFile, Writing
+from fdhil.cli.options import AS_JSON, FILE, FLEET, OutputFile, Writing
 
 if TYPE_CHECKING:
     from fdhil.fleet.offer import Change, Offer
     from fdhil.fleet.rollout import Standing, Told
 
 CHANGE = click.argument("change", type=FILE)
-AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
 MACHINES = click.option("--machine", "machines", multiple=True, help="A machine, by its name in the works; repeatable.")
 
 
@@ -76,7 +75,7 @@ def sign(change: Path, key_file: Path, by: str, machines: tuple[str, ...], out: 
 
 
 @click.command()
-@click.argument("fleet", type=FILE)
+@FLEET
 @CHANGE
 @click.option("--key", "key_file", type=FILE, help="The file of the key to sign with; without it nothing is opened.")
 @click.option("--by", default="", help="Who signs: your name, which the operators read.")

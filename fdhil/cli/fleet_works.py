@@ -9,13 +9,13 @@ from typing import Any
 
 import click
 
-from fdhil.cli.fleet import AS_JSON, with_extra
-from fdhil.cli.options import FILE
+from fdhil.cli.fleet import with_extra
+from fdhil.cli.options import AS_JSON, FILE, FLEET
 from fdhil.config.fleet import load
 
 
 @click.command()
-@click.argument("fleet", type=FILE)
+@FLEET
 @click.option("--machine", required=True, help="The machine, by its name in the works.")
 @click.option("--axis", help="Its axis; left out: the whole machine.")
 @click.option("--date", "at", type=click.DateTime(["%Y-%m-%d", "%Y-%m-%dT%H:%M"]), help="When (UTC); left out: now.")
@@ -46,7 +46,7 @@ def service(
 
 
 @click.command()
-@click.argument("fleet", type=FILE)
+@FLEET
 @click.option("--machine", help="One machine only.")
 @AS_JSON
 def services(fleet: Path, machine: str | None, as_json: bool) -> None:
@@ -62,7 +62,7 @@ def services(fleet: Path, machine: str | None, as_json: bool) -> None:
 
 
 @click.command()
-@click.argument("fleet", type=FILE)
+@FLEET
 @AS_JSON
 def retain(fleet: Path, as_json: bool) -> None:
     """Let go of what [retention] of FLEET does not keep.
@@ -81,7 +81,7 @@ def retain(fleet: Path, as_json: bool) -> None:
 
 
 @click.command()
-@click.argument("fleet", type=FILE)
+@FLEET
 @click.option(
     "--anonymous", "folder", type=FILE, required=True, help="The new folder to write, without any name in it."
 )
@@ -113,7 +113,7 @@ def _progress(text: str) -> None:
 
 
 @click.command()
-@click.argument("fleet", type=FILE)
+@FLEET
 @click.option("--host", help="Address to listen at; left out: web.host of FLEET, else 127.0.0.1.")
 @click.option("--port", type=click.IntRange(0, 65535), help="TCP port; 0 takes a free one. Left out: web.port.")
 @click.option("--json", "as_json", is_flag=True, help="Tell the address as a JSON object on stdout.")
@@ -143,7 +143,7 @@ def web(fleet: Path, host: str | None, port: int | None, as_json: bool) -> None:
 
 
 @click.command("web-user")
-@click.argument("fleet", type=FILE)
+@FLEET
 @click.argument("name")
 @click.option("--remove", is_flag=True, help="Take the user out.")
 @AS_JSON

@@ -13,7 +13,7 @@ import click
 from fdhil import config as machine_config
 from fdhil.cli.bus_lock import lock_bus
 from fdhil.cli.failing import prepare_streams, run_safely
-from fdhil.cli.options import FILE
+from fdhil.cli.options import CONFIG
 from fdhil.errors import DeviceError
 from fdhil.guard.protocol import SETTINGS_NAME
 from fdhil.guard.settings import from_json, to_json
@@ -21,7 +21,7 @@ from fdhil.guard.transmit_socket import connect_bus, greet
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
-@click.argument("config", type=FILE)
+@CONFIG
 @click.option("--check", is_flag=True, help="Write the settings and stop: opens no bus.")
 def guard(config: Path, check: bool) -> None:
     """Run the guard of the machine in CONFIG: the only process of fdhil that may send an offset to a drive.

@@ -16,7 +16,7 @@ import click
 
 from fdhil import tables
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import COLUMNS, FILE, OutputFile, Writing
+from fdhil.cli.options import AS_JSON, COLUMNS, FILE, OutputFile, Writing
 from fdhil.records import INTERVAL_95, unit_of
 from fdhil.report.parameter_view import MEANING, cell, head
 from fdhil.store import suffixes
@@ -47,7 +47,7 @@ UNREADABLE = 3
     help="What an accelerometer at the table recorded of the same run (CSV, as Klipper writes it); for one RECORDING.",
 )
 @COLUMNS
-@click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
+@AS_JSON
 @verdict
 def identify(
     recordings: tuple[Path, ...],

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import config as machine_config
-from fdhil.cli.options import FILE, OutputFile, Writing
+from fdhil.cli.options import AS_JSON, FILE, OutputFile, Writing
 from fdhil.errors import ConfigError, ConfigFault, OutputError
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ NEXT = (
               help="EDS or DCF file, or a folder of them; left out: the folder of FILE.")  # fmt: skip
 @click.option("--offline", is_flag=True, help="Look at no bus: what drives would tell is asked.")
 @click.option("--dry-run", is_flag=True, help="Write no file; print what it would be.")
-@click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
+@AS_JSON
 def init(
     file: Path,
     answers: Path | None,

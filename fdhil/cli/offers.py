@@ -12,16 +12,14 @@ from fdhil import config as machine_config
 from fdhil.cli.audited import audited
 from fdhil.cli.failing import verdict
 from fdhil.cli.fleet import with_extra
-from fdhil.cli.options import FILE
+from fdhil.cli.options import AS_JSON, CONFIG, FILE
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault
 
 if TYPE_CHECKING:
     from fdhil.fleet.offered import Judged
 
-CONFIG = click.argument("config", type=FILE)
 OFFER = click.argument("offer", type=FILE)
-AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
 BY = click.option("--by", required=True, help="Who answers: your name, which the works is told.")
 MOST_BY, MOST_REASON = 64, 200
 

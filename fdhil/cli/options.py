@@ -14,6 +14,10 @@ from fdhil.store.output import check_output
 # whether it can be read is seen where it is read: a file that cannot is trouble, not a wrong call
 FILE = click.Path(path_type=Path, readable=False)
 FOLDER = click.Path(path_type=Path, readable=False, file_okay=False)
+CONFIG = click.argument("config", type=FILE)
+FLEET = click.argument("fleet", type=FILE)
+AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
+LINES = click.option("--json", "as_json", is_flag=True, help="Write each line of the log as a JSON object to stdout.")
 COLUMNS = click.option(
     "--columns",
     type=FILE,

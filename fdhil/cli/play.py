@@ -18,7 +18,7 @@ from fdhil import config as machine_config
 from fdhil.cli.audited import audited
 from fdhil.cli.consent import agreed, listen_again
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import FILE
+from fdhil.cli.options import AS_JSON, FILE
 from fdhil.errors import DeviceError, DriveFault
 from fdhil.guard.protocol import SOCKET_NAME
 
@@ -45,7 +45,7 @@ SIGNALS: Mapping[int, str] = {
 @click.option("--hold", is_flag=True, help="Hold the axes at the start until Enter is pressed: arm a correction there.")
 @click.option("--dry-run", is_flag=True, help="Check the program and say what would move; opens no bus.")
 @click.option("--yes", is_flag=True, help="Do not ask before the axes move.")
-@click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
+@AS_JSON
 @verdict
 def play(
     program: Path, config_path: Path, go_to_start: bool, hold: bool, dry_run: bool, yes: bool, as_json: bool

@@ -15,7 +15,7 @@ import click
 from fdhil import tables
 from fdhil.cli.compiling import forewarn
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import FILE, OutputFile, Positive, Writing
+from fdhil.cli.options import AS_JSON, FILE, OutputFile, Positive, Writing
 from fdhil.records import INTERVAL_95
 from fdhil.report.parameter_view import MEANING
 
@@ -64,7 +64,7 @@ def _shared(wanted: Callable[..., int | None]) -> Callable[..., int | None]:
                 "--report", type=OutputFile(), help="Write an HTML page: a map of the error, its worst places."
             ),
             click.option("--pdf", type=OutputFile(".pdf"), help="Print that page as PDF (needs chromium)."),
-            click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else."),
+            AS_JSON,
         )
     ):
         option(command)

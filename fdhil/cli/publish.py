@@ -9,7 +9,7 @@ import click
 
 from fdhil import config as machine_config
 from fdhil import tables
-from fdhil.cli.options import FILE
+from fdhil.cli.options import CONFIG, FILE, LINES
 from fdhil.config import MachineConfig
 from fdhil.errors import FdhilError
 
@@ -18,13 +18,13 @@ EXTRAS: Mapping[str, str] = {"prometheus": "web", "mtconnect": ""}  # the others
 
 @click.command()
 @click.argument("protocol", type=click.Choice(list(tables.PUBLISHERS)))
-@click.argument("config", type=FILE)
+@CONFIG
 @click.option(
     "--devices",
     type=FILE,
     help="With mtconnect: write the Devices.xml that its agent needs to this file, and stop.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Write each line of the log as a JSON object to stdout.")
+@LINES
 def publish(protocol: str, config: Path, devices: Path | None, as_json: bool) -> None:
     """Publish over PROTOCOL what the daemon of CONFIG knows: parameters with intervals, verdicts, alarms, offsets.
 

@@ -10,7 +10,7 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import FILE, OutputFile, Positive, Writing
+from fdhil.cli.options import AS_JSON, CONFIG, OutputFile, Positive, Writing
 
 if TYPE_CHECKING:
     from fdhil.drivers import Record
@@ -21,7 +21,7 @@ NOTHING_MOVED = "nothing moved; start the program on the NC while the recording 
 
 
 @click.command(cls=Writing)
-@click.argument("config", type=FILE)
+@CONFIG
 @click.option("--out", required=True, type=OutputFile(), help="The demand CSV to write; as *.csv it is read as one.")
 @click.option("--seconds", type=Positive(), help="Record no longer than this.")
 @click.option(
@@ -32,7 +32,7 @@ NOTHING_MOVED = "nothing moved; start the program on the NC while the recording 
     help="Seconds of rest after a motion that end the recording; more than the program's longest dwell.",
 )
 @click.option("--with-gaps", is_flag=True, help="Write a demand with lost rows too, each marked nan.")
-@click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
+@AS_JSON
 @verdict
 def record(config: Path, out: Path, seconds: float | None, rest: float, with_gaps: bool, as_json: bool) -> None:
     """Record the demand that the NC sends to CONFIG's machine during an air cut, as a demand CSV.

@@ -13,14 +13,13 @@ from fdhil import config as machine_config
 from fdhil import tables
 from fdhil.cli.compiling import forewarn
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import COLUMNS, FILE, OutputFile, Writing
+from fdhil.cli.options import AS_JSON, COLUMNS, CONFIG, FILE, OutputFile, Writing
 from fdhil.errors import RecordingError
 from fdhil.store import suffixes
 
 if TYPE_CHECKING:
     from fdhil.records import Outcome, Window
 
-AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
 HEALTH = ("slopes", "trends", "limits", "changes", "windows")
 
 
@@ -109,7 +108,7 @@ def _config_of(window: Window) -> machine_config.MachineConfig:
 
 
 @click.command(cls=Writing)
-@click.argument("config", type=FILE)
+@CONFIG
 @click.option("--axis", help="One axis only.")
 @click.option(
     "--plot",
@@ -177,7 +176,7 @@ def export(recording: Path, out: Path, format_name: str | None, columns: Path | 
 
 
 @click.command(cls=Writing)
-@click.argument("config", type=FILE)
+@CONFIG
 @click.option("--out", required=True, type=OutputFile(), help="The HTML file to write.")
 @click.option("--pdf", type=OutputFile(".pdf"), help="Also print it as PDF (needs chromium).")
 @AS_JSON

@@ -16,23 +16,21 @@ from fdhil import tables
 from fdhil.cli.audited import write_after, write_before
 from fdhil.cli.consent import agreed
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import FILE
+from fdhil.cli.options import AS_JSON, CONFIG, FILE, LINES
 from fdhil.cli.terminal_text import without_controls
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, DriveFault
 
 if TYPE_CHECKING:
     from fdhil.arming.guard_client import GuardClient
 
-CONFIG = click.argument("config", type=FILE)
 DISARM_S = 15.0  # the daemon waits for the guard's answer and for the ramp
 UNASKED = "hold the feed and run it again, with --yes where nobody can be asked"
-AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
 
 
 @click.command()
 @CONFIG
 @click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Left out: the config's, else the best.")
-@click.option("--json", "as_json", is_flag=True, help="Write each line as a JSON object to stdout.")
+@LINES
 @verdict
 def run(config: Path, method: str | None, as_json: bool) -> int:
     """Run the daemon of the machine in CONFIG: listen, identify, predict; correct only when armed.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fdhil.cli.options import FILE, OutputFile, Writing
+from fdhil.cli.options import CONFIG, FILE, OutputFile, Writing
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,7 +23,7 @@ LOOK_S = 0.1
 
 
 @click.command(cls=Writing)
-@click.argument("config", type=FILE)
+@CONFIG
 @click.option("--json", "as_json", is_flag=True, help="Write events as JSON, one line each; the first is 'ready'.")
 @click.option("--faults", type=FILE, help="A fault script: what breaks when (TOML).")
 @click.option(

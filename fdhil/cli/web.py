@@ -10,12 +10,10 @@ from pathlib import Path
 import click
 
 from fdhil import config as machine_config
-from fdhil.cli.options import FILE
+from fdhil.cli.options import AS_JSON, CONFIG
 from fdhil.config.users import Role
 from fdhil.config.web import Web
 from fdhil.errors import ConfigError, ConfigFault
-
-CONFIG = click.argument("config", type=FILE)
 
 
 @click.command()
@@ -55,7 +53,7 @@ def placed(web: Web, host: str | None, port: int | None) -> Web:
 @click.argument("name")
 @click.option("--role", type=click.Choice(["watch", "operate"]), default="watch", show_default=True)
 @click.option("--remove", is_flag=True, help="Take the user out.")
-@click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
+@AS_JSON
 def web_user(config: Path, name: str, role: Role, remove: bool, as_json: bool) -> None:
     """Give the user NAME a password and a role in the users file of CONFIG, or take the user out.
 

@@ -14,7 +14,6 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from fdhil.config.uplink import Uplink
@@ -166,9 +165,7 @@ class OutboxReader:
     def __enter__(self) -> OutboxReader:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._db.close()
 
     def _ask(self, query: str, values: tuple[object, ...]) -> list[tuple[Any, ...]]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil.child import stopping_in_order
-from fdhil.cli.options import FOLDER
+from fdhil.cli.options import AS_JSON, FOLDER
 
 if TYPE_CHECKING:
     from fdhil.cli.demo.realistic import Realistic
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     "--realtime", is_flag=True, help="Run the twin on the host's clock instead of as fast as the bus answers."
 )
 @click.option("--pdf", is_flag=True, help="Print the report as report.pdf too (needs chromium).")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of tables.")
+@AS_JSON
 def demo(out: Path, realtime: bool, pdf: bool, as_json: bool) -> None:
     """Run the whole loop on the simulated machine: no hardware, no root, under a minute.
 

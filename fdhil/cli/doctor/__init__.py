@@ -14,7 +14,7 @@ import click
 from fdhil import config as machine_config
 from fdhil.cli.doctor.trouble import Trouble
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import FILE
+from fdhil.cli.options import AS_JSON, CONFIG
 from fdhil.daemon.clock import newest_record_s
 
 if TYPE_CHECKING:
@@ -26,9 +26,9 @@ SCHEMA = "fdhil-doctor-1"
 
 
 @click.command()
-@click.argument("config", type=FILE)
+@CONFIG
 @click.option("--offline", is_flag=True, help="Look at this PC alone, and leave buses and sensors in peace.")
-@click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
+@AS_JSON
 @verdict
 def doctor(config: Path, offline: bool, as_json: bool) -> int:
     """Tell what is wrong with this PC, bus, drives, sensors, store, clock and rights: what to mend first comes first.

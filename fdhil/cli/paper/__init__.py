@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from fdhil.child import stopping_in_order
-from fdhil.cli.options import FOLDER
+from fdhil.cli.options import AS_JSON, FOLDER
 from fdhil.errors import OutputError
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ RUNS = 50
 @click.option("--runs", type=click.IntRange(2, 10_000), default=RUNS, show_default=True,
               help="Noisy recordings behind each error of an estimator.")  # fmt: skip
 @click.option("--pdf", is_flag=True, help="Print the page as paper.pdf, too (needs chromium).")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of a table.")
+@AS_JSON
 def paper(out: Path, runs: int, pdf: bool, as_json: bool) -> None:
     """Reproduce the paper that fdhil goes back to, claim by claim.
 

@@ -8,7 +8,6 @@ and longer, and enters it anew.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from types import TracebackType
 from typing import Protocol, Self
 
 from fdhil import tables
@@ -28,9 +27,7 @@ class NcSource(Protocol):
     async def __aenter__(self) -> Self:
         """Connect; ConnectError when nobody answers there, ProtocolError when it is not what the config says."""
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         """Disconnect; raises nothing."""
 
     async def read(self) -> Sequence[NcState]:

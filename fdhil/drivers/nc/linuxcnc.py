@@ -12,7 +12,6 @@ import math
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
-from types import TracebackType
 from typing import Any, Self
 
 from fdhil.config import MachineConfig
@@ -67,9 +66,7 @@ class LinuxCnc:
             raise
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         self._disconnect()
 
     def _disconnect(self) -> None:

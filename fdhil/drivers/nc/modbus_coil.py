@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Mapping, Sequence
-from types import TracebackType
 from typing import Self
 
 from fdhil.config import MachineConfig
@@ -37,9 +36,7 @@ class ModbusCoil:
         self._next_s = time.monotonic()
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         self._link.close()
 
     async def read(self) -> Sequence[NcState]:

@@ -10,7 +10,6 @@ import asyncio
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AsyncExitStack
-from types import TracebackType
 from typing import Self
 from urllib.parse import quote
 
@@ -61,9 +60,7 @@ class MtConnect:
             raise
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self._open.aclose()
 
     async def _current(self) -> tuple[Streams, int, int]:

@@ -12,7 +12,6 @@ import logging
 import struct
 import time
 from collections.abc import AsyncIterator, Mapping, Sequence
-from types import TracebackType
 from typing import Any, Self
 
 from asyncua import Client, ua
@@ -72,9 +71,7 @@ class OpcUa:
         self._next_s = time.monotonic()
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self._disconnect()
 
     async def _disconnect(self) -> None:
