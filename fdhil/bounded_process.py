@@ -18,6 +18,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from fdhil.json_lines import decode_line, encode_line
+
 MAX_LINE = 1 << 26
 Take = Callable[[dict[str, Any]], None]
 
@@ -40,11 +42,7 @@ class BoundedProcess:
         try:
             await self.start(request)
             while line := await self.read_line():
-                try:
-                    document = json.loads(line)
-                except ValueError:  # half a line is what a process that was ended leaves
-                    continue
-                if isinstance(document, dict):
+                if document := decode_line(line):  # a process that was ended leaves half a line
                     take(document)
         finally:
             code = await self.end()
@@ -63,7 +61,7 @@ class BoundedProcess:
         assert self._process is not None
         assert self._process.stdin is not None
         with contextlib.suppress(ConnectionError):
-            self._process.stdin.write(json.dumps(request).encode() + b"\n")
+            self._process.stdin.write(encode_line(request))
             await self._process.stdin.drain()
 
     async def read_line(self) -> bytes:
@@ -112,5 +110,5 @@ def _end_with_parent() -> None:
 
 def report(document: Mapping[str, Any]) -> None:
     """Report an object to the parent."""
-    sys.stdout.write(json.dumps(document) + "\n")
+    sys.stdout.buffer.write(encode_line(document))
     sys.stdout.flush()

@@ -6,7 +6,6 @@ own: a daemon that hangs must look dead. The connection that armed is the one wh
 
 from __future__ import annotations
 
-import json
 import os
 import socket
 import threading
@@ -18,6 +17,7 @@ from typing import Any, Self
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
 from fdhil.guard import table
 from fdhil.guard.protocol import SOCKET_NAME
+from fdhil.json_lines import decode_line, encode_line
 
 ANSWER_S = 13.0  # the guard answers a request at a SYNC, or when it has missed it for up to 10 s
 
@@ -143,7 +143,7 @@ class GuardClient:
                     return answer
 
     def _send(self, message: Mapping[str, Any], descriptor: int | None = None) -> None:
-        line = json.dumps(message).encode() + b"\n"
+        line = encode_line(message)
         try:
             with self._sending:
                 if descriptor is not None:  # it goes with the first byte
@@ -168,8 +168,7 @@ class GuardClient:
                 raise self._lost("connection closed")
             self._inbox += chunk
         line, self._inbox = self._inbox.split(b"\n", 1)
-        answer = json.loads(line)
-        return answer if isinstance(answer, dict) else {}
+        return decode_line(line) or {}
 
     @staticmethod
     def _lost(why: str) -> GuardLost:

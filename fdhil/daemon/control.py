@@ -28,6 +28,7 @@ from fdhil.config import Access
 from fdhil.daemon.peers import Peer, listen, peer_of
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, FdhilError
 from fdhil.guard.peers import Role
+from fdhil.json_lines import decode_line, encode_line
 
 SOCKET_NAME = "daemon.sock"
 MAX_LINE = 64 * 1024
@@ -164,7 +165,7 @@ class ControlServer:
             answer = await self._attended(line, peer, writer)
             self._busy.discard(task)
             self._clients[task] = self._clients.pop(task, None)
-            writer.write(json.dumps(answer).encode() + b"\n")
+            writer.write(encode_line(answer))
             await _in_time(writer.drain())
             if self._live is not None and "live" in answer:
                 self._busy.add(task)  # it is never idle: nobody takes its place
@@ -199,7 +200,7 @@ class ControlServer:
         if _hung_up(writer):
             self._abandon()
         elif wanted and (told := self._progress()):
-            writer.write(json.dumps({"progress": told}).encode() + b"\n")
+            writer.write(encode_line({"progress": told}))
 
     async def _answer(self, request: Any, peer: Peer) -> Answer:
         if not isinstance(request, dict) or not isinstance(request.get("request"), str):
@@ -255,7 +256,7 @@ def ask(
             client.settimeout(timeout_s)
             client.connect(str(path))
             wanted = {"progress": True} if progress else {}
-            client.sendall(json.dumps({**request, **wanted}).encode() + b"\n")
+            client.sendall(encode_line({**request, **wanted}))
             with client.makefile("rb") as lines:
                 line = lines.readline()
                 while progress and line.startswith(b'{"progress"'):
@@ -269,10 +270,7 @@ def ask(
         raise ConnectError.of_socket("daemon", error, absent) from None
     if not line:
         raise ConnectError("daemon", "closed the connection without an answer; see its log")
-    try:
-        answer = json.loads(line)
-    except ValueError:
-        answer = None
-    if not isinstance(answer, dict):
+    answer = decode_line(line)
+    if answer is None:
         raise ConnectError("daemon", f"gave no answer of a daemon; see what listens at {path}")
     return answer

@@ -13,15 +13,14 @@ from __future__ import annotations
 
 import asyncio
 import base64
-import json
 from collections import deque
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from fdhil.arming.answers import Answer, refusal
 from fdhil.config import MachineConfig
+from fdhil.json_lines import encode_line
 from fdhil.records import AxisSamples, Temperature, TickTimes, VoltageSamples
 
 SIGNALS = ("voltage_v", "current_a", "speed_rad_s", "following_error_um", "offset_um")
@@ -52,11 +51,11 @@ class _Viewer:
         """Return all that waits, and behind it how much was skipped; a word of life when there is nothing."""
         lines = list(self._lines)
         if self._skipped:
-            lines.append(_line({"live": "skipped", "lines": self._skipped}))
+            lines.append(encode_line({"live": "skipped", "lines": self._skipped}))
         self._lines.clear()
         self._skipped = 0
         self.waiting.clear()
-        return b"".join(lines) or _line({"live": "alive"})
+        return b"".join(lines) or encode_line({"live": "alive"})
 
 
 class LiveStream:
@@ -77,7 +76,7 @@ class LiveStream:
     def take(self, record: object) -> None:
         """Hand a record on to all who look; what cannot be drawn against time is not told."""
         if isinstance(record, Temperature):
-            self._temperatures[record.axis] = _line(
+            self._temperatures[record.axis] = encode_line(
                 {"live": "temperature", "axis": record.axis, "place": record.place, "celsius": record.celsius}
             )
         line = self._line_of(record) if self._viewers else None
@@ -90,12 +89,12 @@ class LiveStream:
         if isinstance(record, Temperature):
             return self._temperatures[record.axis]
         if isinstance(record, AxisSamples) and record.tick.size:
-            return _line(_samples(record))
+            return encode_line(_samples(record))
         if isinstance(record, VoltageSamples) and record.t_ns.size:
-            return _line(_voltage(record))
+            return encode_line(_voltage(record))
         if isinstance(record, TickTimes) and record.tick.size and self._by_the_clock:
             ends = {"tick": record.tick[[0, -1]].tolist(), "t_ns": record.t_ns[[0, -1]].tolist()}
-            return _line({"live": "times", **ends})
+            return encode_line({"live": "times", **ends})
         return None
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -156,7 +155,3 @@ def packed(values: np.ndarray[Any, Any], kind: str) -> str:
 def unpacked(text: str, kind: str) -> np.ndarray[Any, Any]:
     """Return the numbers (n,) of base64 of their bytes in the type ``kind``; ValueError for what is none."""
     return np.frombuffer(base64.b64decode(text, validate=True), kind)
-
-
-def _line(told: Mapping[str, Any]) -> bytes:
-    return json.dumps(told).encode() + b"\n"

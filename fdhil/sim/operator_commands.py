@@ -52,7 +52,7 @@ class OperatorCommands:
             raise CommandError("a command of the panel is longer than 64 KiB; give one JSON object per line")
         try:
             command = json.loads(line)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise CommandError(f"a command of the panel is no JSON ({error}); give one JSON object per line") from None
         name = command.pop("command", None) if isinstance(command, dict) else None
         if not isinstance(name, str) or name not in self._commands:

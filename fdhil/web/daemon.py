@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from fdhil.errors import ConnectError, DeviceTimeout
+from fdhil.json_lines import decode_line, encode_line
 
 ANSWER_S = 10.0
 FRESH_S = 0.5
@@ -36,7 +36,7 @@ class Daemon:
             async with asyncio.timeout(timeout_s):
                 reader, writer = await asyncio.open_unix_connection(self._path, limit=LONGEST_ANSWER)
                 try:
-                    writer.write(json.dumps(asked).encode() + b"\n")
+                    writer.write(encode_line(asked))
                     return await _answer(reader, progress)
                 finally:
                     writer.close()
@@ -66,13 +66,10 @@ def _stale(asked_s: float, answer: asyncio.Task[dict[str, Any]], now_s: float) -
 
 async def _answer(reader: asyncio.StreamReader, progress: Progress | None) -> dict[str, Any]:
     try:
-        line = await reader.readline()
-        while progress and line.startswith(b'{"progress"'):
-            progress(json.loads(line)["progress"])
-            line = await reader.readline()
-        answer = json.loads(line) if line else None
-    except (ValueError, RecursionError, LookupError, TypeError):
+        while (answer := decode_line(await reader.readline())) and progress and list(answer) == ["progress"]:
+            progress(answer["progress"])
+    except ValueError:  # a line without an end
         answer = None
-    if not isinstance(answer, dict):
+    if answer is None:
         raise ConnectError("daemon", "closed the connection without an answer; see its log")
     return answer

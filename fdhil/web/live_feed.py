@@ -8,7 +8,6 @@ are laid on one count of this process by when its first block came, and stay on 
 from __future__ import annotations
 
 import asyncio
-import json
 import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
@@ -20,6 +19,7 @@ import numpy as np
 from fdhil.cancellation import run_attempt
 from fdhil.daemon.live import SIGNALS, unpacked
 from fdhil.errors import ConnectError, DeviceError
+from fdhil.json_lines import decode_line
 from fdhil.web.live_ring import Ring
 
 KEPT_S = 300.0
@@ -140,8 +140,8 @@ async def _line_of(reader: asyncio.StreamReader) -> dict[str, Any]:
         line = await reader.readline()
     if not line:
         raise ConnectError("daemon", "closed the connection; see its log")
-    told = json.loads(line)
-    if not isinstance(told, dict):
+    told = decode_line(line)
+    if told is None:
         raise ConnectError("daemon", "told no line of a daemon; see what listens at its socket")
     return told
 

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import struct
 
+from pymodbus.framer import FramerRTU
+
 READ_COILS, READ_DISCRETE, READ_HOLDING, READ_INPUT, WRITE_REGISTER = 1, 2, 3, 4, 6
 ERROR = 0x80
 BIT_READS = (READ_COILS, READ_DISCRETE)
@@ -14,31 +16,19 @@ _READS = (*BIT_READS, READ_HOLDING, READ_INPUT)
 _ECHO_BYTES, _EXCEPTION_BYTES, _LEAST_BYTES = 8, 5, 5
 
 
-def _shifted(crc: int) -> int:
-    for _ in range(8):
-        crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
-    return crc
-
-
-_SHIFTED = tuple(map(_shifted, range(256)))
-
-
 def crc16(data: bytes) -> int:
-    """Return the checksum; over a frame with its own behind it is 0.
+    """Return the checksum, its low byte in the upper half; over a frame with its own behind it is 0.
 
     >>> hex(crc16(bytes.fromhex("01 04 00 00 00 02")))
-    '0xcb71'
+    '0x71cb'
     """
-    crc = 0xFFFF
-    for byte in data:
-        crc = crc >> 8 ^ _SHIFTED[(crc ^ byte) & 0xFF]
-    return crc
+    return FramerRTU.compute_CRC(data)
 
 
 def framed(unit: int, body: bytes) -> bytes:
     """Return a frame: unit, function and data, checksum with its low byte first."""
     frame = bytes([unit]) + body
-    return frame + struct.pack("<H", crc16(frame))
+    return frame + struct.pack(">H", crc16(frame))
 
 
 def data_bytes(function: int, count: int) -> int:

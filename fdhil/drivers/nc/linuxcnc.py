@@ -7,7 +7,6 @@ before, and a few in between. ``cycle`` is the count of the servo thread and ``m
 from __future__ import annotations
 
 import asyncio
-import json
 import math
 import time
 from collections import deque
@@ -17,6 +16,7 @@ from typing import Any, Self
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.host_clock import DistantClock
 from fdhil.errors import ConnectError, DeviceError, ProtocolError
+from fdhil.json_lines import decode_line
 from fdhil.records import MoveKind, NcState
 
 SCHEMA = "fdhil-linuxcnc-1"
@@ -86,11 +86,8 @@ class LinuxCnc:
         while not self._waiting:
             await self._receive()
         line = self._waiting.popleft()
-        try:
-            told = json.loads(line)
-        except (ValueError, RecursionError):
-            told = None
-        if not isinstance(told, dict):
+        told = decode_line(line)
+        if told is None:
             raise ProtocolError(self.name, f"said {line[:60]!r}, which is no state; is this port the bridge's?")
         return told
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -198,8 +198,3 @@ FIELDS: Mapping[str, Callable[[Shown], Any]] = {
     "program": _text,
 }
 """The signals that are fields of NcState, and how each is read; every other one serves the rules alone."""
-
-
-def fields_of(names: Iterable[str]) -> frozenset[str]:
-    """Return which of the signals are fields of NcState."""
-    return frozenset(names) & FIELDS.keys()
