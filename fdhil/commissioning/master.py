@@ -61,7 +61,7 @@ class AxisSdo(SdoLink):
 
 
 class Master:
-    """A context manager around one drive; nothing is sent before ``produce_sync`` or an SDO call.
+    """A context manager around one drive; nothing is sent before ``loop.produce_sync`` or an SDO call.
 
     Without a ``cycle`` that is shared with other drives it runs the drive's bus itself. The offset is sent, too, but
     where a guard does that.
@@ -237,19 +237,6 @@ class Master:
     @heartbeat.setter
     def heartbeat(self, on: bool) -> None:
         self.loop.heartbeat = self.config.guard.node_id if on else None
-
-    def produce_sync(self, overflow: int) -> None:
-        """Send SYNC from now on, with a counter up to ``overflow`` (0: without)."""
-        self.loop.produce_sync(overflow)
-
-    @property
-    def producing(self) -> bool:
-        """Whether SYNC is being sent."""
-        return self.loop.producing
-
-    def stop_sync(self) -> None:
-        """Send SYNC and set-points no more."""
-        self.loop.stop_sync()
 
     def nmt(self, command: cia402.NmtCommand) -> None:
         """Send an NMT command to the drive."""

@@ -61,7 +61,7 @@ def prepare(master: Master) -> None:
     overflow = read_optional(master, Object.SYNC_COUNTER_OVERFLOW) or 0
     master.sdo.write_int(Object.MODE, 0, Mode.CYCLIC_SYNC_POSITION, 1)
     master.nmt(NmtCommand.START)  # first: who is not started answers no SYNC
-    master.produce_sync(overflow)
+    master.loop.produce_sync(overflow)
     master.wait(
         lambda: master.profile.position in master.heard.objects and master.profile.statusword in master.heard.objects,
         2.0,
@@ -102,7 +102,7 @@ def enable(master: Master) -> None:
 
 def disable(master: Master) -> None:
     """Take the power stage off, step by step, and leave the node pre-operational without SYNC."""
-    if not master.producing:
+    if not master.loop.producing:
         return
     for word in OFF_WORDS:
         master.controlword = word
@@ -114,7 +114,7 @@ def disable(master: Master) -> None:
         master.wait_cycles(20)
     master.target = None
     master.nmt(NmtCommand.ENTER_PRE_OPERATIONAL)
-    master.stop_sync()
+    master.loop.stop_sync()
 
 
 def zero_offset(master: Master) -> None:

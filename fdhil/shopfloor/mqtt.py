@@ -21,9 +21,9 @@ from aiomqtt.exceptions import MqttConnectError
 
 from fdhil.cancellation import GivenUp, end_tasks, run_attempt
 from fdhil.config import MachineConfig
+from fdhil.config.credentials import password_of, tls_of
 from fdhil.config.publish import MqttBroker
 from fdhil.daemon import journal
-from fdhil.shopfloor.broker_security import password_of, tls_of
 from fdhil.shopfloor.news import News, listen
 from fdhil.shopfloor.process import say_ready
 from fdhil.shopfloor.published import Event, Value
@@ -48,6 +48,7 @@ REBIRTH_S = 1.0  # births are sent no more often
 WAITING = 32  # messages of the broker that wait to be looked at
 MOST_EVENTS = 256  # notices that wait to be told
 NOTICE = "the newest notice"
+BROKER = ("MQTT broker", "publish.mqtt")  # as errors name it
 DATATYPES: Mapping[str, int] = {"measure": DOUBLE, "count": INT64, "flag": BOOLEAN, "state": STRING, "text": STRING}
 
 
@@ -62,8 +63,8 @@ async def publish(config: MachineConfig) -> None:
     """
     settings = config.publish.mqtt
     session = Session(settings, settings.node_name(config.machine.name))
-    tls_of(settings)  # what is wrong with the files ends the command
-    password_of(settings)
+    tls_of(settings, *BROKER)  # what is wrong with the files ends the command
+    password_of(settings, *BROKER)
     where = f"{settings.host}:{settings.port}"
     say_ready(f"Sparkplug B of {config.machine.name}: {session.node.topic('NBIRTH')}, for the broker at {where}")
     tasks = [asyncio.create_task(_hear(config, session)), asyncio.create_task(_stay_connected(session, settings))]
@@ -127,8 +128,8 @@ def _client(settings: MqttBroker, session: Session) -> aiomqtt.Client:
         settings.port,
         identifier=f"fdhil-{identity}",  # the broker ends what is left of our own connection before
         username=settings.user,
-        password=password_of(settings),
-        tls_context=tls_of(settings),
+        password=password_of(settings, *BROKER),
+        tls_context=tls_of(settings, *BROKER),
         will=aiomqtt.Will(will.topic, will.payload, will.qos, retain=False),
         clean_session=True,
         keepalive=round(settings.keepalive_s),

@@ -14,10 +14,10 @@ from typing import Any, cast
 import aiomqtt
 import pytest
 
+from fdhil.config.credentials import password_of, tls_of
 from fdhil.config.publish import MqttBroker
 from fdhil.errors import ConnectError
 from fdhil.shopfloor import mqtt
-from fdhil.shopfloor.broker_security import password_of, tls_of
 from fdhil.shopfloor.mqtt import HostGone, Session
 from tests.daemon.machine import config_of
 from tests.shopfloor.asked_daemon import NOW, Daemon, identified, load_changed
@@ -260,14 +260,14 @@ def _counted(tried: asyncio.Queue[None], client: Callable[..., Any]) -> Callable
 def test_credentials_that_cannot_be_used_are_named(tmp_path: Path) -> None:
     missing = tmp_path / "missing"
     with pytest.raises(ConnectError, match=r"password_file .*missing cannot be used: No such file"):
-        password_of(MqttBroker(user="fdhil", password_file=missing))
+        password_of(MqttBroker(user="fdhil", password_file=missing), *mqtt.BROKER)
     with pytest.raises(ConnectError, match=r"tls_ca_file .*missing cannot be used: No such file"):
-        tls_of(MqttBroker(tls_ca_file=missing))
+        tls_of(MqttBroker(tls_ca_file=missing), *mqtt.BROKER)
     certify(tmp_path)
     ca, empty = tmp_path / "ca.pem", tmp_path / "empty"
     empty.touch()
     with pytest.raises(ConnectError, match=r"tls_certificate_file .*empty cannot be used"):
-        tls_of(MqttBroker(tls_ca_file=ca, tls_certificate_file=empty, tls_key_file=empty))
+        tls_of(MqttBroker(tls_ca_file=ca, tls_certificate_file=empty, tls_key_file=empty), *mqtt.BROKER)
 
 
 @pytest.mark.parametrize(
