@@ -3,8 +3,6 @@
 The pipe to its stdin stays open for as long as the parent wants an answer: a child whose parent is gone ends itself.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

@@ -5,8 +5,6 @@ A cancellation can get lost: a context manager raises an error of its own while 
 counted up. So a loop that catches failures and tries again never awaits what may fail in its own task.
 """
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import Coroutine, Iterable

@@ -4,8 +4,6 @@ No I/O, no clock, no numpy: bytes and integers in, values out. Sources: CiA 301 
 CiA 402-2 (state machine, objects), CiA 402-3 (mode bits). Used by the drivers and by the guard.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

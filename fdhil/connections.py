@@ -4,8 +4,6 @@ One that does nothing is ended; and where there are too many, the longest idle o
 many may be there is the server's ``limit_concurrency``: beyond it, it would refuse whoever comes.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections import Counter
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The text of a CSV file, read whole within a limit: what a file declares or repeats can never take more memory."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

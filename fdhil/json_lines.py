@@ -1,7 +1,5 @@
 """JSON lines: one object a line, as the daemon, its clients and child processes exchange them."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from typing import Any

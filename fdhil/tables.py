@@ -3,8 +3,6 @@
 Nothing registers itself. Config checks names against these tables without importing the rooms behind them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from importlib import import_module
 from typing import Any

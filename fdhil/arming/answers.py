@@ -1,7 +1,5 @@
 """Answers who asks for something: yes with what is known, or no with its class, cause and next action."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Starts the check of a long program, follows it ahead of the motion, abandons and remembers it."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import hashlib

@@ -1,7 +1,5 @@
 """Digests the code that makes checked rows: what other code made under the same version is not reused."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

@@ -1,7 +1,5 @@
 """Arms and disarms for the operator, by what is known of the models, and vouches for what is armed."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import hmac

@@ -7,8 +7,6 @@ over into the checked ones, and take their place only where the model says that 
 there, what the way to the start will leave is expected.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -4,8 +4,6 @@ Call ``alive`` at least every 0.2 s from the loop turn that checks the daemon's 
 own: a daemon that hangs must look dead. The connection that armed is the one whose end ramps the offset down.
 """
 
-from __future__ import annotations
-
 import os
 import socket
 import threading

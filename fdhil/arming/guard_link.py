@@ -1,7 +1,5 @@
 """Links the daemon to the guard process: finds it, tells it that the daemon lives, asks it to arm."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time

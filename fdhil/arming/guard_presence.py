@@ -1,7 +1,5 @@
 """Tells whether a guard is there: a socket that a killed guard left behind is none, one that is made again is."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import socket

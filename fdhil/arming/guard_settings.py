@@ -1,7 +1,5 @@
 """Makes the settings of the guard's process from the machine's config, its drives' profiles and their records."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import pwd

@@ -1,7 +1,5 @@
 """Gathers what is known of each axis' model: what the history had, and what the pipelines say since."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ Off unless ``[correction] learning`` is set. Only whole programs are learned, an
 ordered every row as planned, at its own time: an override, a feed hold or a pass that was ended teaches nothing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -3,8 +3,6 @@
 Those of asyncio's pool may all wait for a disk, and a disarm must not wait behind them.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

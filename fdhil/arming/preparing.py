@@ -3,8 +3,6 @@
 Pure but for reading the program and the commissioning records; what says no is a value (:class:`Refused`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -6,8 +6,6 @@ block that passed is on disk, as the guard will get it, before it is told with i
 the file of all rows, and a header that vouches for it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

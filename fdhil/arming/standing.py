@@ -1,7 +1,5 @@
 """Knows what may still be applied in the drives by what the guard said last, and says it to the operator."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import time

@@ -1,7 +1,5 @@
 """Keeps in the store that an offset may stand in the drives: the next daemon knows it, also without a guard."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Mapping

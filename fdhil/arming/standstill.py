@@ -1,7 +1,5 @@
 """Hears at what current each axis stands still: that is what its regulators hold when a program starts."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Mapping
 from typing import NamedTuple

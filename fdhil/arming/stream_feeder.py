@@ -1,7 +1,5 @@
 """Feeds checked rows to the guard as their program runs, and tells what the check found of the rest."""
 
-from __future__ import annotations
-
 import contextlib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Keeps the operator's token: who can read it (mode 0600, in the run directory) may arm. It is never logged."""
 
-from __future__ import annotations
-
 import os
 import secrets
 import stat

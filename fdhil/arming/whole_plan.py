@@ -1,7 +1,5 @@
 """Plans a program at once, which is short or whose method needs all of it; what passes are checked rows in memory."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Mapping

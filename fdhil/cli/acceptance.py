@@ -1,7 +1,5 @@
 """``fdhil acceptance``: what is handed over with a machine: what was proven, what it is, and how well it runs."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Gathers what an acceptance report says, and which points are open, each by a rule."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import json

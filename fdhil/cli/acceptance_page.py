@@ -1,7 +1,5 @@
 """Lays the acceptance report out: the verdict, what was proven, parameters, circular test, path, signatures."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """``fdhil audit``: who asked the machine for what, and whether that list is as it was written."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Many recordings at once: analysed in this process when few, on every core when many."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -5,8 +5,6 @@ place: two addresses of one distant hub, a tunnel, two interfaces on one cable, 
 each other's heartbeat on the bus (``BusLocked``).
 """
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import ipaddress

@@ -1,7 +1,5 @@
 """Says beforehand that the numerics must be compiled, which happens once and takes seconds of silence."""
 
-from __future__ import annotations
-
 import functools
 import os
 import sys

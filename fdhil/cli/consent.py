@@ -4,8 +4,6 @@ While a question waits for its answer an NC may be switched on. So an answer is 
 listened to for a while after it; whoever sends then is refused by the bus (:mod:`fdhil.commissioning.bus_watch`).
 """
 
-from __future__ import annotations
-
 import sys
 import time
 

@@ -1,7 +1,5 @@
 """The terminal, as rich writes to it: no text from outside can steer it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 from rich.console import Console, ConsoleOptions, RenderableType

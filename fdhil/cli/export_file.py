@@ -1,7 +1,5 @@
 """Which way a file goes from one format to another: a recording, or a log of the bus."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Turns an error into one sentence, or one JSON document, and an exit code."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import io

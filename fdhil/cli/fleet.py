@@ -1,7 +1,5 @@
 """``fdhil uplink``: sends a machine's records to the works; ``fdhil fleet``: gathers them, and asks all machines."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module

@@ -1,7 +1,5 @@
 """Shows a person what a re-analysis changed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Shows the answers of ``fdhil fleet`` to a person, or as one JSON document."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any

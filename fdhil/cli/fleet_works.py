@@ -1,7 +1,5 @@
 """``fdhil fleet``: what a works does with its history: services, what is let go of, what is given away, the page."""
 
-from __future__ import annotations
-
 import sys
 from datetime import UTC, datetime
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``fdhil-guard CONFIG``: owns the machine's bus and becomes the guard's process."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """The stored history as one page: how the drives are, then why."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Shows on the terminal how the drives are, and which notices wait for somebody."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

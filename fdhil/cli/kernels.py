@@ -3,8 +3,6 @@
 ``make setup`` runs it. The kernels are kept where numba keeps them: beside the code, or in ``NUMBA_CACHE_DIR``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Entry point: the list of commands."""
 
-from __future__ import annotations
-
 import os
 import sys
 import warnings

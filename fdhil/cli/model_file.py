@@ -1,7 +1,5 @@
 """Writes what recordings tell as a model file, which ``--model`` of predict and correct reads."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """``fdhil interpret``: the motions of an NC program."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """``fdhil publish``: tells a network of the shop floor what the daemon knows."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

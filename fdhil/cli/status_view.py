@@ -1,7 +1,5 @@
 """Shows the daemon's status and the stored history as tables for a person."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping, Sequence
 from typing import Any

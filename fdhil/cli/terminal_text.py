@@ -1,7 +1,5 @@
 """Makes text from outside harmless for a terminal: names of machines, programs, files and devices."""
 
-from __future__ import annotations
-
 import unicodedata
 
 _LAYOUT = "\n\t"

@@ -1,7 +1,5 @@
 """``fdhil web`` and ``fdhil web-user``: the pages in a browser, and who may log in."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

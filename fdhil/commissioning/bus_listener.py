@@ -1,7 +1,5 @@
 """Listens to a bus beside whoever runs it, and gathers the traffic of an NC and of the nodes. Sends nothing."""
 
-from __future__ import annotations
-
 import statistics
 import threading
 import time

@@ -4,8 +4,6 @@ The answer is one finding per axis; it is ok only where the fingerprint is the r
 configuration either.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from fdhil.commissioning.bus_listener import BusListener, Traffic

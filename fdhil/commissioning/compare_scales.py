@@ -1,7 +1,5 @@
 """Compares what a drive counts in with the configuration: increments, currents, torques, speeds and the DC link."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from functools import partial
 

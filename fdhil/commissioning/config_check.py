@@ -3,8 +3,6 @@
 Where an NC runs the bus nothing is sent: what its own traffic shows is compared, the rest is told as not compared.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Callable, Iterator, Sequence
 

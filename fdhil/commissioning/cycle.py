@@ -4,8 +4,6 @@ One thread does it all by absolute deadlines, and everything that is sent in tim
 that hangs sends nothing more: the drives' own watchdogs see that.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator

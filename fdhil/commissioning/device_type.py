@@ -1,7 +1,5 @@
 """Reads a device type: which device profile a node follows (0x1000 in CiA 301, 0x67FF in CiA 402-2). Pure."""
 
-from __future__ import annotations
-
 DRIVES = 402
 _KINDS = {
     401: "an I/O module",

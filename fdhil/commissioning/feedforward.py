@@ -3,8 +3,6 @@
 Every refusal is a DriveFault that begins with ``FeedforwardOff``, the class under which arming would be refused.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

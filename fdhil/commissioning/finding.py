@@ -1,7 +1,5 @@
 """One point of a comparison between a drive and its configuration, and how an object that may lack is read."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from fdhil.commissioning.master import Master

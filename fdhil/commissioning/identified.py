@@ -1,7 +1,5 @@
 """Identifies an axis from test rapids as the daemon would, and compares the last of them with the model. Pure."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

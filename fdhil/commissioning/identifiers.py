@@ -5,8 +5,6 @@ CiA 301, the PDOs of every configured drive, the predefined identifiers of every
 heard, and what was heard.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 

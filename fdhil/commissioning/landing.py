@@ -1,7 +1,5 @@
 """Brings the drives to rest when another master is heard beside the cycle: the only thing that still leaves then."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol
 

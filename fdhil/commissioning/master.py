@@ -3,8 +3,6 @@
 What is sent in time leaves from the turn of the :class:`Cycle` that runs its bus.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

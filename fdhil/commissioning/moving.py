@@ -1,7 +1,5 @@
 """Moves axes that are held in Operation enabled; whatever ends a motion ends it by a braking ramp."""
 
-from __future__ import annotations
-
 import contextlib
 import signal
 import threading

@@ -4,8 +4,6 @@ The profile names the RPDOs that it needs, and no others. An NC that compensates
 one of its own: two masters that write one offset make the table step from the value of one to that of the other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

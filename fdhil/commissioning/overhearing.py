@@ -1,7 +1,5 @@
 """Hears one axis as the daemon would, while the commissioning moves it: the records of its drive and its sensors."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections.abc import Callable

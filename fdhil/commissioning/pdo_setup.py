@@ -4,8 +4,6 @@ The order is that of CiA 301, 7.5.2.36 and 7.5.2.38: the PDO is made invalid, it
 and only then it is valid again. What fails is given back as it was.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from fdhil.cia402 import NmtCommand, Object, State, state_of

@@ -5,8 +5,6 @@ checked before anything is sent, and whatever ends it, the axes are braked, the 
 is given back. A correction by the guard works beside it: the offsets (0x60B0) are the guard's alone.
 """
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence

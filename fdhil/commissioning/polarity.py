@@ -4,8 +4,6 @@ What is spent on a way that ends where it began is friction and heat alone, what
 axis: the integrals of i w, u i and u w over it are positive, and each needs two signs to be right (FAULTS B10).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

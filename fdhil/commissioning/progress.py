@@ -4,8 +4,6 @@ A step holds for the drive and the configuration that it was done with, which a 
 the record and is sealed with the same key: what is signed off may rest on it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 import json

@@ -1,7 +1,5 @@
 """Asks the kernel for what keeps a cycle in time: a real-time priority for the thread, memory that is not paged out."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import gc

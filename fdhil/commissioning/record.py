@@ -4,8 +4,6 @@ It is sealed with a key that only its owner can read (mode 0600): who cannot rea
 docs/decisions/0009-records-are-sealed.md for how far that goes.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import hmac

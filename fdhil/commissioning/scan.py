@@ -4,8 +4,6 @@ The default SDO channel of a drive has one client at a time, so beside an NC not
 written, no NMT command and no SYNC leaves from here.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

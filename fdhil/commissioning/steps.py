@@ -4,8 +4,6 @@
 is disabled and what was written is restored. See CiA 402-2 for the objects, CiA 301 7.2.8 for the heartbeat consumer.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import time

@@ -1,7 +1,5 @@
 """Moves an enabled axis by strokes, inside its room and the drive's software limits."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from fdhil.commissioning.master import Master

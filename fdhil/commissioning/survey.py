@@ -4,8 +4,6 @@
 ProtocolError); ``require`` turns the first point that differs into a DriveFault.
 """
 
-from __future__ import annotations
-
 import hashlib
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Tells how evenly SYNC comes, and how soon a drive answers it, from frames that were only listened to. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ No periodic sending of any library is used anywhere: a kernel that goes on sendi
 a dead program look alive.
 """
 
-from __future__ import annotations
-
 import errno
 import threading
 import time

@@ -4,8 +4,6 @@ The jog proves units and signs, the rapids identify the drive, and the last two 
 leave by ``set_points`` alone; whatever happens, also Ctrl-C, the axis is braked and the drive is switched off.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field

@@ -5,8 +5,6 @@ The mark is a file of its own, so that it outlives every process; comparing the 
 something more was seen meanwhile: that makes another mark.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from datetime import UTC, datetime

@@ -1,7 +1,5 @@
 """Proves that a drive stops by itself when fdhil dies: CiA 301 7.2.8, the heartbeat consumer."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterator
 

@@ -4,8 +4,6 @@ The instants are whole multiples of the period on the SYNC count, so that the va
 without SYNC they are so on this computer's clock.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

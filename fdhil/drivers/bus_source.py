@@ -1,7 +1,5 @@
 """Drains one bus, decodes it, and opens it again when it ended."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections import Counter

@@ -3,8 +3,6 @@
 Pure: records in, a demand out. What was lost stays a gap; nothing is interpolated.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What the connection to a sensor that is a device of its own must be able to do."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 from fdhil.errors import DeviceError

@@ -8,8 +8,6 @@ is queued here: what came waits in the bus' ring and in the sensor, both of whic
 fault of a source's own leaves ``run`` as the exception that it is.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager

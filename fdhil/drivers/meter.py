@@ -5,8 +5,6 @@ itself keeps its own rate. A value that was not to be had in time is a hole in t
 place.
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 import time

@@ -1,7 +1,5 @@
 """Polls a sensor that is a device of its own, and connects it again when it went away."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import Callable, Sequence

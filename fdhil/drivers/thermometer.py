@@ -1,7 +1,5 @@
 """Reads a slide-way's thermometer now and then, behind Modbus or on a serial line."""
 
-from __future__ import annotations
-
 import asyncio
 
 from fdhil.config import Thermometer

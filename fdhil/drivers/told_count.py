@@ -4,8 +4,6 @@ A value may come late, with those behind it close on its heels: none is missing 
 at once came in time, and if it is late all the same, others before it were lost.
 """
 
-from __future__ import annotations
-
 from collections import deque
 
 LATE = 0.6  # of a period

@@ -1,7 +1,5 @@
 """Tells what a re-analysis changed: of each kind, axis and parameter how far it moved, and whose verdict is another."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, LiteralString
 

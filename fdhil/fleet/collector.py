@@ -8,8 +8,6 @@ says so, nothing of it is written, and all goes by a table of its own that what 
 database writes, the next messages are fetched and read.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 from collections.abc import Callable, Iterator, Sequence

@@ -5,8 +5,6 @@ now and then (a direct get, for which its user needs the right to ask for its ow
 signed by a trusted key into its folder, and takes away what the works does not offer any more. It accepts nothing.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from dataclasses import asdict

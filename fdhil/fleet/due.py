@@ -1,7 +1,5 @@
 """Tells when an axis reaches a maintenance limit: by the rule with which its own machine tells it, over many months."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping, Sequence

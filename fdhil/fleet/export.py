@@ -6,8 +6,6 @@ digest of a configuration, no number of a record; of the labels there are those 
 measured figures: whoever has the same figures from elsewhere can find them here.
 """
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 import os

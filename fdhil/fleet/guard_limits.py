@@ -3,8 +3,6 @@
 Most keys act on them by a way of their own, as the torque constant does on the torque of the feed-forward.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path

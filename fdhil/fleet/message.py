@@ -10,8 +10,6 @@ file; the axis, or ``-``; the digest of the row; its place in the outbox; when i
 window is, or ``-``.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

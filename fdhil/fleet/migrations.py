@@ -5,8 +5,6 @@ again by machine, message and time. Times outside of the years that have partiti
 programs read the views.
 """
 
-from __future__ import annotations
-
 from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any, LiteralString

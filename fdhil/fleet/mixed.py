@@ -6,8 +6,6 @@ maximum likelihood (REML). Both are taken together; where neither tells, a weak 
 Axes that fit badly lose their say, those that are far off lose all of it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The recorded windows of many machines: one file each, named by the SHA-256 of its content, never changed."""
 
-from __future__ import annotations
-
 import os
 import secrets
 from pathlib import Path

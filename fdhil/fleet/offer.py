@@ -4,8 +4,6 @@ The first line is the offer as canonical JSON, the second says who signed it and
 bytes of the first. There is one way to write an offer, so that no byte of it can be changed without being seen.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -5,8 +5,6 @@ accepted is looked at again then; the new configuration takes the old one's plac
 it. A daemon that runs goes on with the configuration that it has read.
 """
 
-from __future__ import annotations
-
 import copy
 import fcntl
 import hashlib

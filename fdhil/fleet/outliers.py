@@ -6,8 +6,6 @@ own interval, and what is not known of its temperature, are added. The bounds ar
 an outlier one has an alarm, whatever their number (they were counted with random numbers).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Answers what is asked of all machines, from the views of the database; as JSON has it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

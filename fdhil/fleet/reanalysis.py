@@ -4,8 +4,6 @@ What was found before stays as it is. A revision belongs to one method (its sett
 given, the code): what is done of it is not done twice, so that whoever was killed begins where he was.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing

@@ -5,8 +5,6 @@ rest. Of what goes, the first parameter set of each axis and the newest of what 
 as ages and limits count from there; and the numbers of the records, so that none comes back or is called missing.
 """
 
-from __future__ import annotations
-
 import re
 import time
 from collections.abc import Callable, Sequence

@@ -4,8 +4,6 @@ A person opens each stage, and is shown what the machines before have told. Each
 for its machines by name.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager

@@ -1,7 +1,5 @@
 """Knows when an axis was serviced, and what that changed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

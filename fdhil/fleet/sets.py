@@ -1,7 +1,5 @@
 """Reads the parameter sets of axes from the database, since the newest service of each, with its age."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager

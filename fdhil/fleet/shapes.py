@@ -1,7 +1,5 @@
 """What a record must be like so that the views of the database can show it: no machine can make them fail for all."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

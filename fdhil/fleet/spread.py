@@ -1,7 +1,5 @@
 """Spreads work over an executor: this process, further processes, or a cluster; what is done comes as it is done."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from dataclasses import dataclass

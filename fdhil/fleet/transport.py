@@ -4,8 +4,6 @@ The stream is a queue for one reader, the collectors: what is in the database go
 refuses what is new, and the machines keep it.
 """
 
-from __future__ import annotations
-
 import asyncio
 import binascii
 import re

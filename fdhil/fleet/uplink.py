@@ -5,8 +5,6 @@ on as if there were none. One message is on its way at a time, so that none can 
 together, many records in one.
 """
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """What a worker does in a re-analysis: reads stored windows and analyses each again; the same bits wherever it runs."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

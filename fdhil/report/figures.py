@@ -4,8 +4,6 @@ Figure numbers in the docstrings are those of [DES] (Desforges, Habbadi, Dessein
 :mod:`fdhil.report.maps`; its functions are offered here too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

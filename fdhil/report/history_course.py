@@ -1,7 +1,5 @@
 """The course of one parameter as a chart: its estimates over time or temperature, its line, nominal value and limit."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime

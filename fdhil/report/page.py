@@ -1,7 +1,5 @@
 """One self-contained HTML page: it carries its pictures and its scripts, and loads nothing from elsewhere."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime

@@ -1,7 +1,5 @@
 """Shows parameters to people: one unit each, and one meaning of ±, in every table."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """A program's path error as a report: before and after the correction, as a map and with its worst places enlarged."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

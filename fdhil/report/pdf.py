@@ -1,7 +1,5 @@
 """Prints a page as PDF with the browser of this computer: a browser sets tables and text better than we would."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

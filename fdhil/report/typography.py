@@ -1,7 +1,5 @@
 """Sets units and signs as they are printed: ASCII in data and terminals, µm, ±, °C and N·m in pages."""
 
-from __future__ import annotations
-
 import re
 
 # longer ones first: each is replaced where it stands alone

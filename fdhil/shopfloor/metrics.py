@@ -4,8 +4,6 @@ https://prometheus.io/docs/practices/naming/. What is not known is absent; texts
 say what runs. All names begin with ``fdhil_``.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from importlib.metadata import version

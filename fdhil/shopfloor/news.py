@@ -3,8 +3,6 @@
 A daemon that does not answer is told of as well; it is asked on.
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 import time

@@ -1,7 +1,5 @@
 """Serves what the daemon knows over OPC UA, for reading."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager

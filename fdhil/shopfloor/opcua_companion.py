@@ -3,8 +3,6 @@
 What fdhil does not know has a bad quality there, and no default that would be taken for a fact: 0 is a mode, too.
 """
 
-from __future__ import annotations
-
 from collections.abc import AsyncIterator, Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Tells alarms as conditions and notices as events, under the machine's Notification.Messages (OPC 40501-1)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any

@@ -3,8 +3,6 @@
 Node IDs are made of what is published (``s=X.R_low``, ``s=state``, ``s=can0.bus_load``) and stay the same.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from asyncua import Node, Server, ua

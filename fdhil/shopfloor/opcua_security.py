@@ -4,8 +4,6 @@ Without a certificate the server is for this computer alone and asks for no name
 encrypted. No client can write, call more than ConditionRefresh, or add a node.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Makes OPC UA's data of what is published: a value with its kind, quality and time, a unit, the ID of a node. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from datetime import UTC
 from typing import Any

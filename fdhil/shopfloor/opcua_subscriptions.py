@@ -4,8 +4,6 @@ asyncua compares with the value before, which may not have been reported: what c
 is never told, and with a deadband no status is told whose value is none, so that an old number stays Good.
 """
 
-from __future__ import annotations
-
 from numbers import Real
 from typing import Any
 

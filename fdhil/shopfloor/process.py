@@ -1,7 +1,5 @@
 """Runs one process of a network: until SIGTERM or Ctrl-C, with a line and a word to systemd when it is ready."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import signal

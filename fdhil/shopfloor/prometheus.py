@@ -1,7 +1,5 @@
 """Serves the metrics to Prometheus over HTTP: GET /metrics and nothing else, for the hosts that the config allows."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import socket

@@ -4,8 +4,6 @@ A value that is not known is None, and so is every one while the daemon is silen
 way (a bad quality, UNAVAILABLE, nothing at all), and never by an old number.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal

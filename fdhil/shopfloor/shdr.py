@@ -4,8 +4,6 @@ Lines and levels: MTConnect part 5 and the adapter's guide of the reference agen
 Devices.xml: MTConnect 2.0, part 2; a type or unit that the standard does not know has the prefix ``x:``.
 """
 
-from __future__ import annotations
-
 import re
 import uuid
 from collections.abc import Iterable, Mapping

@@ -4,8 +4,6 @@ The field numbers of the payload, the data types and the order of the messages a
 specification 3.0, chapters 4 to 6. An edge node is a machine, its devices are the axes.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Joins one axis' drive with its slide-way and sensor, and offers what a fault can do to them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from fdhil.sim.drive.servo import Drive

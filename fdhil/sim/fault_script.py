@@ -10,8 +10,6 @@
 A wrong entry is a ConfigError that names every fault of the script at once.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

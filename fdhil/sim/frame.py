@@ -1,7 +1,5 @@
 """The types of a CAN frame inside the simulated machine."""
 
-from __future__ import annotations
-
 Frame = tuple[int, bytes]
 BusFrame = tuple[str, Frame]
 

@@ -4,8 +4,6 @@ Every fault draws from a source of its own for each way, so the same frames in t
 whatever happens on the other way meanwhile.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass

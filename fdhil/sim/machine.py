@@ -3,8 +3,6 @@
 SYNC is the machine's clock. In real time and without its own NC, each drive has a clock of its own besides.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

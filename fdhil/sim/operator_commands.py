@@ -1,7 +1,5 @@
 """Obeys the commands of the operator's panel: one JSON object per line, checked before it acts."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Records the true motion of a played file: one CSV row per SYNC with the true table, as no sensor could give it."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from pathlib import Path

@@ -6,8 +6,6 @@ machine does not run faster than its period. A sender that stops after a zero is
 in force is waited for as long as it may sleep on a busy host, unless it has left the bus.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import select

@@ -1,7 +1,5 @@
 """Spoils a reported signal as a fault script orders it."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Simulates what is mounted at a table: an encoder node on the bus and an accelerometer that streams lines of text."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

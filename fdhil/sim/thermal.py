@@ -1,7 +1,5 @@
 """Warms a slide-way: one time constant, warmed in proportion to speed ([DES] 3.2: ft and Cd fall as it rises)."""
 
-from __future__ import annotations
-
 from fdhil.config import Thermal
 
 

@@ -5,8 +5,6 @@ of the drive such a file is laid on its rows by what both have in common, the ac
 the clocks, which of its axes lies along the machine's, and its direction.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

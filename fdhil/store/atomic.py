@@ -1,7 +1,5 @@
 """Writing a file so that a reader sees all of it or nothing, also after a power cut."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

@@ -5,8 +5,6 @@ changed, left out or put elsewhere is seen. That the newest lines were cut off, 
 daemon's journal has each answer too, and may be sent on; ``chattr +a`` guards the file itself.
 """
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import hashlib

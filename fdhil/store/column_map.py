@@ -3,8 +3,6 @@
 Without a speed, it is the difference of positions; without a demand, none can be replayed and the map is refused.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Counters that pass the end of the range of their bits, unwrapped where nothing else explains the jump."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from fdhil.records import Float, Int

@@ -1,7 +1,5 @@
 """A stored window as a recording, which ``fdhil identify`` and other programs read, in every file format there is."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What a correction is predicted to gain, with the uncertainty that the history knows."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from fdhil.config import MachineConfig

@@ -1,7 +1,5 @@
 """Keeps what the passes of a program have taught: one file for each program and configuration."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Variables of MATLAB as columns, under the names that MATLAB gives them: ``meas.t``, ``data(:,2)``, ``s(3).t``."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any

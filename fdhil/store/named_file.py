@@ -1,7 +1,5 @@
 """Opens a file by a name that came from outside: never anything but a regular file of that one folder."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re

@@ -1,7 +1,5 @@
 """Finds the newest published parameter set of each axis, and the loops that the drive's newest rapids show."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path

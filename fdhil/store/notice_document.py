@@ -1,7 +1,5 @@
 """A stored notice and its acknowledgement as JSON has them."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime
 from typing import Any
 

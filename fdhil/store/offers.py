@@ -5,8 +5,6 @@ looked at elsewhere. The answers are one file of the store, which the operator's
 which version of each offer was accepted last, so that an older one is known.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Sequence

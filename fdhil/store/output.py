@@ -4,8 +4,6 @@ The null device and what the process has as standard output are written to as th
 writing the new one fails.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import stat

@@ -5,8 +5,6 @@ is a struct of the Thrift compact protocol; its fields 2 and 3 are the page's si
 ([Parquet] PageHeader, [Thrift] compact protocol).
 """
 
-from __future__ import annotations
-
 _UNCOMPRESSED, _COMPRESSED = 2, 3
 _INTEGERS, _BYTE, _DOUBLE, _BINARY, _STRUCT = (4, 5, 6), 3, 7, 8, 12
 _DEEPEST = 8

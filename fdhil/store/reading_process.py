@@ -5,8 +5,6 @@ and is told so in a sentence. ``python -m fdhil.store.reading_process`` has the 
 file, so that nothing which one file broke is there when the next one is read; it ends when nobody asks any more.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import json

@@ -1,7 +1,5 @@
 """Recordings as CSV text: header lines ``# key: value``, then a line of names, then rows of numbers."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Recordings as HDF5 files: one dataset each with its unit as attribute, the headers as attributes of the file."""
 
-from __future__ import annotations
-
 import io
 from typing import Any
 

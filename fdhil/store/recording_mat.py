@@ -4,8 +4,6 @@ Written in version 5, which MATLAB, Octave and scipy read; version 7.3 is HDF5 a
 scipy's process, so it is read in one of its own.
 """
 
-from __future__ import annotations
-
 import io
 import math
 from typing import Any

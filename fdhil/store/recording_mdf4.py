@@ -5,8 +5,6 @@ The columns are one group of channels over ``time``; the headers stand as JSON i
 A damaged file ends the process that reads it, so they are read in one of their own.
 """
 
-from __future__ import annotations
-
 import html
 import io
 import json

@@ -1,7 +1,5 @@
 """Recordings as Parquet tables: one column each, its unit in the field's metadata, the headers in the schema's."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path

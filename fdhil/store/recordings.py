@@ -1,7 +1,5 @@
 """Reads a recording from any file: one of the recording formats, or another program's file with a column map."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from fdhil import tables

@@ -1,7 +1,5 @@
 """Times of samples with too few digits or with jitter: the even grid that they stand for, if there is only one."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from fdhil.errors import RecordingError

@@ -4,8 +4,6 @@ Every row carries a digest over all its fields and its number. The file's own st
 and no index is kept: an index that is damaged would hide rows, a row that is damaged is seen by its digest.
 """
 
-from __future__ import annotations
-
 import hashlib
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping

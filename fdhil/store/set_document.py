@@ -1,7 +1,5 @@
 """A published parameter set as JSON has it: each value with its interval, to full precision."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Which file format a name's suffix means."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 RECORDINGS: Mapping[str, str] = {

@@ -1,7 +1,5 @@
 """Cells of text files as numbers: decimal marks, thousands' separators, times of day, and words for a lost value."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

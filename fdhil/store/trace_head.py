@@ -1,7 +1,5 @@
 """Names of columns in the head of a text: the nearest above the numbers, where the names count as the cells do."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

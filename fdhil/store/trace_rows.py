@@ -1,7 +1,5 @@
 """Which records of a text are rows of numbers: where they begin and end, and what stands between them."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence

@@ -5,8 +5,6 @@ column is found by the text nearest above its numbers, or as ``#1``, ``#2`` ... 
 in two ways it is refused with both: a name above two columns, a mark that is decimal or separates thousands.
 """
 
-from __future__ import annotations
-
 import codecs
 import csv
 import re

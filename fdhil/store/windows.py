@@ -5,8 +5,6 @@ takes some 10 kB); the store tries the scales it is given and falls back to floa
 Files are numbered, never dated: the order holds however wrong the wall clock is.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -3,8 +3,6 @@
 A token is 256 random bits that live in this process alone, kept as their SHA-256; a restart ends every login.
 """
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 import ipaddress

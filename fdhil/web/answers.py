@@ -1,7 +1,5 @@
 """What is answered when it is no: one document for every fault, and the status that fits."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Literal
 

@@ -1,7 +1,5 @@
 """Puts the pages together behind the gate: one application for one machine, or for many."""
 
-from __future__ import annotations
-
 import logging
 import pkgutil
 from collections.abc import Iterable, Iterator

@@ -4,8 +4,6 @@ What is needed before a route begins is a coroutine here and on every page: a pl
 forty threads that plain routes run in, and who takes those would keep an operator from disarming.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Asks the daemon over its socket, without blocking; who is not waited for any more takes the question back."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Sends a file as it is: a recording, a black box."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import BinaryIO
 

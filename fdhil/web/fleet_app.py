@@ -3,8 +3,6 @@
 It reads the works' database by what it is given to ask with, and reaches no machine.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import OrderedDict

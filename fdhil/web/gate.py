@@ -5,8 +5,6 @@ One rule for all routes, so that no page can forget it: what is under /api needs
 shell, its scripts and the login are open; they tell nothing of the machine.
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 from collections.abc import Mapping

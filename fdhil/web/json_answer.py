@@ -1,7 +1,5 @@
 """How every answer that is JSON is written: whatever text is in it."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -5,8 +5,6 @@ asked again, and the hole stays one. The ticks of two buses need not agree, and 
 are laid on one count of this process by when its first block came, and stay on it as long as they rise.
 """
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import AsyncIterator, Callable, Mapping

@@ -3,8 +3,6 @@
 Pure: nothing here knows a clock or a socket. Rows are placed by their tick; one that is missing stays NaN.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

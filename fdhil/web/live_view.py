@@ -4,8 +4,6 @@ Pure. A browser says which message it has drawn. While two are on their way noth
 at once in columns that are twice, four times ... as wide, and what is older than the view is skipped and counted.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping, Sequence

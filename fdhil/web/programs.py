@@ -1,7 +1,5 @@
 """The NC programs that may be armed from a browser: plain files of one folder, by names that lead nowhere else."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

@@ -5,8 +5,6 @@ all as JSON. An answer is one line: a + and the signals, or a - and a fault. It 
 is gone or has not asked for a while: what it has loaded takes 200 MB.
 """
 
-from __future__ import annotations
-
 import json
 import resource
 import select

@@ -1,7 +1,5 @@
 """Asks the process that replays rapids, starts it where it does not run, and ends it where it does not answer."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 

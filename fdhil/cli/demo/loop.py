@@ -1,7 +1,5 @@
 """Runs the demonstration's loop: commission, shuttle, identify, predict, cut, arm, cut corrected, warm, cut again."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence

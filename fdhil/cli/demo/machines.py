@@ -1,7 +1,5 @@
 """The demonstration's machines: the paper's plant, and the same with what real ones have."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path

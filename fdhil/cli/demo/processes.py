@@ -1,7 +1,5 @@
 """Child processes of the demonstration: the twin with its panel, the guard, the daemon."""
 
-from __future__ import annotations
-
 import json
 import queue
 import signal

@@ -1,7 +1,5 @@
 """Runs the demonstration on a machine with what real ones have: what fdhil believes of it, and what that is worth."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The report's section on the realistic machine: what it has, what was believed of it, what the correction left."""
 
-from __future__ import annotations
-
 from fdhil.cli.demo.realistic import AxisVerdict, Realistic
 from fdhil.cli.demo.report import CUT_HEAD, PARAMETER_HEAD, cut_rows_of, identified_rows, rms
 from fdhil.config import Reality

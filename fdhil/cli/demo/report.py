@@ -1,7 +1,5 @@
 """Reports the demonstration: the paper's figures for the machine that was just identified."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

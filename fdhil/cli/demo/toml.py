@@ -1,7 +1,5 @@
 """A machine's configuration as the text of a file: nested tables of plain values."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from typing import Any

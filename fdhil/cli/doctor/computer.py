@@ -1,7 +1,5 @@
 """Examines the PC: its CAN interfaces and hubs, its clock, its processors."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Examines what is wired to the PC, through the comparison of ``fdhil check``, and asks the guard how it is."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator, Sequence
 
 from fdhil.arming.guard_client import GuardClient

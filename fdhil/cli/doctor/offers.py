@@ -1,7 +1,5 @@
 """Examines what the works offers: what waits for the operator, and what keeps it from being looked at."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 

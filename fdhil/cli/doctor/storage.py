@@ -1,7 +1,5 @@
 """Examines the store and what must be kept secret: folders, rights, free space, history, records, token."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Names one thing that is wrong with a machine's PC, and what mends it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

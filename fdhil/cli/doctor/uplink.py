@@ -1,7 +1,5 @@
 """Examines what goes to the works: how much waits, where it is noted how far it is, the server; nothing is sent."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket

@@ -5,8 +5,6 @@ within theirs. A claim that all its scenarios show holds; one that some show hol
 reproduced. Nothing else decides, and no verdict is written down anywhere.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

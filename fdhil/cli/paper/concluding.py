@@ -1,7 +1,5 @@
 """The paper's conclusion: what it left to study, what the calculus takes, and whether one machine shows it all."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """Section 6 of the paper: equations [9] and [11], the mirror, and figures 16 to 20."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from fdhil.cli.paper import drawings, paths

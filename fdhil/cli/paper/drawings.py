@@ -1,7 +1,5 @@
 """Draws what the report's figures do not have, in the same style: most of it as charts that the page makes live."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Section 2 and 3.1 of the paper: equations [3] to [8], the operators, the rival method, the low-pass, the load."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Sections 2.1, 3 and 4 of the paper: figures 2 and 4 to 8, whiteness, backlash, and how fast the parameters move."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache

@@ -1,7 +1,5 @@
 """Runs operators and methods over many noisy recordings of one rapid, and tells their errors and the bound."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """The derivative operators that the paper may have compared: its own, [4], and three rivals; it names none of them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

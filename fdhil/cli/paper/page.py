@@ -1,7 +1,5 @@
 """Lays the claims out as one page and as one document for machines."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence

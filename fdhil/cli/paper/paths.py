@@ -4,8 +4,6 @@ In a simulation no drive can be harmed, so the offsets are not limited here as t
 figures are drawn as the paper drew them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import cache
 from importlib.resources import as_file, files

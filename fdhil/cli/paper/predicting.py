@@ -1,7 +1,5 @@
 """Section 5 of the paper: figures 9 to 15, where errors arise, and what the feed, friction, a mass and cutting do."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The scenarios that the claims are put to: the paper's machine with one thing or another changed."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

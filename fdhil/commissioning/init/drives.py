@@ -3,8 +3,6 @@
 Where an NC runs the bus nothing is sent at all; the drives are then known by their node-IDs alone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial

@@ -1,7 +1,5 @@
 """Makes the values of a machine: takes what files and drives tell, asks for the rest, proposes what can be guessed."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial

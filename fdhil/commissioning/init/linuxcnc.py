@@ -6,8 +6,6 @@ Neither [JOINT_n] nor [TRAJ] MAX_LINEAR_ACCELERATION limits them (measured on Li
 joint of a gantry are named and left out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -4,8 +4,6 @@ Pure: text in, tables out. Of HAL only what tells the scale of a joint and the l
 that are set and the pins that each signal joins.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

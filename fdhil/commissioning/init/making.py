@@ -1,7 +1,5 @@
 """Makes a machine's configuration file: the order of the questions, the last check, and the text."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path

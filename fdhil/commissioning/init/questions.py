@@ -4,8 +4,6 @@ What a key means is its description in ``fdhil/config``; here stands only where 
 what is known by then, in the keys of [axis.X].
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """One value of a configuration that is being made, and who said so."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Vector's ASC logs, as ``log2asc`` (can-utils), python-can and CANoe write them. Their dates are local time."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Vector's BLF logs, by python-can."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections import Counter

@@ -3,8 +3,6 @@
 There is nothing here that sends: what does is in ``fdhil.commissioning.transmit``, which no other room may import.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Sequence

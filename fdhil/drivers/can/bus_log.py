@@ -3,8 +3,6 @@
 A log is read twice, so that its head is known before its first frame is written and none of it is held.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Logs of ``candump -l`` and ``-L`` (can-utils): the lines of the black box too."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator

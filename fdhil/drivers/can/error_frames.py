@@ -1,7 +1,5 @@
 """Tells what the CAN controller says in error frames (linux/can/error.h). Pure: no clock, no I/O."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Says which frames of a bus are needed, as filters for the kernel or an adapter, and drops the others of a block."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Keeps the last seconds of all frames of a bus, as they came, for the black box."""
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np

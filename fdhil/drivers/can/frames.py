@@ -5,8 +5,6 @@ A frame is 24 bytes: ``t_ns`` host-monotonic receive stamp, ``id`` with the flag
 decoded with shifts and masks instead of a loop.
 """
 
-from __future__ import annotations
-
 import mmap
 import struct
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """Brings time stamps of other clocks onto the host's monotonic one."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 

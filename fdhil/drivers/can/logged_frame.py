@@ -1,7 +1,5 @@
 """A frame of a bus log, whatever the file format, and what is common to the formats."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping

@@ -4,8 +4,6 @@ The frames are read here and not by the canopen library, which drops an EMCY sho
 heartbeat that stops, and believes an NMT command as soon as it is sent.
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """What a way onto a CAN bus is, as the receive thread needs it."""
 
-from __future__ import annotations
-
 from typing import Literal, Protocol
 
 from fdhil.drivers.can.frames import FrameRing

@@ -1,7 +1,5 @@
 """Opens the way onto a bus that ``[bus.NAME] interface`` names, for listening."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 
 from fdhil import config

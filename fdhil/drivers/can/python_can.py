@@ -1,7 +1,5 @@
 """Listens through python-can: to adapters that have no SocketCAN driver, and to the bus inside one process."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Mapping, Sequence

@@ -6,8 +6,6 @@ a moment ago), the line is left quiet until nothing more can come, and then the 
 or an error.
 """
 
-from __future__ import annotations
-
 import logging
 import operator
 import queue

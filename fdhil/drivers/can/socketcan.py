@@ -3,8 +3,6 @@
 python-can neither counts the kernel's drops nor enlarges the receive buffer, and its stamps are the wall clock's alone.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import fcntl

@@ -5,8 +5,6 @@ closes the connection and cannot tell it from silence; reading what has come in 
 2 us a frame.
 """
 
-from __future__ import annotations
-
 import socket
 import struct
 import time

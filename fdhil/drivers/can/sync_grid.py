@@ -7,8 +7,6 @@ see at once where a counter begins again that does not go up to 240. What comes 
 farther, however long the NC was off and wherever a clock jumped.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ overflow value breaks its series, but never returns to the one it left. Without 
 early and late in turn. A single producer of half the period comes evenly; that is another fault, told by its rate.
 """
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tells host time by the SYNC count and back, from the arrivals of SYNC. Pure."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from fdhil.records import Float, Int, TickTimes

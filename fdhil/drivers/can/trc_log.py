@@ -3,8 +3,6 @@
 Source: PEAK CAN TRC file format, 2020-07-27. Start times are taken as UTC, as python-can writes them.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime

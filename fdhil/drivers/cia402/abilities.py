@@ -3,8 +3,6 @@
 An EDS is what the maker says. ``perhaps`` is what it does not settle, and a drive does.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

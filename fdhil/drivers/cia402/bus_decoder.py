@@ -1,7 +1,5 @@
 """Decodes one bus: its SYNC grid, its drives' samples and the watch over its nodes. Pure: no clock, no I/O."""
 
-from __future__ import annotations
-
 from fdhil.cia402 import COB_HEARTBEAT
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.error_frames import ErrorWatch

@@ -1,7 +1,5 @@
 """Reads what the drives did from a candump log of their buses, such as a black box, as the daemon heard it."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Says what an EDS or DCF file offers, as plain records: the device's identity, its objects and its PDOs."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path

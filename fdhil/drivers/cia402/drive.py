@@ -7,8 +7,6 @@ belongs to row k-1. Rows leave two ticks late, when all they need is there; a ro
 out: a hole in ``tick``, counted in ``lost``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal

@@ -5,8 +5,6 @@ behind values, incomplete [DummyUsage], [Comments] that count wrong. This module
 can be mended, and hands the library a clean text; what is left is one :class:`EdsError` with the line.
 """
 
-from __future__ import annotations
-
 import configparser
 import io
 import re

@@ -3,8 +3,6 @@
 Works on sections by their names (``1A00``, ``1A00sub1``, ``1A00Value``); each section is a mapping of keys to texts.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 

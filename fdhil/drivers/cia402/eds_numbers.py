@@ -1,7 +1,5 @@
 """Reads the numbers of EDS and DCF files (CiA 306): decimal, hexadecimal, with leading zeros, with $NODEID. Pure."""
 
-from __future__ import annotations
-
 import re
 
 _TERM = re.compile(r"([+-])(\$NODE_?ID|0X[0-9A-F]{1,16}|[0-9]{1,20})[UL]*")

@@ -4,8 +4,6 @@ The PDOs lie as the packaged profiles have them: position and speed first, then 
 and offset in a slower one. Where the device's mapping is fixed, its own is taken as it is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Lays the frames of a PDO on a dense grid of ticks, and follows sniffed set-points. Pure numpy, no loop per frame."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Watches for TPDOs that never come though SYNC runs: they are told by name, and are not lost frames. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 
 import numpy as np

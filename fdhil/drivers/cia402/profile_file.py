@@ -4,8 +4,6 @@ A file may begin with ``base = "epos4"``: what it does not say is then that prof
 (``rpdos``, ``tpdos``) takes the place of the other's as a whole.
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace

@@ -1,7 +1,5 @@
 """Reads a voltage sensor that keeps its newest samples by number, at the registers that the configuration names."""
 
-from __future__ import annotations
-
 import math
 
 from fdhil.config import MachineConfig

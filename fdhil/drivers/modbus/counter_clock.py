@@ -7,8 +7,6 @@ one-sided and not normal). The timeline may be the host's clock in ns or the SYN
 a simulated machine that is held up stops both its SYNC and its sensor, and only the SYNC count stays true.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What a line to one or more Modbus units is, what it is asked, and what can go wrong with the answer."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import MutableSet
 from dataclasses import dataclass

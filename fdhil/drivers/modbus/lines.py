@@ -1,7 +1,5 @@
 """One line per device: two sensors on it must wait for each other, wherever they were made."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Hashable
 from weakref import WeakValueDictionary

@@ -1,7 +1,5 @@
 """Asks one Modbus unit, over TCP or over the serial line that it shares with others."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from fdhil.config.sensors import ModbusPlace

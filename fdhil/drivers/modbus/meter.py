@@ -1,7 +1,5 @@
 """A value in the registers of a Modbus unit: its newest, whenever it is asked."""
 
-from __future__ import annotations
-
 import math
 
 from fdhil.config.sensors import ModbusPlace, ValueType

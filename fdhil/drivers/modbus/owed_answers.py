@@ -5,8 +5,6 @@ and then each answer is taken for the one before. A unit answers in order: what 
 requests before it.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from fdhil.drivers.modbus.line import Request

@@ -3,8 +3,6 @@
 Source: MODBUS over serial line, specification and implementation guide V1.02, 2.5.1.
 """
 
-from __future__ import annotations
-
 import struct
 
 from pymodbus.framer import FramerRTU

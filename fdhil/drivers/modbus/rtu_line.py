@@ -7,8 +7,6 @@ has answered a probe of another shape (:mod:`fdhil.drivers.modbus.owed_answers`)
 Noise, or a piece, is no answer: ours may still come, and must not be taken for that of the next request.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import struct

@@ -1,7 +1,5 @@
 """Chooses how a voltage sensor on Modbus is read, by what its section says of its registers."""
 
-from __future__ import annotations
-
 from fdhil.config import MachineConfig
 from fdhil.drivers.meter import BEYOND_LIMIT, MeterVoltage
 from fdhil.drivers.modbus.block import BlockVoltage

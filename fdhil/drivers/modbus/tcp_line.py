@@ -5,8 +5,6 @@ a few silent requests; none of it suits a sensor that is asked 20 times a second
 quiet, and what an answer must be is checked here.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import time

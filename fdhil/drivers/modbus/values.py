@@ -1,7 +1,5 @@
 """Numbers in 16 bit registers. Pure."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import struct

@@ -9,8 +9,6 @@ Everything is then read with one request, so that no value is torn.
 A sensor with another register map is a class beneath :class:`ModbusVoltage` that reads a :class:`SensorBlock`.
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 from collections import deque

@@ -1,7 +1,5 @@
 """Tells which moves were ordered as rapids (G0); ``tables.EVENT_SOURCES`` lists the ways."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Protocol
 
 from fdhil import tables

@@ -5,8 +5,6 @@ drive's increments, from another zero. A group of set-points of a moving axis fi
 only say where to begin looking.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass, field
 

@@ -4,8 +4,6 @@ The input comes with a slower TPDO than the samples, so an edge is known to that
 as the tick of the sample before the edge, the end as the tick of the first sample after it.
 """
 
-from __future__ import annotations
-
 from fdhil.config import MachineConfig
 from fdhil.drivers.cia402.drive import InputSamples
 from fdhil.records import AxisSamples, MoveEvent, MoveKind, NcState, TickTimes

@@ -3,8 +3,6 @@
 Which kind a move is shows only when it is fast enough, or over; the event then carries the tick at which it began.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from fdhil.config import MachineConfig

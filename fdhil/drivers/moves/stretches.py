@@ -1,7 +1,5 @@
 """Follows one axis' demand: from when to when it moves in one direction. Pure."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 

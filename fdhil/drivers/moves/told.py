@@ -6,8 +6,6 @@ them parts them. An NC that tells its own set-points is laid on the bus by them,
 clocks. A move in which the NC was not heard is UNKNOWN, and no rapid.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Iterator, Sequence

@@ -5,8 +5,6 @@ silence: whoever listens to it (:mod:`fdhil.drivers.nc.listener`) leaves it, say
 and longer, and enters it anew.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Protocol, Self
 

@@ -8,8 +8,6 @@ Sources: ISO 6983-1 (G00 to G03); LinuxCNC's modal groups; Fanuc's lathe codes o
 with axis words cut; for Klartext the maker's user's manuals: FMAX holds for its block alone.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from typing import Protocol

@@ -3,8 +3,6 @@
 Sources: RFC 9112 (messages, chunked), RFC 2046 5.1 (multipart); MTConnect Standard Part 1 (multipart/x-mixed-replace).
 """
 
-from __future__ import annotations
-
 import asyncio
 import re
 from collections.abc import AsyncIterator

@@ -4,8 +4,6 @@ The first line tells what the bridge is, each later one the state in one servo c
 before, and a few in between. ``cycle`` is the count of the servo thread and ``mm`` its set-points.
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 import time

@@ -1,7 +1,5 @@
 """Listens to the NC for ever: enters its source, hands its states over, and begins anew when it is lost."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Asks an NC, or the PLC beside it, what it does by Modbus: bits for the motion, registers for line and overrides."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import Mapping, Sequence

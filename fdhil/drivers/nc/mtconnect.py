@@ -4,8 +4,6 @@ The agent sends what is new every ``period_s``, and an empty document when nothi
 than the one before it. The agent's own stamps part what one document tells; its clock is not compared with ours.
 """
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import Iterable, Iterator, Sequence

@@ -3,8 +3,6 @@
 Source: MTConnect Standard Part 1 (header, errors) and Part 3 (streams).
 """
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ asyncua reconnects by itself only if it is told to, which it is not: the listene
 quiet, for what it logs is told by the errors here.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging

@@ -1,7 +1,5 @@
 """Finds the nodes of a server by what a profile says of their places."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 
 from asyncua import Client, ua

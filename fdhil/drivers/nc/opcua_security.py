@@ -3,8 +3,6 @@
 The key and the password are read each time the server is entered, and are in no message.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from asyncua import Client

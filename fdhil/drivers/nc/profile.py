@@ -5,8 +5,6 @@ is not told does not hold and is not passed over either: the motion is then UNKN
 never leaves a "rapid" behind.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Reads the profiles of NCs: the packaged ones of ``tables.NC_PROFILES``, and a user's own TOML file."""
 
-from __future__ import annotations
-
 import math
 import tomllib
 from collections.abc import Mapping

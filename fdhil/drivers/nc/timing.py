@@ -1,7 +1,5 @@
 """When what an NC shows was true. Pure."""
 
-from __future__ import annotations
-
 LEAST_ERROR_NS = 1000  # no clock of a computer is read more exactly
 
 

@@ -1,7 +1,5 @@
 """What comes over a line as bytes, each with the time at which it was read: the part that every kind of line has."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from abc import ABC, abstractmethod

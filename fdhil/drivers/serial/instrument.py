@@ -1,7 +1,5 @@
 """Reads an instrument that tells its value in lines of text over a serial line: asked, or by itself."""
 
-from __future__ import annotations
-
 import re
 import time
 from typing import Protocol

@@ -1,7 +1,5 @@
 """Lines of text that come over a serial port, each with the time at which its end had come."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A serial port as a stream of bytes. The one place that knows pyserial."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import termios

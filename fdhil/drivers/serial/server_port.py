@@ -1,7 +1,5 @@
 """The port of a serial server: it passes the bytes of its serial line over TCP, as they are."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from typing import cast

@@ -1,7 +1,5 @@
 """Reads an accelerometer at the table that streams a line of text per sample over a serial port."""
 
-from __future__ import annotations
-
 import re
 import time
 from collections import deque

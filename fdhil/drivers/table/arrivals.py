@@ -5,8 +5,6 @@ the sensor's count to the SYNC count runs along the earliest arrivals; its slope
 such sensors is some percent off its nominal one.
 """
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np

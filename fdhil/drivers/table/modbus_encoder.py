@@ -1,7 +1,5 @@
 """Asks an encoder at the table behind Modbus: an SSI or EnDat module, which tells where the table stands."""
 
-from __future__ import annotations
-
 import asyncio
 
 from fdhil.config import TableEncoder

@@ -1,7 +1,5 @@
 """Decodes the TPDO of an encoder at the table: a second axis' place, or that of an encoder node. Pure."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from fdhil.cia402 import PdoEntry

@@ -1,7 +1,5 @@
 """Holds what a drive moves: the axis' mechanics and loops, and how its parameters follow orders and the temperature."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

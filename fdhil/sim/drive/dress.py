@@ -5,8 +5,6 @@ current, voltage or duty, and in what they count, no EDS says: the tables in ``d
 from the vendors' documents and not from the profiles that the drivers read.
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass, replace

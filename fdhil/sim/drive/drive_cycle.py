@@ -1,7 +1,5 @@
 """Runs a drive's cycles: set-points are taken, all objects sampled, the following error watched, motion integrated."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from fdhil.sim.drive.axis_plant import AxisPlant

@@ -1,7 +1,5 @@
 """Handles the errors of a CANopen device: emergency messages, error history, heartbeats both ways, node guarding."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from fdhil.sim.drive.dictionary import AbortCode, Dictionary, Entry, TransferAbort

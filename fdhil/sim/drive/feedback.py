@@ -1,7 +1,5 @@
 """Samples the objects of a drive at a SYNC: positions, speeds, current, voltage, statusword (CiA 402-2)."""
 
-from __future__ import annotations
-
 import math
 
 from fdhil.config import Regulators

@@ -4,8 +4,6 @@ Positions are raw here: those of the encoder, before any home offset. A switch i
 once per revolution, at whole ones.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from enum import Enum, auto

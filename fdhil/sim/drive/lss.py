@@ -4,8 +4,6 @@ A new node-ID holds from the next reset of the communication on; stored, also af
 a simulated bus is nobody's to choose: every standard one is accepted and changes nothing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 REQUEST, RESPONSE = 0x7E5, 0x7E4

@@ -1,7 +1,5 @@
 """Names the modes of operation that the drive has (CiA 402-2, object 0x6060)."""
 
-from __future__ import annotations
-
 PROFILE_POSITION, PROFILE_VELOCITY, PROFILE_TORQUE, HOMING = 1, 3, 4, 6
 CYCLIC_POSITION, CYCLIC_VELOCITY, CYCLIC_TORQUE = 8, 9, 10
 CYCLIC = frozenset({CYCLIC_POSITION, CYCLIC_VELOCITY, CYCLIC_TORQUE})

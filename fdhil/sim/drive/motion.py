@@ -1,7 +1,5 @@
 """Chooses the set-point that the loops follow: modes of operation, ramps of the power state machine, the halt bit."""
 
-from __future__ import annotations
-
 import math
 from enum import Enum, auto
 from operator import itemgetter

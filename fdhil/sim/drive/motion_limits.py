@@ -1,7 +1,5 @@
 """Reads limits, rates and windows of the drive's own motion; an object that it lacks, or that is 0, limits nothing."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

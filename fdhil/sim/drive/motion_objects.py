@@ -3,8 +3,6 @@
 Profile speeds are in increments/s and accelerations in increments/s2, as everywhere in this drive; 0x6080 is in rpm.
 """
 
-from __future__ import annotations
-
 import math
 
 from fdhil.config import Axis

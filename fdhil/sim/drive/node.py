@@ -3,8 +3,6 @@
 What the device does with a SYNC, with what it received and with an error is left to who derives from it.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 
 from fdhil.sim.drive import lss

@@ -1,7 +1,5 @@
 """Gives SDO writes to the drive their meaning beyond storing the value: rules and actions by object."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from fdhil.sim.drive.dictionary import AbortCode, Dictionary, Entry, TransferAbort

@@ -6,8 +6,6 @@ Which of the two it is, a phase-locked loop says: its phase goes that period on 
 time.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ Communication and mapping parameters may change in pre-operational only, a mappi
 its sub-index 0 is 0.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field

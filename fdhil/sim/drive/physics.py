@@ -10,8 +10,6 @@ exact (a matrix exponential); a sign change of w stops at w = 0 for that step. E
 direction; position is the shaft's angle, the table follows it through the backlash.
 """
 
-from __future__ import annotations
-
 import math
 from enum import Enum, auto
 from typing import NamedTuple

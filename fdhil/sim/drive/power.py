@@ -1,7 +1,5 @@
 """Steps the power states of CiA 402-2: controlword in, state out, with the option codes for every kind of stop."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from enum import Enum, auto
 

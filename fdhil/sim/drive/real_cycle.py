@@ -15,8 +15,6 @@ Every current cycle is one step of the midpoint rule with the sign of sticking f
 it, far below an increment. The bristles, which are stiff at speed, take half a step before and after it in closed form.
 """
 
-from __future__ import annotations
-
 import math
 
 import numba

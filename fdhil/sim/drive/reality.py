@@ -4,8 +4,6 @@ It takes the place of :class:`fdhil.sim.drive.physics.Physics` where ``[sim.axis
 regulators have a filter or a delay. Everything runs in the drive's own direction.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

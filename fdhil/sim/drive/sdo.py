@@ -4,8 +4,6 @@ Sans-I/O: a request of 8 bytes in, the answers out. One client, one transfer at 
 drops the transfer that was going on, as the standard has it.
 """
 
-from __future__ import annotations
-
 import binascii
 from dataclasses import dataclass, field
 

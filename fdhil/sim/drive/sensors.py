@@ -1,7 +1,5 @@
 """Reports what the drive's sensors see: with white noise, and with the faults that a test or a fault script orders."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

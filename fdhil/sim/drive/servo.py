@@ -5,8 +5,6 @@ due, and integrates [t_k, t_k+1). The 0x607A and 0x60B0 latched at SYNC k are wh
 and time-outs run on the time that :meth:`Drive.wall_clock` is given, and where no SYNC leads so does the motion.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

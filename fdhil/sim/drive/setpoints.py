@@ -4,8 +4,6 @@ The cyclic set-points and the profile give, for the cycle that begins, the deman
 later (increments), because the feed-forward runs linearly from the slope of this cycle to the slope of the next.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from typing import NamedTuple

@@ -4,8 +4,6 @@ It shares nothing with the reader that the daemon uses, so that a mistake of one
 leaves out or writes wrongly is mended the way the device must have meant it; what has no meaning is left out.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """Computes the set-points of the modes with open outer loops: velocity and torque, profile and cyclic."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import NamedTuple

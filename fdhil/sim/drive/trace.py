@@ -1,7 +1,5 @@
 """Keeps the last cycles as the drive saw them, to be read by SDO block upload (vendor object 0x2120)."""
 
-from __future__ import annotations
-
 import struct
 
 TRACE_CYCLES = 1024

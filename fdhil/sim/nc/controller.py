@@ -4,8 +4,6 @@ After SYNC k-1 and before SYNC k it sends r[k+delay] by RPDO (controlword, targe
 runs its set-point ``delay`` cycles late, follows r[k] at SYNC k. All its times are counted in SYNC cycles.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from enum import Enum, auto

@@ -1,7 +1,5 @@
 """Moves the NC along a path on the SYNC grid: in a rapid to its start, then through its rows at a variable rate."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 The rows come on another clock than the SYNC, in lumps: a short lead is kept, so that a late lump is no jerk.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 All three offer the same methods to the twin's loop; this is the only module of the twin that imports ``can``.
 """
 
-from __future__ import annotations
-
 import errno
 import socket
 import struct

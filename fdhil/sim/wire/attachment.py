@@ -1,7 +1,5 @@
 """Describes a CAN bus as the twin's loop sees it, and the pipe by which another thread wakes that loop."""
 
-from __future__ import annotations
-
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence

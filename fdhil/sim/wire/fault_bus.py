@@ -6,8 +6,6 @@ bus = FaultBus(can.Bus(interface="virtual", channel="test"), plan, seed=1)
 assert bus.faults.total("drop") == what_my_program_says_it_lost
 """
 
-from __future__ import annotations
-
 import os
 import threading
 import time

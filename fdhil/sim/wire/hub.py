@@ -9,8 +9,6 @@ fits and none is torn. Nothing is lost: each client has a queue, and while one q
 from anyone and says so (:attr:`Hub.congested`); a client that reads nothing for ``STALL_S`` is then disconnected.
 """
 
-from __future__ import annotations
-
 import errno
 import socket
 import time

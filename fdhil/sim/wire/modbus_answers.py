@@ -3,8 +3,6 @@
 Source: MODBUS application protocol V1.1b3, 6.3, 6.4, 6.6, 6.12 and 7.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Mapping
 from random import Random

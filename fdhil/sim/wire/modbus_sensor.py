@@ -12,8 +12,6 @@ Its own registers, 16 bit, 32 bit values in two with the high word first, the sa
 Sample c is the mean over [c Ts, (c + 1) Ts) of the sensor's own time, which is the simulated one.
 """
 
-from __future__ import annotations
-
 import struct
 import threading
 from collections import deque

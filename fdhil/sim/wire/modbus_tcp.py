@@ -3,8 +3,6 @@
 Source: MODBUS messaging on TCP/IP implementation guide V1.0b, 3.1.
 """
 
-from __future__ import annotations
-
 import asyncio
 import struct
 import threading

@@ -3,8 +3,6 @@
 Written from the keys of the configuration as a maker of such a device would: numbers are packed here with ``struct``.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Callable

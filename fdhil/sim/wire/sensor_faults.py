@@ -1,7 +1,5 @@
 """What can be wrong with a simulated sensor, whichever wire it is on."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from random import Random

@@ -1,7 +1,5 @@
 """Connects the sensors of the simulated machine as its configuration has them: Modbus TCP and RTU, lines of text."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

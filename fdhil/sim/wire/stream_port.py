@@ -1,7 +1,5 @@
 """Serves a stream of text as a serial device: a pseudo terminal, under the name that the configuration gives it."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import tty

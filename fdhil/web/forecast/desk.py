@@ -4,8 +4,6 @@ What is kept lives as long as the process that serves the pages, under the diges
 shown and never a path.
 """
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 import os

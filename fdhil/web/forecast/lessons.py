@@ -1,7 +1,5 @@
 """What programs have learned: the curve of each one by its passes, and what the daemon measured of the last ones."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -5,8 +5,6 @@ bounded time, memory and disk: whatever the program is, neither the daemon nor t
 history and writes into the folder that it is given; nothing is sent to any machine.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import resource

@@ -1,7 +1,5 @@
 """What a browser draws of a forecast: the whole or a part of its path, by as few points as tell the same."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Mapping, Sequence
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Acting: what arming would move is told first, and only what was told is armed. To disarm asks nothing."""
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """The black boxes as the browser has them: which there are, and the envelope of what the drives did in one."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any, BinaryIO

@@ -1,7 +1,5 @@
 """The notices as the browser has them: those that wait in front, each with its cause, effect and next action."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Literal
 

@@ -1,7 +1,5 @@
 """Alarms with cause, effect and next action, who acknowledged them, and the black boxes."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from fastapi import APIRouter, Query

@@ -1,7 +1,5 @@
 """How the drives are and how their parameters moved: against time and temperature, with intervals and limits."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Annotated, Any
 

@@ -1,7 +1,5 @@
 """What the browser shows of the drives' history: how each is, and the course of each parameter. Reads only."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 

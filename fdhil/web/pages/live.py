@@ -1,7 +1,5 @@
 """The page *live*: the signals of every axis as they pass, and single samples of what has just passed."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 from collections.abc import AsyncIterator

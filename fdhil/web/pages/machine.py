@@ -1,7 +1,5 @@
 """The machine: what its daemon says, how the axes are, and what to do next."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Literal
 

@@ -1,7 +1,5 @@
 """Says of a status document how each axis is and what to do next. Pure: a document in, sentences out."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal

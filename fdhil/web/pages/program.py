@@ -3,8 +3,6 @@
 A program that is dropped is forecast in a process of its own. Nothing here reaches the machine.
 """
 
-from __future__ import annotations
-
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from itertools import islice

@@ -1,7 +1,5 @@
 """The stored rapids as the browser has them: which there are, newest first, and what was said of each. Reads only."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 from typing import Any, Literal

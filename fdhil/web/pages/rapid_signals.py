@@ -1,7 +1,5 @@
 """The signals of one rapid with the model laid over them, what is left, and the spectra of both. Pure."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

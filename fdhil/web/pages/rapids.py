@@ -1,7 +1,5 @@
 """The rapids: which were recorded, what was said of each, its signals with the model laid over, its recording."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager

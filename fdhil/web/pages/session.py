@@ -1,7 +1,5 @@
 """Logs in and out, and tells the browser who it is. Open to everyone who reaches the address; it tells no secret."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from fastapi import APIRouter, Request
