@@ -140,7 +140,6 @@ class _RunningCheck:
         return running
 
     async def _follow(self, request: Mapping[str, Any]) -> None:
-        """Take what the process reports until it ends."""
         try:
             self._conclude(await self._process.run(request, self._take))
         except OSError as error:

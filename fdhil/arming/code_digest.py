@@ -47,7 +47,6 @@ def code_files(home: Path) -> dict[str, bytes]:
 
 
 def _imported(text: str) -> Iterator[str]:
-    """Yield what may be a module: what is imported from, and each name that is."""
     yield from _LISTED.findall(text)
     for module, names in _IMPORT.findall(text):
         yield module

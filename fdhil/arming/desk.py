@@ -306,7 +306,6 @@ class ArmingDesk:
 
 
 def _is_name(program: Any) -> bool:
-    """Whether it is a text that can be a file's name."""
     try:
         return isinstance(program, str) and b"\0" not in os.fsencode(program)
     except UnicodeEncodeError:

@@ -162,7 +162,6 @@ class FirstBlock:
         )
 
     def _better(self, found: Mapping[str, _Found]) -> bool:
-        """Whether the contour error is smaller with the rows found anew."""
         around = np.column_stack([self._path[axis] for axis in found])
         old_um, new_um = (
             rms(contour_error_um(around, np.column_stack(positions), self._period_s, 0))

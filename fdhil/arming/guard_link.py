@@ -208,7 +208,6 @@ class GuardLink:
 
 
 def _gone(before: Mapping[str, Any], now: Mapping[str, Any], error: DeviceError) -> Notice:
-    """Say that the guard is gone, and what it may have left."""
     stands = standing(now)
     was = "" if before["state"] in GONE else f"it was in state {before['state']}; "
     text = f"{error}; {was}{stands}"
@@ -230,7 +229,6 @@ def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
 
 
 def _voided(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
-    """Say which records hold no longer."""
     known = {told["axis"] for told in before.get("not_good", []) if told["code"] == RECORD_VOID}
     void = [told for told in now.get("not_good", []) if told["code"] == RECORD_VOID and told["axis"] not in known]
     return [Notice(RECORD_VOID, "MAJOR", f"{told['text']}; {told['advice']}", told["axis"]) for told in void]

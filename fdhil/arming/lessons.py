@@ -108,7 +108,6 @@ def _with_offsets(
     known: Lesson,
     config: MachineConfig,
 ) -> CheckedProgram:
-    """Return the program with other offsets, and with what the check found of it."""
     other = in_memory(encoded(demand_mm, offset_um, config), config, checked.errors)
     text = f"what {len(known.curve_um)} passes taught is added; the last one left {known.curve_um[-1]:.2f} um RMS"
     other.method, other.half_um = checked.method, checked.half_um

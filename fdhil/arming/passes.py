@@ -315,7 +315,6 @@ def _common(axes: Sequence[Rows]) -> tuple[Float, Float]:
 
 
 def _text(told: Mapping[str, Any]) -> str:
-    """Return what a pass measured beside what was predicted, as one line."""
     name, measured, half = Path(told["program"]).name, told["measured"], told["predicted"]["uncertainty_um"]
     spread = "" if half is None else f" {plus_minus(half, 2)}"
     text = f"pass {told['pass']} of {name}: contour error measured {measured['rms_um']:.2f} um RMS,"
@@ -325,7 +324,6 @@ def _text(told: Mapping[str, Any]) -> str:
 
 
 def _lesson_text(lesson: Lesson) -> str:
-    """Return the curve of what the passes left, as the end of a line."""
     newest = " ".join(f"{left_um:.2f}" for left_um in lesson.curve_um[-SHOWN_CURVE:])
     return f"; learning from {len(lesson.curve_um)} passes, the last left {newest} um"
 

@@ -69,7 +69,6 @@ def _errors(contour_um: Float) -> dict[str, float]:
 
 
 def _in_memory(rows: bytes) -> int:
-    """Return a descriptor of the rows."""
     try:
         descriptor = os.memfd_create("fdhil-rows")
     except OSError as error:

@@ -95,7 +95,6 @@ def _held(advice: Advice, corrected: bool) -> bool:
 
 
 def _write(program: Path, advice: Sequence[Advice], config: MachineConfig, out: Path) -> None:
-    """Write the program with the feeds that were found to hold together."""
     from fdhil.program import Budget
     from fdhil.program.feed_words import with_feeds
     from fdhil.store.output import open_output

@@ -126,7 +126,6 @@ def analyse_file(
 
 
 def _read(path: Path, accelerometer: Path | None, columns: ColumnMap | None) -> Recording | Window:
-    """Read a recording; a stored window is one rapid already, and is taken as it is, to the bit."""
     if next(os.walk(path), None) is not None:  # a folder: what is in it would be given in its place
         known = ", ".join(suffixes.RECORDINGS)
         raise RecordingError(f"{path} has no recordings ({known}); give the folder that has them")

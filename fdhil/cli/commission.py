@@ -138,7 +138,6 @@ def _tell_plan(machine: MachineConfig, axes: list[str], asked: Asked) -> int:
 
 
 def _commission_axis(machine: MachineConfig, axis: str, asked: Asked) -> dict[str, Any]:
-    """Run all steps for one axis and save its record; DriveFault when it is refused."""
     from fdhil.cli.bus_lock import lock_bus
     from fdhil.commissioning import steps
     from fdhil.commissioning.record import save_record
@@ -176,7 +175,6 @@ def _commissioning_guide(machine: MachineConfig, axis: str, asked: Asked, progre
 
 
 def _set_pdos(machine: MachineConfig, axis: str, asked: Asked) -> dict[str, Any]:
-    """Set the PDOs of one drive up; DriveFault when it refuses, or the operator does."""
     from fdhil.cli.bus_lock import lock_bus
     from fdhil.commissioning.master import Master
     from fdhil.commissioning.pdo_setup import set_up_pdos

@@ -100,7 +100,6 @@ def _tell(notices: Sequence[Notice]) -> None:
 
 
 def _told(found: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
-    """Return what the trial found, a line a step."""
     for step, values in found.items():
         if step == "identification":
             shown = [f"{name} {_figure(value)}" for name, value in values.items()]

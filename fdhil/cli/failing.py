@@ -143,7 +143,6 @@ def _details(error: FdhilError) -> dict[str, Any]:
 
 
 def _tell_config(error: ConfigError) -> int:
-    """Tell every fault of a configuration, one a line."""
     if wants_json():
         return tell(type(error).__name__, str(error), error.exit_code, _details(error))
     if len(error.faults) == 1:
@@ -153,7 +152,6 @@ def _tell_config(error: ConfigError) -> int:
 
 
 def _usage(error: click.ClickException) -> str:
-    """Return what is wrong with a call, and where to read how it goes."""
     context = getattr(error, "ctx", None) or click.get_current_context(silent=True)
     command = context.command_path if context is not None else "fdhil"
     text = " ".join(error.format_message().split()).rstrip(".")

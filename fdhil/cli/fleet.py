@@ -99,7 +99,6 @@ def collect(fleet: Path, as_json: bool) -> None:
 
 
 def _answer(fleet: Path, question: str, **given: str | None) -> dict[str, Any]:
-    """Return what one of the questions is answered."""
     from fdhil.config.fleet import load
 
     settings = load(fleet)

@@ -88,7 +88,6 @@ def reanalyse(
 
 
 def _by_name(configs: tuple[Path, ...]) -> dict[str, MachineConfig]:
-    """Return the configurations by the names of their machines in the works."""
     from fdhil import config
 
     machines: dict[str, MachineConfig] = {}
@@ -107,7 +106,6 @@ def _utc(at: datetime | None) -> datetime | None:
 
 @contextmanager
 def _bar() -> Iterator[Callable[[int, int], None]]:
-    """Show how far it is, on stderr when that is a terminal."""
     if not sys.stderr.isatty():
         from fdhil.fleet.reanalysis import unseen
 

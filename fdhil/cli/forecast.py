@@ -327,7 +327,6 @@ def crossing_text(entry: Mapping[str, Any], tolerance_um: float) -> str:
 
 
 def _span(days: float) -> str:
-    """Return a time as people say it."""
     if days >= 2.0:
         return f"{days:.0f} days"
     return f"{days * 24:.0f} h" if days >= 1 / 12 else f"{days * 1440:.0f} min"

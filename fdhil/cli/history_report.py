@@ -95,7 +95,6 @@ def _pictures(history: AxisHistory) -> list[tuple[str, str]]:
 
 
 def _health_tables(told: Mapping[str, Any] | None) -> list[Table]:
-    """Return slopes with dates of the limits, and the changes, each where there are any."""
     if told is None:
         return []
     slopes = Table(

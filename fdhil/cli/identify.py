@@ -158,7 +158,6 @@ def _analyse(
     accelerometer: Path | None,
     columns: Path | None,
 ) -> list[FileResult]:
-    """Analyse the files, with a progress bar on stderr when that is a terminal."""
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
     from fdhil.cli.batch import analyse_files
@@ -238,7 +237,6 @@ def _verdict(verdict: Verdict) -> dict[str, Any]:
 
 
 def _terms(estimate: Estimate | None) -> dict[str, Any]:
-    """Return value, std and unit of each term that joined the six."""
     if estimate is None:
         return {}
     return {n: {"value": estimate.value(n), "std": estimate.std(n), "unit": unit_of(n)} for n in estimate.terms}
@@ -277,7 +275,6 @@ def _parameters(estimate: Estimate | None, verdict: Verdict) -> dict[str, Any]:
 
 
 def _show(results: Sequence[FileResult], axes: Mapping[str, Axis], with_loops: bool) -> None:
-    """Write a table per file for people: every window, then the pool, then the loops."""
     from rich import box
     from rich.table import Table
 
@@ -338,7 +335,6 @@ def _cell(estimate: Estimate, name: str) -> str:
 
 
 def _show_terms(console: Any, result: FileResult) -> None:
-    """Write what joined the six: of the pool, else of each window."""
     each = ((f"{o.window.start_s:.2f} s", _usable(o)) for o in result.outcomes)
     for who, estimate in each if result.pooled is None else (("all", result.pooled),):
         if estimate is not None and estimate.terms:
@@ -348,7 +344,6 @@ def _show_terms(console: Any, result: FileResult) -> None:
 
 
 def _show_table(console: Any, result: FileResult) -> None:
-    """Write what an encoder at the table saw of each rapid."""
     for outcome in result.outcomes:
         if (seen := outcome.at_table) is not None:
             left = "" if seen.left_rms_um is None else f"; {seen.left_rms_um:.3g} um RMS of it not predicted"

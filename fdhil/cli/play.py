@@ -110,7 +110,6 @@ def _play(machine: MachineConfig, plan: Plan, program: Path, go_to_start: bool, 
 
 
 def _entered() -> bool:
-    """Whether Enter was pressed; DriveFault where nobody is there to press it."""
     if sys.stdin is None or sys.stdin.closed:
         raise DriveFault("the bench", NOBODY)
     if not select.select([sys.stdin], (), (), 0.0)[0]:

@@ -262,7 +262,6 @@ def _refuse_refuted_loops(config: MachineConfig, axes: Iterable[str], source: st
 
 
 def _covariances(reference: Trajectory, past: Past) -> dict[str, Float]:
-    """Return the newest published covariance of each axis; zeros for an axis without one (it stands still)."""
     import numpy as np
 
     known = {axis: found[-1].set.covariance for axis, found in past.revisions.items() if found}
@@ -338,7 +337,6 @@ def _show_prediction(
 
 
 def _driver(per_axis: Mapping[str, Mapping[str, float]]) -> str:
-    """Name the parameter that drives a zone's error."""
     rise, axis, name = max(
         ((rise, axis, name) for axis, values in per_axis.items() for name, rise in values.items()),
         key=lambda item: abs(item[0]),

@@ -107,7 +107,6 @@ def _load(path: Path, machine: MachineConfig) -> Trajectory:
 
 
 def _panel_descriptor() -> int | None:
-    """Return the descriptor of standard input, None when the process was started without one."""
     try:
         return sys.stdin.fileno()
     except (AttributeError, OSError, ValueError):
@@ -115,12 +114,10 @@ def _panel_descriptor() -> int | None:
 
 
 def _tell_json(event: dict[str, Any]) -> None:
-    """Write an event as one line of JSON."""
     click.echo(json.dumps(event))
 
 
 def _tell(event: dict[str, Any]) -> None:
-    """Write an event for people."""
     click.echo("\n".join(_lines(event)))
 
 

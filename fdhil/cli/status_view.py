@@ -139,7 +139,6 @@ def nc_line(nc: Mapping[str, Any]) -> str:
 
 
 def _ago(seconds: float) -> str:
-    """Return an age as a person says it."""
     if seconds < 120:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
@@ -164,7 +163,6 @@ def counted(counters: Mapping[str, Any]) -> str:
 
 
 def _unused(axis: Mapping[str, Any]) -> str:
-    """Say which moves of an axis were not used, and why."""
     moves = axis.get("moves") or {}
     reasons = [f"{count} refused: {code}" for code, count in axis.get("refused_by", {}).items()]
     if moves.get("too_slow"):

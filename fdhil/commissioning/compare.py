@@ -42,7 +42,6 @@ def compare_record(record: CommissioningRecord, found: Survey) -> Finding:
 
 
 def _difference(record: CommissioningRecord, found: Survey) -> str:
-    """Name the first thing that differs."""
     if record.serial != found.identity.serial:
         return f"its serial number is {found.identity.serial}, not {record.serial}"
     if record.mapping_fingerprint != found.fingerprint:

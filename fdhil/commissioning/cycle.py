@@ -217,7 +217,6 @@ class Cycle:
         self._offsets_before, self.offsets_heard = self.offsets_heard, set()
 
     def _send_set_points(self) -> None:
-        """Send what the next SYNC latches."""
         path = self.path
         if path is not None:
             targets = path.step([member.position for member in self.members])

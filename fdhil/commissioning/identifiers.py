@@ -123,7 +123,6 @@ def _in_use(config: MachineConfig, own: str) -> Iterator[_Use]:
 
 
 def _nodes_heard(config: MachineConfig, own: str, heard: Collection[int]) -> Iterator[_Use]:
-    """Yield the predefined identifiers of nodes that were heard and are not configured."""
     bus = config.axis[own].drive.bus
     names = [name for name, axis in config.axis.items() if axis.drive.bus == bus]
     nodes = {config.node_id(name) for name in names} | {config.guard.node_id}

@@ -91,7 +91,6 @@ def _speed(jog: Recording) -> Finding:
 
 
 def _table(jog: Recording) -> Iterator[Finding]:
-    """Compare the way of the table with the motor's, where an encoder of its own tells it."""
     if jog.table_mm is None:
         return
     known = np.isfinite(jog.table_mm) & np.isfinite(jog.position_mm)

@@ -131,5 +131,4 @@ class DemandRecorder:
 
 
 def _runs(rows: Int) -> list[Int]:
-    """Cut ascending numbers where one is missing."""
     return [run for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if run.size]

@@ -118,7 +118,6 @@ class MeterVoltage:
         return f"{await self._volts():.2f} V at {1e9 / self._grid.period_ns:g} Hz"
 
     async def _ask(self, ticks: TickClock) -> _Value:
-        """Wait for the next instant and ask."""
         number, due_ns = self._grid.next_instant(time.monotonic_ns(), ticks)
         while (left_s := (due_ns - time.monotonic_ns()) / 1e9) > 0:
             await asyncio.sleep(min(left_s, NEAR_S))

@@ -261,7 +261,6 @@ async def _put_aside(cursor: psycopg.AsyncCursor, aside: Aside) -> None:
 
 
 async def _next(reader: JetStreamContext.PullSubscription) -> tuple[list[Msg], list[Received]]:
-    """Return the messages that come next, and what is in them."""
     messages, received = await _fetch(reader), list[Received]()
     try:
         for message in messages:

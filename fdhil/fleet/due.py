@@ -63,7 +63,6 @@ def due(db: Db) -> list[dict[str, Any]]:
 
 
 def _forecasts(db: Db, axes: Sequence[Axis], shares: Mapping[str, Mapping[str, float]]) -> dict[Axis, Limits]:
-    """Return the limits that each axis will reach."""
     first = {(row["machine"], row["axis"]): row for row in db.execute(_FIRST, asked(axes))}
     found: dict[Axis, Limits] = {key: {} for key in axes}
     for key, rows in newest_sets(db, NEWEST_SETS, axes, APART).items():

@@ -247,7 +247,6 @@ def _check_numbers(line: bytes) -> None:
 
 
 def _check(value: Any, depth: int) -> None:
-    """Refuse what PostgreSQL's jsonb does not take."""
     if depth == 0:
         raise BadMessage(f"it is nested deeper than {MOST_DEPTH}")
     if isinstance(value, dict):

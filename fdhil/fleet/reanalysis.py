@@ -86,7 +86,6 @@ async def _bring_up(fleet: Fleet) -> None:
 
 
 def _revision(db: Db, method: Method) -> int:
-    """Return the number of a method's revision, a new one where there is none."""
     told = (method.digest, Jsonb(method.document()))
     db.execute("INSERT INTO fleet.reanalyses (digest, method) VALUES (%s, %s) ON CONFLICT DO NOTHING", told)
     return _one(db, "SELECT revision FROM fleet.reanalyses WHERE digest = %s", (method.digest,))

@@ -76,7 +76,6 @@ class Crew(Generic[Item, Result]):
             return [self.lost(task[0])]
 
     def _ended(self, running: Iterable[Future[Sequence[Result]]]) -> set[Future[Sequence[Result]]]:
-        """Return the futures that have ended, one at least."""
         while not (ended := wait(running, TEND_S, FIRST_COMPLETED).done):
             if self.tend is not None:
                 self.tend()

@@ -147,7 +147,6 @@ async def _publish(stream: JetStreamContext, message: Message) -> None:
 
 
 def _about(config: MachineConfig, settings: Uplink) -> dict[str, Any]:
-    """Return what this machine is, for those that compare it with others."""
     return {
         "name": config.machine.name,
         "axes": list(config.axis),

@@ -122,7 +122,6 @@ def _result(window: Stored, method: Method) -> dict[str, Any]:
 
 
 def _of_machine(config: MachineConfig, asked: Identification) -> Identification:
-    """Return a machine's own settings, with the method that was asked for."""
     return config.identification.model_copy(update={"method": asked.method} if asked.method else {})
 
 
@@ -139,7 +138,6 @@ def _content(name: str, folder: Path) -> bytes:
 
 
 def _document(outcome: WindowOutcome) -> dict[str, Any]:
-    """Return an outcome as the history of a machine has its row."""
     estimate, verdict = outcome.estimate, outcome.verdict
     return {
         "accepted": verdict.accepted,

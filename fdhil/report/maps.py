@@ -223,7 +223,6 @@ def _extent(path_mm: Float) -> str:
 
 
 def _way(axes: Axes, path_mm: Float) -> None:
-    """Mark where the path starts, and which way it goes."""
     axes.plot(*path_mm[0], "o", ms=8, mfc="white", mec=INK, mew=1.3, zorder=6)
     axes.annotate("start", path_mm[0], xytext=(7, -9), textcoords="offset points", fontsize=8, color=INK, zorder=6)
     for share in (np.arange(ARROWS) + 0.5) / ARROWS:
@@ -245,7 +244,6 @@ def _arrow(axes: Axes, path_mm: Float, share: float) -> None:
 
 
 def _mark(axes: Axes, places: Sequence[Place]) -> None:
-    """Write the names of places beside them, each in a box."""
     box: dict[str, Any] = {"boxstyle": "round,pad=0.25", "fc": "white", "ec": COLOURS[1], "lw": 0.9}
     line: dict[str, Any] = {"arrowstyle": "-", "color": COLOURS[1], "lw": 0.9, "shrinkA": 0, "shrinkB": 0}
     for place in places:

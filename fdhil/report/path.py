@@ -79,7 +79,6 @@ def _with(parameters: str) -> str:
 
 
 def _um(value: float) -> str:
-    """Three digits, and no exponent."""
     if value < 0.001:
         return "below 0.001 um"
     return f"{value:.3g} um" if value < 999.5 else f"{value:.0f} um"

@@ -110,7 +110,6 @@ def _add(families: dict[str, Metric], value: Value) -> None:
 
 
 def _infos(news: News) -> Iterator[Metric]:
-    """Yield what runs: the configuration and fdhil's version, and what is armed."""
     told: dict[str, dict[str, str]] = {"fdhil": {"version": VERSION}}
     for value in news.values:
         if value.item.name in TEXTS and value.value:

@@ -183,7 +183,6 @@ class Session:
             self._untold += 1
 
     def _waited(self) -> None:
-        """Say how many notices made room, now that none waits any more."""
         if self._untold:
             journal.write_line(f"{self._untold} notices were not told one by one: the broker was too slow", "minor")
         self._untold = 0

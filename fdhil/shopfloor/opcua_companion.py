@@ -77,7 +77,6 @@ class Companion:
 
 
 async def _variables(top: Node) -> AsyncIterator[Node]:
-    """Yield every variable below a node."""
     for child in await top.get_children():
         if await child.read_node_class() is ua.NodeClass.Variable:
             yield child

@@ -50,7 +50,6 @@ class Nodes:
         await self._lay_out()
 
     async def _companions(self) -> None:
-        """Make what the companion specification has a place for: messages, and what is known of the rest."""
         at = self.machine_tool
         notification = await self.machine.get_child(f"{at}:Notification")
         self.messages = await notification.add_object(
@@ -60,7 +59,6 @@ class Nodes:
         await self._companion.build(self._config.publish.opcua)
 
     async def _lay_out(self) -> None:
-        """Make a folder of fdhil's own with all that is published."""
         top = await self._folder(self.machine, "fdhil", "fdhil")
         places: dict[str, Node] = {"": top}
         for name in (*self._config.axis, *buses(self._config)):

@@ -190,7 +190,6 @@ def _is_new(metric: Metric, told: Metric) -> bool:
 
 
 def _fields(metric: Metric) -> dict[str, Any]:
-    """Return the fields of a metric in a certificate: its name, data type, unit and description."""
     pairs = [(UNIT, metric.unit), (DESCRIPTION, metric.description)]
     properties = [(key, text) for key, text in pairs if text]
     told = {
@@ -225,7 +224,6 @@ def _payload(now_ms: int, seq: int | None, metrics: Iterable[Mapping[str, Any]])
 
 @cache
 def _classes() -> Mapping[str, Any]:
-    """Return protobuf's class of each message, made of ``_FIELDS``."""
     file = descriptor_pb2.FileDescriptorProto(name="sparkplug_b", package="fdhil.sparkplug", syntax="proto2")
     for name, fields in _FIELDS.items():
         file.message_type.add(name=name).field.extend(_described(fields))

@@ -165,7 +165,6 @@ def _frames_of(unit: AxisUnit, entry: FaultEntry) -> FrameFault:
 
 
 def _ids_of(node_id: int) -> frozenset[int]:
-    """The identifiers of a node by CiA 301: EMCY, PDOs, SDO and heartbeat."""
     return frozenset((*range(0x80 + node_id, 0x680, 0x80), 0x700 + node_id))
 
 

@@ -216,7 +216,6 @@ class Machine:
         return frames
 
     def _advance(self, unit: AxisUnit, data: bytes) -> list[Frame]:
-        """One SYNC for one axis."""
         drive = unit.drive
         before = drive.tick
         table_rad_s = drive.physics.table_speed_rad_s

@@ -83,7 +83,6 @@ class OperatorCommands:
         self._machine.faults.add(fault_script.parse(command, tuple(self._machine.units)))
 
     def _units(self, command: dict[str, Any], *, required: bool = False) -> list[AxisUnit]:
-        """The axis that a command names, or all."""
         units, axis = self._machine.units, command.get("axis")
         if axis is None and not required:
             return list(units.values())

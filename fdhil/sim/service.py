@@ -180,7 +180,6 @@ class SimService:
             self._leave(bus, answers)
 
     def _leave(self, bus: str, frames: Sequence[Frame]) -> None:
-        """Send what the bus' faults make of frames."""
         wire = self.machine.wires[bus]
         if not wire.idle:
             now_s = time.monotonic()
@@ -188,7 +187,6 @@ class SimService:
         self._buses[bus].send(frames)
 
     def _let_go(self, now_s: float) -> None:
-        """Let pass on what the faults of the buses held back until now."""
         for name, wire in self.machine.wires.items():
             if wire.idle:
                 continue
@@ -281,7 +279,6 @@ class SimService:
             self.close()
 
     def _turn(self) -> None:
-        """One turn of the loop: wait, read, let time pass, send."""
         buses = self._buses.values()
         readers: list[int | Selectable] = [self._pipe]
         if self._panel_fd is not None and not (self._stream is not None and self._stream.full):
@@ -412,7 +409,6 @@ class SimService:
             obeyed.set_result(self._obey(line))
 
     def _obey(self, line: str) -> str:
-        """Obey a command, or take a row of the stream; return what is wrong with it."""
         try:
             if self._stream is None or line.startswith("{"):
                 self._panel.obey(line)

@@ -284,7 +284,6 @@ def _time(raw: RecordingTable, rate_hz: float | None, rows: int, source: str) ->
 
 
 def _check_rising(time_s: Float, source: str) -> None:
-    """Refuse times that do not rise from sample to sample."""
     steps = np.diff(time_s)
     if (steps > 0).all():
         return

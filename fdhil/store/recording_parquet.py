@@ -50,7 +50,6 @@ def decode(content: bytes, source: str) -> RecordingTable:
 
 
 def _units(field: pa.Field) -> list[str]:
-    """Return the unit in a field's metadata."""
     said = (field.metadata or {}).items()
     return [value.decode(errors="replace") for key, value in said if key.decode(errors="replace").lower() in UNIT_KEYS]
 

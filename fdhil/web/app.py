@@ -87,8 +87,6 @@ def page_routers() -> Iterator[APIRouter]:
 
 
 def _serve_shell(app: FastAPI, document: str, paths: Iterable[str]) -> None:
-    """Serve the one document of all pages, its scripts, and the carried uPlot."""
-
     async def shell() -> Response:
         return HTMLResponse(document)
 

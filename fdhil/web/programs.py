@@ -58,7 +58,6 @@ def look_at(folder: Path | None, name: str) -> Program:
 
 
 def _opened(folder: Path, name: str) -> BufferedReader:
-    """Open a regular file of the folder itself. Refused."""
     try:
         return open_named(folder, name)
     except StoreError as error:

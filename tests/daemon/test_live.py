@@ -172,7 +172,7 @@ async def test_viewers_are_few_and_who_leaves_makes_room(tmp_path: Path) -> None
 
 
 def test_nobody_looks_nothing_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fdhil.daemon.live._line", lambda told: pytest.fail("a line was made for nobody"))
+    monkeypatch.setattr("fdhil.daemon.live.encode_line", lambda told: pytest.fail("a line was made for nobody"))
     LiveStream(config_of(tmp_path)).take(block([1, 2, 3]))
 
 

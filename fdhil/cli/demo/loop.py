@@ -203,7 +203,6 @@ def _analysed(stage: Stage) -> dict[str, int]:
 
 
 def _settled(stage: Stage, before: Mapping[str, int]) -> bool:
-    """Whether every rapid of the shuttle has been analysed on every axis."""
     return all(now >= before[axis] + RAPIDS for axis, now in _analysed(stage).items())
 
 

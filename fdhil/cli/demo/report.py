@@ -292,7 +292,6 @@ def _corrected(loop: Loop) -> Section:
 
 
 def _maps(cuts: Sequence[Cut]) -> list[tuple[str, str]]:
-    """Return a map of each pass, all with one scale of colours."""
     largest, least = figures.common_scale([cut.contour_um for cut in cuts])
     places = [figures.Place(name, *at) for name, at in POINTS.items()]
     return [

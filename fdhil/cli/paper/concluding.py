@@ -89,7 +89,6 @@ def _on_line() -> Claim:
 
 
 def _all_at_once(found: Sequence[Claim]) -> Claim:
-    """Count what each scenario shows of all that the paper saw on its path."""
     saw = [claim for claim in found if claim.key in SEEN]
     assert len(saw) == len(SEEN)
     trials = [

@@ -134,7 +134,6 @@ def turns(values: Float, least: float) -> int:
 
 
 def _three(scenario: str, view: View, program: str = paths.SLOW) -> str:
-    """Draw a place with the desired path, the one without and the one with the mirror, and their errors."""
     before, after = paths.predicted(scenario, program), paths.corrected(scenario, "mirror", program)
     return drawings.place(
         [

@@ -263,7 +263,6 @@ def _no_load() -> Claim:
 
 
 def _stages(told: Estimating, runs: int) -> Claim:
-    """Compare what parts of a rapid tell of [6] with what acceleration and cruise together do."""
     spread = {
         part: np.array([_mechanical(bench.noisy(told.recording, 0.001, seed), part) for seed in range(runs)])
         for part in ("both", "acceleration", "cruise")

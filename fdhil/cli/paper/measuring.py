@@ -66,7 +66,6 @@ def claims() -> list[Claim]:
 
 @cache
 def _outcome(noise: float, trouble: Trouble = Trouble()) -> WindowOutcome:  # noqa: B008 - frozen
-    """Analyse the last of two rapids, as the daemon would."""
     config = machine()
     recording = bench.rapid(bench.plant(), trouble=trouble, strokes=2)
     window = bench.noisy(recording, noise, 0)[-1]

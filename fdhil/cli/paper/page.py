@@ -74,7 +74,6 @@ def _section(claim: Claim) -> Section:
 
 
 def _trials(claim: Claim) -> Table:
-    """Return a row a scenario, a column each thing that is measured, its bounds in the head."""
     columns = list(dict.fromkeys((trial.what, trial.unit, trial.bounds) for trial in claim.trials))
     cells = {(trial.scenario, trial.what): cell(trial) for trial in claim.trials}
     head = ["scenario", *(f"{what}{f', {unit}' * bool(unit)} ({bounds})" for what, unit, bounds in columns)]
@@ -108,7 +107,6 @@ def _scenarios(claims: Sequence[Claim]) -> Section:
 
 
 def _once(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the changes with those of all axes told once."""
     return {key.replace("axis.X.", "axis.*."): value for key, value in changes.items() if not key.startswith("axis.Y.")}
 
 

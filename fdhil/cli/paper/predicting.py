@@ -46,7 +46,6 @@ def claims() -> list[Claim]:
 
 
 def _structure() -> Claim:
-    """Put the model's closed loop beside the twin's physics: two programs for the same equations."""
     trials = []
     for name in CASCADES:
         missed = np.abs(paths.measured_mm(name) - paths.path_mm(paths.predicted(name))).max()

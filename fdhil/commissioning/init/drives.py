@@ -70,7 +70,6 @@ def find_drives(name: str, settings: CanBus, descriptions: Sequence[Description]
 
 
 def _asked(bus: BusScanner, node_id: int, said: Answers, descriptions: Sequence[Description]) -> Iterator[FoundDrive]:
-    """Yield the axes of a node that is a drive; nothing for any other node."""
     best = best_description(said.identity, descriptions)
     eds = best[0].path if best else None
     profile = suggested(said, eds, partial(_number, bus, node_id, 1))

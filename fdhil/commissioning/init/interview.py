@@ -144,7 +144,6 @@ def _settle_drive(draft: Draft, axis: str, found: Found) -> FoundDrive | None:
 
 
 def _taken(draft: Draft, axis: str) -> set[tuple[str, int, int]]:
-    """Return the drives that the other axes have, or are answered to have."""
     named = {path.split(".")[1] for path in draft.values if path.startswith("axis.") and path.endswith(".node_id")}
     return {_place(draft, other) for other in named - {axis}}
 

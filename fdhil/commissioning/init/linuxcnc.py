@@ -110,7 +110,6 @@ def machine_of(ini: Ini, hal: Hal, path: Path) -> Machine:
 
 
 def _travel(ini: Ini, joints: Mapping[str, int], unit_mm: float) -> Iterator[str]:
-    """Say how far the axes may go: commissioning asks for room, and no key of the configuration holds it."""
     ways = []
     for letter, joint in joints.items():
         places = (f"AXIS_{letter}", f"JOINT_{joint}")
@@ -132,7 +131,6 @@ def _unit_mm(ini: Ini, path: Path) -> float:
 
 
 def _joints(ini: Ini, notes: list[str]) -> dict[str, int]:
-    """Return the joint of each linear axis."""
     kinematics = ini.text("KINS", "KINEMATICS").split()
     told = next((word[12:] for word in kinematics if word.lower().startswith("coordinates=")), "")
     named = "".join(ini.text("TRAJ", "COORDINATES").upper().split())

@@ -149,7 +149,6 @@ def parse_hal(text: str, ini: Ini, read: Read, hal: Hal, depth: int = 0) -> None
 
 
 def _instances(name: str, arguments: Sequence[str]) -> Iterator[str]:
-    """Yield the names of the components that a ``loadrt`` (or Machinekit's ``newinst``) makes."""
     for argument in arguments:
         key, equals, value = argument.replace('"', "").partition("=")
         if key == "names" or not equals:

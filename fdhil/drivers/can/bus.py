@@ -48,7 +48,6 @@ class CanBus:
         self._thread.start()
 
     def _open(self, settings: config.CanBus, filters: Sequence[Filter]) -> Port:
-        """Open the port that ``[bus.NAME]`` asks for; ConnectError with cause and next action."""
         return open_port(self.name, settings, filters)
 
     def _make_ring(self, frames: int) -> FrameRing:

@@ -190,7 +190,6 @@ class SyncGrid:
         return counted
 
     def _collisions(self, stamps: Int) -> tuple[Notice, ...]:
-        """Say once when two nodes send SYNC."""
         self._producers.stamped(stamps)
         was, self._collision = self._collision, self._producers.two
         if not self._collision or was:

@@ -89,7 +89,6 @@ def read(path: Path, skipped: Counter[str]) -> Iterator[LoggedFrame]:
 
 
 def _frame(line: str, columns: Sequence[str], head: _Head) -> LoggedFrame | None:
-    """Return the frame of a row, None where it is another row."""
     words = line.split()
     row = dict(zip(columns, words, strict=False))
     t_ns = (head.start_ns or 0) + int(Decimal(row["O"]) * 1_000_000)

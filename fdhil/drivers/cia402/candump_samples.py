@@ -34,7 +34,6 @@ def samples_of_log(log: bytes, config: MachineConfig) -> dict[str, AxisSamples]:
 
 
 def _frames(log: bytes) -> dict[str, Frames]:
-    """Return the frames of each bus, in their order."""
     if len(log) > LARGEST_LOG:
         raise RecordingError(f"the log has more than {LARGEST_LOG >> 20} MiB, nothing of it is read; cut it")
     rows: dict[str, list[tuple[int, int, bytes]]] = {}

@@ -153,7 +153,6 @@ class Cia402Decoder:
         self._syncs = self._syncs[np.searchsorted(self._syncs, row) :]
 
     def _heard(self, first: int, stop: int) -> Bool:
-        """Which SYNCs of ticks [first, stop) were received."""
         mine = self._syncs[self._syncs.searchsorted(first) : self._syncs.searchsorted(stop)]
         heard = np.zeros(stop - first, np.bool_)
         heard[mine - first] = True
@@ -327,7 +326,6 @@ class Cia402Decoder:
             self._tell("PdoMapping", "minor", text)
 
     def _tell(self, code: str, severity: Literal["minor", "MAJOR"], text: str) -> None:
-        """Say a thing once."""
         if code not in self._told:
             self._told.add(code)
             self._notices.append(Notice(code, severity, text, self.axis))

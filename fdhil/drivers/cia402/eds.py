@@ -154,7 +154,6 @@ def _sections(raw: bytes, name: str) -> list[_Section]:
 
 
 def _title(found: str) -> str:
-    """Return the name of a section as the library has it."""
     if match := _OBJECT.match(found):
         return match[1].upper() + (f"sub{int(match[2], 16):X}" if match[2] else "")
     return "DeviceComissioning" if _COMMISSIONING.match(found) else found

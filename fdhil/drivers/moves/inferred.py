@@ -54,7 +54,6 @@ class InferredG0:
         return events
 
     def _piece(self, moving: bool, fast: bool, begin: int, end: int) -> list[MoveEvent]:
-        """A piece of uniform kind from ``begin`` to ``end`` (ticks)."""
         if not moving:
             return self._rest(begin, end)
         self._still_since = None

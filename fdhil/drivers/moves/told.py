@@ -94,7 +94,6 @@ class ToldG0:
                 self._alignment.told(state, bounds[0])
 
     def _is_new_count(self, state: NcState) -> bool:
-        """Whether the NC has begun to count anew since it was last heard."""
         last = self._said[-1].state.nc_tick if self._said else None
         return last is not None and state.nc_tick is not None and state.nc_tick < last
 
@@ -112,7 +111,6 @@ class ToldG0:
         return (last is not None and last.low > stretch.end) or newest - stretch.end > self._patience
 
     def _tell(self, stretch: Stretch) -> Iterator[MoveEvent]:
-        """Say what kind of move a stretch was."""
         said = self._about(stretch)
         pieces = list(self._pieces(stretch, said))
         for (begin, kind), (end, _) in pairwise([*pieces, (stretch.end, MoveKind.REST)]):

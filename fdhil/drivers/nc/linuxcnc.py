@@ -80,7 +80,6 @@ class LinuxCnc:
         return states
 
     async def _next(self) -> Mapping[str, Any]:
-        """Return what the next line says."""
         while not self._waiting:
             await self._receive()
         line = self._waiting.popleft()
@@ -109,7 +108,6 @@ class LinuxCnc:
         self._period_s = period_s
 
     def _state(self, told: Mapping[str, Any]) -> NcState:
-        """Return the state that one line tells; ProtocolError."""
         try:
             stamp_ns, error_ns = _whole(told["stamp_ns"]), _whole(told["error_ns"])
             if self._distant is not None:

@@ -80,7 +80,6 @@ class OpcUa:
                     await client.disconnect()
 
     async def _find(self, client: Client) -> Mapping[str, ua.NodeId]:
-        """Return the nodes of the profile's signals; ProtocolError with what is not there."""
         signals = self._profile.signals
         found = await find_nodes(client, {name: signal.at for name, signal in signals.items()})
         values = await client.uaclient.read_attributes(list(found.values()), ua.AttributeIds.Value)

@@ -19,7 +19,6 @@ _CLASS_BITS = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08}
 
 
 def _register_bits(code: int) -> int:
-    """Bits of the error register 0x1001 for an error code."""
     if code & 0xFF00 in (0x8100, 0x8200):
         return _GENERIC | _COMMUNICATION
     if code & 0xFF00 == 0x8600:

@@ -107,7 +107,6 @@ class Feedback:
         return demand - true_position
 
     def _show(self, current_a: float, voltage_v: float, bus_v: float) -> None:
-        """Let the vendor's own objects show what is measured."""
         signals = {
             "current_a": current_a,
             "current_share": current_a * self._counts_per_a * 1e-3,

@@ -271,7 +271,6 @@ class Motion:
         return self._profile.command()
 
     def _enter_profile(self, actual: Actual) -> None:
-        """Start the profile where another source ends."""
         if self.source is Source.OFF:
             self._profile.start(actual.position, 0.0)
         elif self.source is Source.CYCLIC and self._loops_before is Loops.POSITION:

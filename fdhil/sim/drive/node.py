@@ -92,7 +92,6 @@ class CanopenNode(ABC):
 
     @property
     def _mute(self) -> bool:
-        """Without supply, or not yet booted."""
         return self.nmt in (OFF, INITIALISING)
 
     def _is_pre_operational(self) -> bool:
@@ -132,7 +131,6 @@ class CanopenNode(ABC):
         return [(0x700 + self.node_id, b"\0")]
 
     def _take_node_id(self) -> None:
-        """Take over the node-ID that LSS has given."""
         new, old = self._lss.pending, self.node_id
         if new == old:
             return
@@ -144,7 +142,6 @@ class CanopenNode(ABC):
         self._sync_id = self.dictionary.number(0x1005) & 0x7FF
 
     def _watch_connections(self) -> None:
-        """Report the heartbeats, guards and RPDOs that have just been missed."""
         if not self.faults.no_heartbeat_consumer:
             for node in self._consumer.expired(self._now_s):
                 self._connection_lost(HEARTBEAT_LOST, bytes([node]))

@@ -289,7 +289,6 @@ class PdoEngine:
                     self._dictionary.check[mapping + n << 8 | sub] = self._check_mapping
 
     def _places(self, index: int) -> int:
-        """How many objects a mapping parameter has room for."""
         entries = self._dictionary.entries
         return next(sub for sub in range(1, 256) if index << 8 | sub not in entries) - 1
 

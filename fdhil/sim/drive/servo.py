@@ -179,7 +179,6 @@ class Drive(CanopenNode):
         return self._clock.leads and not self._cycle.stands
 
     def _move_alone(self, now_s: float, alone: bool) -> None:
-        """Run the cycles that no SYNC has begun."""
         if not alone:
             self._clock.stop()
             return

@@ -225,7 +225,6 @@ class NcController:
         return frames
 
     def _start(self) -> list[BusFrame]:
-        """Start the drives by the PDOs that they have."""
         for link in self._links:
             link.wiring = self._wiring(link.axis)
             if link.wiring.missing:
@@ -329,7 +328,6 @@ class NcController:
         return frames
 
     def _advance(self) -> Row:
-        """Go one cycle on along the path."""
         held = self._hold or self._stopping or self.phase is Phase.FAULTED
         rate = self._rate.step(0.0 if held else self.override)
         if self._stopping and rate == 0.0:
@@ -374,7 +372,6 @@ class NcController:
             return
 
     def _report(self, before: Row | None, now: Row | None) -> None:
-        """Tell when the first and the last row of a file come into force."""
         was, is_ = before is not None and before.playing, now is not None and now.playing
         if is_:
             self._played += 1

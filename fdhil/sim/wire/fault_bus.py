@@ -59,7 +59,6 @@ class FaultBus(can.BusABC):
                 return None, False
 
     def _settle(self, now_s: float) -> None:
-        """Let go on what was held back until now, on either way."""
         with self._lock:
             self._ready.extend(map(_message, self.faults.due("received", now_s)))
             late = self.faults.due("sent", now_s)
@@ -84,7 +83,6 @@ def _frame(message: can.Message) -> Frame:
 
 
 def _message(passed: Passed) -> can.Message:
-    """Return the message that was given, or one like it with what was changed."""
     (can_id, data), origin = passed
     message: can.Message | None = origin
     if message is not None and _frame(message) == (can_id, data):

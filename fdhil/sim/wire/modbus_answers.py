@@ -78,7 +78,6 @@ def _torn(unit: int, body: bytes, before: bytes) -> tuple[int, bytes]:
 
 
 def _too_many(unit: int, body: bytes, _before: bytes) -> tuple[int, bytes]:
-    """One register more than was asked for."""
     return (unit, bytes([body[0], body[1] + 2]) + body[2:] + b"\0\1") if body[0] in _READS else (unit, body)
 
 

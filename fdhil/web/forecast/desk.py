@@ -171,7 +171,6 @@ class Desk:
         return self._folder
 
     def _forget(self) -> None:
-        """Drop the oldest that are over."""
         for digest, job in list(self._jobs.items()):
             if len(self._jobs) > KEPT and job.over:
                 del self._jobs[digest]
@@ -217,8 +216,6 @@ class Desk:
             work.state = "cancelled"
 
     async def _compute(self, job: Job, work: Work) -> None:
-        """Have a process compute, and take what it reports until it ends."""
-
         def take(told: Mapping[str, Any]) -> None:
             if "progress" in told:
                 work.progress = told["progress"]

@@ -72,7 +72,6 @@ def _fitting(forecast: Forecast, inside: Bool, size_mm: float) -> float:
 
 
 def _flat(forecast: Forecast, plane: tuple[int, int]) -> Float:
-    """Return the path (n, 2) in a plane; where one axis is alone, along it."""
     flat = np.asarray(forecast.path_mm[:, list(plane)], dtype=np.float64)
     if plane[0] == plane[1]:
         flat[:, 1] = 0.0

@@ -31,7 +31,6 @@ Columns = Annotated[int, Query(ge=10, le=4000)]
 
 
 def _feed_of(app: FastAPI) -> LiveFeed:
-    """Return the one feed of this process."""
     if not hasattr(app.state, "live"):
         config = app.state.context.config
         app.state.live = LiveFeed(config.run_directory / SOCKET_NAME, config.axis, config.machine.sync_period_s)
@@ -49,7 +48,6 @@ Feed = Annotated[LiveFeed, Depends(_feed)]
 
 @asynccontextmanager
 async def _reading(app: FastAPI) -> AsyncIterator[None]:
-    """Read the daemon's stream, for as long as the application lives, whenever somebody looks on."""
     task = asyncio.create_task(_feed_of(app).run(), name="live feed")
     try:
         yield
@@ -194,7 +192,6 @@ async def _tell(socket: WebSocket, view: View, feed: LiveFeed, drawn: asyncio.Ev
 
 
 async def _login_ends(socket: WebSocket, here: Here) -> str:
-    """Wait until the login by which the socket was opened has ended."""
     token = token_of(socket.headers)
     while True:
         await asyncio.sleep(LOGIN_S)
