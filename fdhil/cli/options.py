@@ -14,8 +14,8 @@ FILE = click.Path(path_type=Path, readable=False)
 FOLDER = click.Path(path_type=Path, readable=False, file_okay=False)
 CONFIG = click.argument("config", type=FILE)
 FLEET = click.argument("fleet", type=FILE)
-AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
-LINES = click.option("--json", "as_json", is_flag=True, help="Write each line of the log as a JSON object to stdout.")
+AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout.")
+LINES = click.option("--json", "as_json", is_flag=True, help="Write each log line as a JSON object to stdout.")
 COLUMNS = click.option(
     "--columns",
     type=FILE,

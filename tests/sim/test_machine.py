@@ -215,6 +215,7 @@ def test_the_panel_sets_parameters_and_temperature() -> None:
     ("line", "complaint"),
     [
         ("nonsense", "no JSON"),
+        ("[" * 60_000, "no JSON"),
         ("[1]", "no command None"),
         ('{"command": ["nc"]}', "no command"),
         ('{"command": "dance"}', "'dance'; it has nc, play"),
