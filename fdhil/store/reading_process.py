@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from fdhil import errors
+from fdhil.bounded_process import limit_process
 from fdhil.errors import FdhilError, RecordingError
 from fdhil.store.recording_table import RecordingTable, unreadable
 
@@ -159,8 +160,7 @@ def _end() -> None:
 
 def main() -> None:
     """Fork for one file after another, and tell how each fork ended, until nobody asks any more."""
-    with contextlib.suppress(OSError, ValueError):  # a sandbox may forbid it
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    limit_process(0, {})
     asked = socket.socket(fileno=int(sys.argv[1]))
     asked.send(b"0")
     with contextlib.suppress(OSError):
