@@ -32,7 +32,7 @@ class Standing:
     @property
     def nothing(self) -> bool:
         """Whether it is known that no offset is applied; what is unknown is not nothing."""
-        return not self.heard or (bool(self.offset_um) and not self.fed and not any(map(_stands, self._values())))
+        return not self.heard or (bool(self.offset_um) and not self.fed and not any(um != 0.0 for um in self._values()))
 
     @property
     def known(self) -> bool:
@@ -54,10 +54,6 @@ class Standing:
         if self.fed:
             parts.append(f"speed and torque offsets on axis {', '.join(self.fed)}")
         return (" and ".join(parts) or "an unknown offset") + " may still be applied"
-
-
-def _stands(offset_um: float | None) -> bool:
-    return offset_um is None or offset_um != 0.0
 
 
 def standing(status: Mapping[str, Any]) -> Standing:

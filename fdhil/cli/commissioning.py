@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
@@ -15,6 +14,7 @@ import click
 from fdhil import config as machine_config
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import AS_JSON, CONFIG, FILE
+from fdhil.cli.terminal_text import print_progress
 from fdhil.errors import DeviceError
 from fdhil.guard.protocol import SOCKET_NAME
 
@@ -51,7 +51,7 @@ def scan(config: Path, places: tuple[Path, ...], as_json: bool) -> None:
     descriptions = _descriptions(places, config.parent)
     scans = []
     for name in machine.bus:
-        _progress(f"listening on bus {name}, then asking the nodes")
+        print_progress(f"listening on bus {name}, then asking the nodes")
         scans.append(scan_bus(name, machine, descriptions))
     if as_json:
         click.echo(json.dumps({"schema": "fdhil-scan-1", "buses": [asdict(found) for found in scans]}))
@@ -67,13 +67,8 @@ def _descriptions(places: Sequence[Path], folder: Path) -> list[Description]:
     if faults and places:
         raise faults[0]
     for fault in faults:
-        _progress(f"not used: {fault}")
+        print_progress(f"not used: {fault}")
     return found
-
-
-def _progress(text: str) -> None:
-    if sys.stderr.isatty():
-        click.echo(text, err=True)
 
 
 def _show_scans(scans: Sequence[BusScan]) -> None:
@@ -130,7 +125,7 @@ def check(config: Path, as_json: bool) -> int:
 
     marks = {axis: void_mark(machine.store.directory, axis) for axis in machine.axis}
     with _guard(machine) as tell:
-        found = check_machine(machine, _progress)
+        found = check_machine(machine, print_progress)
         _tell_compared(machine, found, tell, marks)
     differ = sum(finding.ok is False for _, finding in found)
     if as_json:

@@ -1,6 +1,5 @@
 """``fdhil fleet``: what a works does with its history: services, what is let go of, what is given away, the page."""
 
-import sys
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -9,6 +8,7 @@ import click
 
 from fdhil.cli.fleet import with_extra
 from fdhil.cli.options import AS_JSON, FILE, FLEET
+from fdhil.cli.terminal_text import print_progress
 from fdhil.config.fleet import load
 
 
@@ -74,7 +74,7 @@ def retain(fleet: Path, as_json: bool) -> None:
     with with_extra():
         from fdhil.fleet import retention, sets
     with sets.entered(settings) as db:
-        told = retention.retain(db, settings, datetime.now(UTC), _progress)
+        told = retention.retain(db, settings, datetime.now(UTC), print_progress)
     fleet_view.tell(told, "retain", as_json, fleet_view.retain)
 
 
@@ -100,14 +100,9 @@ def export(fleet: Path, folder: Path, labels: tuple[str, ...], key: Path | None,
         from fdhil.fleet import sets
     with sets.asking(settings) as db:
         told = given_away.export(
-            db, folder, given_away.key_of(key or fleet.parent / "anonymous.key"), labels, _progress
+            db, folder, given_away.key_of(key or fleet.parent / "anonymous.key"), labels, print_progress
         )
     fleet_view.tell(told, "export", as_json, fleet_view.export)
-
-
-def _progress(text: str) -> None:
-    if sys.stderr.isatty():
-        click.echo(text, err=True)
 
 
 @click.command()

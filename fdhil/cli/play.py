@@ -19,6 +19,7 @@ from fdhil.cli.audited import audited
 from fdhil.cli.consent import agreed, listen_again
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import AS_JSON, FILE
+from fdhil.cli.terminal_text import print_progress
 from fdhil.errors import DeviceError, DriveFault
 from fdhil.guard.protocol import SOCKET_NAME
 
@@ -91,7 +92,7 @@ def _play(machine: MachineConfig, plan: Plan, program: Path, go_to_start: bool, 
         for name in dict.fromkeys(axis.drive.bus for axis in machine.axis.values()):
             held.enter_context(lock_place(machine.bus[name], "set-points"))
         held.enter_context(before_other_work())
-        bench = held.enter_context(on_bench(plan, _say, GuardPresence(machine.guard_directory).is_there))
+        bench = held.enter_context(on_bench(plan, print_progress, GuardPresence(machine.guard_directory).is_there))
         bench.compare(records)
         here = bench.here()
         bench.require_start(here, go_to_start)
@@ -162,11 +163,6 @@ def _guard_told(
         answer = guard.compared(token, {axis: records[axis].fingerprint for axis in as_compared()}, touched)
     time.sleep(MARKED_S)
     return list(answer.get("refused", []))
-
-
-def _say(text: str) -> None:
-    if sys.stderr.isatty():
-        click.echo(text, err=True)
 
 
 @contextmanager

@@ -1,6 +1,9 @@
-"""Makes text from outside harmless for a terminal: names of machines, programs, files and devices."""
+"""Text on a terminal: names of machines, programs, files and devices made harmless, and how far a command is."""
 
+import sys
 import unicodedata
+
+import click
 
 _LAYOUT = "\n\t"
 _REPLACEMENT = "\N{REPLACEMENT CHARACTER}"
@@ -19,3 +22,9 @@ def without_controls(text: str) -> str:
 
 def _steers(letter: str) -> bool:
     return letter not in _LAYOUT and unicodedata.category(letter) in ("Cc", "Cf", "Zl", "Zp", "Cs")
+
+
+def print_progress(text: str) -> None:
+    """Print how far a command is to stderr when that is a terminal."""
+    if sys.stderr.isatty():
+        click.echo(text, err=True)

@@ -206,7 +206,7 @@ def _record(machine: str, head: re.Match[bytes], line: bytes, window: bytes, pay
         _check(_read(line), MOST_DEPTH)
     digits = line.translate(_ONLY_DIGITS)
     if b"e+000" in digits or b"e000" in digits or MANY_DIGITS in digits:  # a number that no float holds looks like this
-        _check_numbers(line)
+        _NUMBERS.decode(line.decode())
     if fault := shapes.fault(kind, record):
         raise BadMessage(fault)
     recorded_at = datetime.fromtimestamp(float(recorded_s), UTC)
@@ -240,10 +240,6 @@ def _bounded(number: str) -> float:
 _IS_SOMETHING = re.compile(r"-?[0.]*[1-9]")
 _DECODER = json.JSONDecoder(parse_constant=_no_number)
 _NUMBERS = json.JSONDecoder(parse_constant=_no_number, parse_float=_bounded, parse_int=_bounded)
-
-
-def _check_numbers(line: bytes) -> None:
-    _NUMBERS.decode(line.decode())
 
 
 def _check(value: Any, depth: int) -> None:

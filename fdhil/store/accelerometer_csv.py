@@ -69,17 +69,13 @@ def _placed(wanted: Float, told: Float, dt: float) -> tuple[float, float]:
     both = [zero_phase(values - values.mean(), CORNER_HZ, dt) for values in (wanted, told)]
     size = quick_size(wanted.size + told.size)
     product = np.fft.irfft(np.fft.rfft(both[0], size) * np.conj(np.fft.rfft(both[1], size)), size)
-    power = float(np.sqrt((both[0] @ both[0]) * _overlap(both[1])))
+    power = float(np.sqrt((both[0] @ both[0]) * (both[1] @ both[1])))
     k = int(np.argmax(np.abs(product)))
     side = np.array([product[(k + step) % size] for step in (-1, 0, 1)])
     curve = side[0] - 2 * side[1] + side[2]
     shift = k + (0.5 * (side[0] - side[2]) / curve if curve else 0.0)
     shift -= size if k > wanted.size else 0
     return float(product[k] / power) if power else 0.0, float(shift * dt)
-
-
-def _overlap(values: Float) -> float:
-    return float(values @ values)
 
 
 def _at(rows_s: Float, time_s: Float, values: Float) -> Float:

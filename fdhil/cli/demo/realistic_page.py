@@ -51,7 +51,8 @@ def effect_rows(realistic: Realistic) -> list[list[str]]:
 
 def verdict_rows(realistic: Realistic) -> list[list[str]]:
     """Return one row per axis: rapids believed, whether a model was published, why the other rapids were not."""
-    return [[axis, f"{told.believed} of {told.rapids}", _model(told), _why(told)]
+    return [[axis, f"{told.believed} of {told.rapids}", _model(told),
+             ", ".join(f"{count} x {code}" for code, count in told.reasons.items())]
             for axis, told in realistic.verdicts.items()]  # fmt: skip
 
 
@@ -60,10 +61,6 @@ def _model(told: AxisVerdict) -> str:
         return "none published"
     terms = ", ".join(name for name, _ in told.published.parameters.terms if not name.endswith(SHAPES))
     return f"the six and {terms}" if terms else "the six"
-
-
-def _why(told: AxisVerdict) -> str:
-    return ", ".join(f"{count} x {code}" for code, count in told.reasons.items())
 
 
 def parameter_rows(realistic: Realistic) -> list[list[str]]:

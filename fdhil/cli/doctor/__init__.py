@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -15,6 +14,7 @@ from fdhil import config as machine_config
 from fdhil.cli.doctor.trouble import Trouble
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import AS_JSON, CONFIG
+from fdhil.cli.terminal_text import print_progress
 from fdhil.daemon.clock import newest_record_s
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def _in_order(config: MachineConfig, offline: bool) -> Iterator[Trouble]:
     if not offline:
         heard = {name for name, troubles in buses.items() if not any(trouble.grave for trouble in troubles)}
         recorded = {trouble.place for trouble in secrets if trouble.code == storage.RECORD_BAD}
-        yield from devices.examine_devices(config, heard, recorded, _progress)
+        yield from devices.examine_devices(config, heard, recorded, print_progress)
     yield from _seen("guard", lambda: devices.examine_guard(config))
     yield from _seen("uplink", lambda: uplink.examine_uplink(config, offline))
     yield from _seen("offers", lambda: offers.examine_offers(config))
@@ -77,11 +77,6 @@ def _seen(place: str, examine: Callable[[], Iterator[Trouble]]) -> Iterator[Trou
         what = f"{error.filename or place} may not be looked at by this user"
         means = f"what may be wrong with the {place} is not known"
         yield Trouble("NotSeen", place, what, means, "run fdhil doctor as the user of the daemon, or with sudo")
-
-
-def _progress(text: str) -> None:
-    if sys.stderr.isatty():
-        click.echo(text, err=True)
 
 
 def _show(found: list[Trouble]) -> None:

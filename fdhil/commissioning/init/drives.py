@@ -111,11 +111,7 @@ def suggested(said: Answers, eds: Path | None, read: Read) -> str | None:
     own = {name: profile for name, profile in profiles.items() if profile.vendor_id == who.vendor_id}
     if len(own) < 2:
         return next(iter(own), None)
-    return min(own, key=lambda name: sum(read(*key) is None for key in _mapped(own[name])))
-
-
-def _mapped(profile: DriveProfile) -> list[tuple[int, int]]:
-    return [(entry.index, entry.sub) for spec in profile.tpdos for entry in spec.entries]
+    return min(own, key=lambda name: sum(read(e.index, e.sub) is None for s in own[name].tpdos for e in s.entries))
 
 
 def told_by(read: Read, profile: DriveProfile | None) -> Iterator[tuple[str, Told]]:

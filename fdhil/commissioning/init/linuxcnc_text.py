@@ -131,7 +131,8 @@ class Hal:
 def parse_hal(text: str, ini: Ini, read: Read, hal: Hal, depth: int = 0) -> None:
     """Add the commands of a HAL file, and of those that it sources, to ``hal``; unknown commands are left out."""
     for line in _joined(text):
-        words = _substituted(line, ini).split()
+        # what is not in the INI stays as it is written
+        words = _SUBSTITUTE.sub(lambda found: ini.text(found[1], found[2]) or found[0], line).split()
         words = words[: next((k for k, word in enumerate(words) if word.startswith("#")), len(words))]
         match words:
             case ["setp", pin, value, *_]:
@@ -157,8 +158,3 @@ def _instances(name: str, arguments: Sequence[str]) -> Iterator[str]:
             yield from (f"{_PIDS[name]}.{number}" for number in range(min(int(value), _MOST_LOOPS)))
     if not arguments:
         yield from (f"{_PIDS[name]}.{number}" for number in range(_DEFAULT_LOOPS))
-
-
-def _substituted(line: str, ini: Ini) -> str:
-    """Put the INI's values in place of ``[SECTION]KEY``; one that is not there stays as it is."""
-    return _SUBSTITUTE.sub(lambda found: ini.text(found[1], found[2]) or found[0], line)

@@ -30,7 +30,7 @@ def suggest_rpdos(device: Device, target: ObjectKey, offset: ObjectKey, fed: Seq
         place = places.pop(0)
         spec = _fixed(device, place, "RPDO", COB_RPDO) if place.fixed else _spec(place, "RPDO", COB_RPDO, whole)
         if spec is not None:
-            found.append(spec if keys is not groups[2] else _not_exchanged(spec))
+            found.append(spec if keys is not groups[2] else replace(spec, valid=False))
     return found
 
 
@@ -78,10 +78,6 @@ def _sent(device: Device, key: ObjectKey) -> bool:
 def _heard(device: Device, key: ObjectKey) -> bool:
     found = device.find(key)
     return found is not None and (found.in_tpdo or found.perhaps_in_tpdo)
-
-
-def _not_exchanged(spec: PdoSpec) -> PdoSpec:
-    return replace(spec, valid=False)
 
 
 def _spec(place: PdoPlace, kind: str, bases: Sequence[int], entries: Sequence[Entry], every: int = 1) -> PdoSpec:

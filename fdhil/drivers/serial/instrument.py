@@ -7,7 +7,7 @@ from typing import Protocol
 from fdhil.config import MachineConfig
 from fdhil.config.sensors import SerialPlace
 from fdhil.drivers.meter import MeterVoltage
-from fdhil.drivers.serial.lines import LineReader, TextLine
+from fdhil.drivers.serial.lines import LineReader
 from fdhil.drivers.serial.port import SerialPort
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
 
@@ -80,7 +80,7 @@ class TextMeter:
             what = f"{self._text.query.strip()!r} was not answered" if self._text.query else "no line came"
             text = f"{what} within {self._wait_s:g} s; check the instrument, the baud rate and the line's end"
             raise DeviceTimeout(self.name, text)
-        self.answered_ns = self._begun_ns(line)
+        self.answered_ns = line.t_ns - self.link.port.wire_ns(len(line.text) + 1)
         self.asked_ns = min(asked_ns or self.answered_ns, self.answered_ns)
         return self._number_in(line.text)
 
@@ -89,9 +89,6 @@ class TextMeter:
         query = self._text.query.encode()
         self._lines.discard()
         return self.link.port.send(self.name, query) + self.link.port.wire_ns(len(query))
-
-    def _begun_ns(self, line: TextLine) -> int:
-        return line.t_ns - self.link.port.wire_ns(len(line.text) + 1)
 
     def _number_in(self, line: str) -> float:
         self._line = line
