@@ -1,0 +1,24 @@
+"""A child for the tests of bounded processes: reports its request, then ends, hangs, or breaks off as it is asked."""
+
+import os
+import sys
+import time
+
+from fdhil.bounded_process import limit_process, receive_request, report
+
+
+def main() -> None:
+    """Answer the one request."""
+    limit_process(0, {})
+    request = receive_request()
+    report({"request": request, "pid": os.getpid()})
+    if request["then"] == "hang":
+        time.sleep(1000)
+    elif request["then"] == "break off":
+        sys.stdout.write('{"cut": ')
+        sys.stdout.flush()
+        sys.exit(3)
+
+
+if __name__ == "__main__":
+    main()
