@@ -31,9 +31,9 @@ class BoundedProcess:
         self._killed = False
 
     @property
-    def running(self) -> bool:
-        """Whether it was started and has not ended."""
-        return self._process is not None and self._process.returncode is None
+    def pid(self) -> int | None:
+        """Its process ID while it runs, else None."""
+        return None if self._process is None or self._process.returncode is not None else self._process.pid
 
     async def run(self, request: Mapping[str, Any], take: Take) -> int:
         """Send a request, hand over each object that is reported, and return the exit code. OSError."""
@@ -71,9 +71,9 @@ class BoundedProcess:
     def kill(self) -> None:
         """End it at once, also one that is only about to start."""
         self._killed = True
-        if self._process is not None and self._process.returncode is None:
+        if self.pid is not None:
             with contextlib.suppress(ProcessLookupError):
-                os.kill(self._process.pid, signal.SIGKILL)  # asyncio's own kill() may take the exit code from who waits
+                os.kill(self.pid, signal.SIGKILL)  # asyncio's own kill() may take the exit code from who waits
 
     async def end(self) -> int:
         """Kill it and return its exit code, 0 where it never ran."""

@@ -66,4 +66,4 @@ async def test_error_in_what_takes_the_documents_ends_the_process() -> None:
 
     with pytest.raises(LookupError):
         await process.run({"then": "hang"}, refuse)
-    assert not process.running
+    assert process.pid is None

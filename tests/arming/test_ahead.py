@@ -109,7 +109,7 @@ class Shop:
         """The check's process."""
         going = self.desk._check._going
         assert going is not None
-        assert going._process is not None
+        assert going._process.pid is not None
         return going._process.pid
 
     @property

@@ -57,6 +57,12 @@ def session(app: FastAPI) -> Iterator[Any]:
         yield client
 
 
+@pytest.fixture(scope="module")
+def replaying(app: FastAPI, session: Any) -> None:
+    """Have the process that replays, and the thread that waits for its end, run before the first test."""
+    session.get("http://localhost/api/rapids/X/1/signals", headers=own(app, "operator"))
+
+
 def own(app: FastAPI, name: str) -> dict[str, str]:
     """Return the headers of a page of ours, and of a login."""
     return {**OWN, **({"Authorization": f"Bearer {token_for(app, name)}"} if name else {})}
@@ -68,7 +74,7 @@ def test_every_kind_of_page_is_described() -> None:
     )
 
 
-@pytest.mark.usefixtures("processes")
+@pytest.mark.usefixtures("processes", "replaying")
 @pytest.mark.parametrize("label", OPERATIONS)
 def test_whatever_is_sent_is_answered_as_described(label: str, app: FastAPI, session: Any) -> None:
     name = "" if label.startswith("POST /api/session") else "operator"  # a login that is guessed costs its scrypt
