@@ -8,11 +8,14 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import ipaddress
+import itertools
 import logging
+import math
 import secrets
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,8 +31,6 @@ LONGEST_WAIT_S = 300.0
 FORGET_S = 3600.0
 MOST_GUESSERS = 4096
 MOST_PLACES = 1024
-WAITING_LOGINS = 4
-"""Logins that may wait for their check; each takes a tenth of a second and 32 MiB, one at a time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,29 +52,31 @@ class Session:
 
 
 class Guesses:
-    """Counts wrong passwords by who is guessed and from where; each one beyond five doubles the wait."""
+    """Counts wrong passwords by user and by address; each one beyond five doubles the wait."""
 
     def __init__(self, now_s: Callable[[], float]) -> None:
         self._now_s = now_s
         self._wrong: OrderedDict[str, tuple[int, float]] = OrderedDict()
 
-    def wait_s(self, *keys: str) -> float:
-        """Return for how long none of these may try again; 0 when they may."""
-        return max((self._wait_of(key) for key in keys), default=0.0)
+    def wait_s(self, key: str) -> float:
+        """Return how long it is until the next guess is allowed; 0 when it is."""
+        wait_s = min(LONGEST_WAIT_S, 2.0 ** min(60, self.count(key) - FREE_GUESSES))
+        return max(0.0, self._last_s(key) + wait_s - self._now_s()) if self.count(key) >= FREE_GUESSES else 0.0
 
-    def _wait_of(self, key: str) -> float:
-        count, at_s = self._wrong.get(key, (0, 0.0))
-        if count < FREE_GUESSES:
-            return 0.0
-        wait_s = min(LONGEST_WAIT_S, 2.0 ** (count - FREE_GUESSES))
-        return max(0.0, at_s + wait_s - self._now_s())
+    def count(self, key: str) -> int:
+        """Return how many passwords were wrong in the last hour."""
+        return self._wrong[key][0] if self._now_s() - self._last_s(key) < FORGET_S else 0
+
+    def _last_s(self, key: str) -> float:
+        return self._wrong.get(key, (0, -math.inf))[1]
 
     def wrong(self, *keys: str) -> None:
         """Note a wrong password."""
         now_s = self._now_s()
         for key in keys:
-            count, at_s = self._wrong.pop(key, (0, now_s))
-            self._wrong[key] = (count + 1 if now_s - at_s < FORGET_S else 1, now_s)
+            count = self.count(key) + 1
+            self._wrong.pop(key, None)
+            self._wrong[key] = (count, now_s)
             while len(self._wrong) > MOST_GUESSERS:
                 self._wrong.popitem(last=False)
 
@@ -81,6 +84,38 @@ class Guesses:
         """Forget what was wrong before."""
         for key in keys:
             self._wrong.pop(key, None)
+
+
+class Turns:
+    """Has one password checked at a time, which takes a tenth of a second and 32 MiB.
+
+    First those from where the fewest were wrong; no more wait than there may be connections.
+    """
+
+    def __init__(self) -> None:
+        self._line: dict[tuple[int, int], asyncio.Event] = {}  # by wrong passwords and arrival
+        self._arrivals = itertools.count()
+        self._checked: tuple[int, int] | None = None
+
+    @asynccontextmanager
+    async def turn(self, wrong: int) -> AsyncIterator[None]:
+        """Wait for a turn after ``wrong`` wrong passwords."""
+        own = wrong, next(self._arrivals)
+        self._line[own] = turn = asyncio.Event()
+        self._begin_next()
+        try:
+            await turn.wait()
+            yield
+        finally:
+            del self._line[own]
+            if self._checked == own:
+                self._checked = None
+            self._begin_next()
+
+    def _begin_next(self) -> None:
+        if self._checked is None and self._line:
+            self._checked = min(self._line)
+            self._line[self._checked].set()
 
 
 class Access:
@@ -94,8 +129,7 @@ class Access:
         self._guesses = Guesses(now_s)
         # where who has logged in: guesses elsewhere do not lock him out there
         self._places: OrderedDict[tuple[str, str], None] = OrderedDict()
-        self._checking = asyncio.Semaphore(1)
-        self._waiting = 0
+        self._turns = Turns()
         self._read: tuple[tuple[int, ...], Mapping[str, User]] = ((), {})
         if users_file:
             self._users(users_file)
@@ -125,20 +159,21 @@ class Access:
             return None
 
     async def log_in(self, name: str, password: str, address: str) -> tuple[str, Session]:
-        """Return a new token and its session; Refused when name or password is wrong, or too many were."""
+        """Return a new token and its session; Refused when name or password is wrong, or too many were.
+
+        Where no password was wrong before one is checked, and first: guessing elsewhere locks nobody out.
+        """
         place = place_of(address)
-        keys = (f"user {name[:64]} {place if (name, place) in self._places else ''}", f"address {place}")
-        wait_s = self._guesses.wait_s(*keys)
-        if wait_s > 0 or self._waiting >= WAITING_LOGINS:
-            text = "too many logins failed or are being checked; nothing was looked at"
+        of_place = f"address {place}"
+        keys = (f"user {name[:64]} {place if (name, place) in self._places else ''}", of_place)
+        wrong = self._guesses.count(of_place)
+        wait_s = max(map(self._guesses.wait_s, keys)) if wrong or (name, place) in self._places else 0.0
+        if wait_s > 0:
+            text = "too many logins failed; nothing was looked at"
             raise Refused(429, "TooMany", text, f"try again in {max(1.0, wait_s):.0f} s")
-        self._waiting += 1
-        try:
-            async with self._checking:
-                user = await asyncio.to_thread(self._user, name)
-                fits = await asyncio.to_thread(matches, user, password[: LONGEST_PASSWORD + 1])
-        finally:
-            self._waiting -= 1
+        async with self._turns.turn(wrong):
+            user = await asyncio.to_thread(self._user, name)
+            fits = await asyncio.to_thread(matches, user, password[: LONGEST_PASSWORD + 1])
         if user is None or not fits:
             self._guesses.wrong(*keys)
             raise Refused(401, "AuthRequired", "name or password is wrong", "check both; fdhil web-user sets a new one")

@@ -17,10 +17,11 @@ from anyio import to_thread
 
 from fdhil.arming.token import ensure_token
 from fdhil.config import MachineConfig
+from fdhil.config.users import Role, write_users
 from fdhil.web.app import make_app
 from tests.daemon.machine import Machine
 from tests.daemon.test_service import serving
-from tests.web.clients import OWN, client_of, daemon_that, machine_of
+from tests.web.clients import OWN, client_of, daemon_that, machine_of, user
 
 PROGRAM = b"G21 G90\nG1 X10 F1000\nM2\n"
 DIGEST = hashlib.sha256(PROGRAM).hexdigest()
@@ -171,6 +172,29 @@ async def test_who_goes_away_while_a_program_is_checked_has_nothing_armed(config
     async with daemon_that(config, checking, abandoned.set), client_of(app, "operator") as client:
         await _posting(app, client, await confirmed(client), gone)
         await abandoned.wait()
+
+
+@pytest.mark.usefixtures("real_time")
+@pytest.mark.parametrize("left", [{}, {"operator": "watch"}])
+async def test_a_user_who_is_removed_while_a_program_is_checked_has_nothing_armed(
+    config: MachineConfig, tmp_path: Path, left: dict[str, Role]
+) -> None:
+    ensure_token(_made(config))
+    abandoned = asyncio.Event()
+
+    async def checking(request: Mapping[str, Any]) -> Mapping[str, Any]:
+        if request["request"] == "arm":
+            write_users(tmp_path / "users.json", {name: user(role) for name, role in left.items()})
+            await abandoned.wait()
+        return granting(request)
+
+    async with (
+        daemon_that(config, checking, abandoned.set),
+        client_of(make_app(config), "operator", **OWN) as client,
+    ):
+        answer = await client.post("/api/machine/arm", json=await confirmed(client))
+        await abandoned.wait()
+    assert (answer.status_code, answer.json()["code"]) == (401, "AuthRequired")
 
 
 async def _posting(app: Any, client: httpx.AsyncClient, document: dict[str, Any], gone: asyncio.Event) -> None:

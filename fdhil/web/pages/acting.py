@@ -16,6 +16,7 @@ from fdhil.arming.token import TOKEN_NAME, given_credential, read_token
 from fdhil.config import MachineConfig
 from fdhil.web.answers import Refused, granted
 from fdhil.web.context import Asking, Context, Here
+from fdhil.web.gate import token_of
 from fdhil.web.programs import NAME, Program, listed, look_at
 
 router = APIRouter(prefix="/api/machine")
@@ -150,12 +151,16 @@ async def arm(arming: Arming, request: Request, here: Here, asking: Asking) -> D
 
 
 async def _while_there(request: Request, here: Context, asked: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Ask the daemon as long as the browser waits for it; by its progress the daemon notices that nobody does."""
+    """Ask the daemon as long as the browser waits and its user may arm; else the daemon abandons the check."""
     asking = asyncio.ensure_future(here.daemon.ask(asked, ARM_S, progress=lambda _: None))
     try:
         while not (await asyncio.wait([asking], timeout=LOOK_S))[0]:
             if await request.is_disconnected():
                 raise Refused(409, "Abandoned", "nobody waited for the answer, nothing is armed", "arm again")
+            asker = here.access.asker(token_of(request.headers))
+            if asker is None or asker.role != "operate":
+                text = "the login has ended, or the user lost the role operate: nothing is armed"
+                raise Refused(401, "AuthRequired", text, "log in again")
         return await asking
     finally:
         asking.cancel()
