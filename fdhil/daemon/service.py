@@ -302,6 +302,7 @@ class Service:
             self._resources = uses()
             self._tell([*watch.look(self._resources), *clock.look(time.time(), time.monotonic())])
             self._tell(await asyncio.to_thread(offers.look))
+            self._tell(await asyncio.to_thread(self._store.keep, ()))  # tells whether the history still stands there
             await asyncio.sleep(RESOURCES_S)
 
     # control ---------------------------------------------------------------------------------------------------
