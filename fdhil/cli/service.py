@@ -68,7 +68,10 @@ def _ask(
 @AS_JSON
 def status(config: Path, as_json: bool) -> None:
     """Ask the running daemon of CONFIG how it is: parameters, windows, frames, guard, notices."""
+    from fdhil.daemon.status import config_difference
+
     answer = _ask(config, {"request": "status"})
+    answer["config_difference"] = config_difference(answer, machine_config.load(config).digest)
     if as_json:
         click.echo(json.dumps(answer))
         return
@@ -108,6 +111,7 @@ def arm(config: Path, program: Path | None, method: str | None, whole: bool, as_
         "program": None if program is None else str(program.resolve()),
         "method": method,
         "whole": whole,
+        "config_digest": machine.digest,
         "token": read_token(machine.run_directory),
     }
     shown = _Shown(as_json)
@@ -260,6 +264,8 @@ def _adopted(guard: GuardClient, token: Callable[[], str], yes: bool, quiet: boo
 
 def _tell(answer: Mapping[str, Any], as_json: bool) -> None:
     """Show an answer; exit 1 when it is no, or as the answer says where something could not be read."""
+    if difference := answer.get("config_difference"):
+        click.echo(without_controls(difference), err=True)
     if as_json:
         click.echo(json.dumps(answer))
     elif answer["ok"]:

@@ -26,6 +26,8 @@ from tests.web.clients import OWN, client_of, daemon_that, machine_of, user
 PROGRAM = b"G21 G90\nG1 X10 F1000\nM2\n"
 DIGEST = hashlib.sha256(PROGRAM).hexdigest()
 ARMED = {"ok": True, "state": "ARMED", "text": "armed part.ngc", "program_digest": DIGEST}
+LIMITS = {"max_offset_um": 250.0, "max_speed_mm_s": 20.0, "max_acceleration_mm_s2": 2000.0, "max_torque_nm": None}
+RUNNING = {"config_digest": "another", "limits": {"X": {**LIMITS, "max_speed_rad_s": None}}}
 PLAN = "/api/machine/plan?program=part.ngc"
 
 
@@ -38,7 +40,11 @@ def config(tmp_path: Path) -> MachineConfig:
 
 def granting(request: Mapping[str, Any]) -> Mapping[str, Any]:
     """Answer as a daemon does to whom nothing is wrong."""
-    return ARMED if request["request"] == "arm" else {"ok": True, "state": "OFF", "text": "guard: OFF, offset 0"}
+    if request["request"] == "arm":
+        return ARMED
+    return {"ok": True, "state": "OFF", "text": "guard: OFF, offset 0"} | (
+        RUNNING if request["request"] == "status" else {}
+    )
 
 
 async def confirmed(client: httpx.AsyncClient) -> dict[str, Any]:
@@ -53,7 +59,8 @@ async def test_what_would_move_is_shown_and_that_is_armed_by_name(config: Machin
         choice = (await client.get("/api/machine/programs")).json()
         plan = (await client.get(PLAN)).json()
         assert [program["name"] for program in choice["programs"]] == ["part.ngc"]
-        assert plan["axes"]["X"]["max_offset_um"] == 250.0
+        assert plan["axes"]["X"]["max_offset_um"] == 250.0  # the daemon's, whatever the file says
+        assert "the daemon runs with another configuration than the file" in plan["difference"]
         assert plan["program"]["sha256"] == DIGEST
         assert "path" not in plan["program"]
         assert all(request["request"] == "status" for request in asked)  # showing does nothing
