@@ -57,10 +57,10 @@ def _ask(
     timeout_s: float = 10.0,
     progress: Callable[[Mapping[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
-    machine = machine_config.load(config)
+    load = machine_config.load_places if request["request"] == "disarm" else machine_config.load
     from fdhil.daemon.control import SOCKET_NAME, ask
 
-    return ask(machine.run_directory / SOCKET_NAME, request, timeout_s, progress)
+    return ask(load(config).run_directory / SOCKET_NAME, request, timeout_s, progress)
 
 
 @click.command()
@@ -188,7 +188,7 @@ def _user() -> str:
 
 def _disarm_at_the_guard(config: Path, silent: DeviceError) -> Mapping[str, Any]:
     """Ask the guard without the daemon; ``silent`` is why. ConnectError when neither answers."""
-    machine = machine_config.load(config)
+    machine = machine_config.load_places(config)
     from fdhil.arming.guard_client import GuardClient
     from fdhil.arming.standing import landed, verdict
 
@@ -215,7 +215,7 @@ def adopt(config: Path, yes: bool, as_json: bool) -> None:
     """
     if as_json and not yes:
         raise click.UsageError("--json cannot ask: give --yes too")
-    machine = machine_config.load(config)
+    machine = machine_config.load_places(config)
     from fdhil.arming.guard_client import GuardClient
     from fdhil.arming.token import read_token
 
@@ -236,7 +236,7 @@ def _written_after(config: Path, what: str, answer: Mapping[str, Any]) -> Iterat
     try:
         yield
     finally:
-        write_after(machine_config.load(config), what, answer)
+        write_after(machine_config.load_places(config), what, answer)
 
 
 def _adopted(guard: GuardClient, token: Callable[[], str], yes: bool, quiet: bool) -> Mapping[str, Any]:

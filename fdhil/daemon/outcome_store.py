@@ -286,6 +286,7 @@ class OutcomeStore:
 
     def _refused(self, error: StoreError) -> list[Notice]:
         again, self.fault = self.fault == error.code, error.code
+        self._windows = None  # its folder may be gone
         if again:
             return []
         return [Notice(error.code, "MAJOR", f"{error}; the daemon goes on in shadow and cannot be armed.")]

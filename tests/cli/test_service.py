@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -148,6 +149,22 @@ def test_a_refusal_exits_1_with_class_cause_and_next_action(machine: Path, tmp_p
     with answering(machine, answer):
         code, out, _ = fdhil("disarm", machine, "--json", capsys=capsys)
     assert (code, json.loads(out)) == (1, answer)
+
+
+@pytest.mark.parametrize("edited", ["[axis.X", "[axis.X]\nscrew_pitch_mm = 0\n", "\0", "[store]\nkeep_windows = 0"])
+def test_a_faulty_configuration_keeps_nobody_from_disarming(
+    edited: str, machine: Path, capsys: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    machine.write_text(edited)
+    with answering(machine, {"ok": True, "text": "guard: OFF, offset 0"}) as requests:
+        code, out, _ = fdhil("disarm", machine, capsys=capsys)
+    assert (code, out, requests) == (0, "guard: OFF, offset 0\n", [{"request": "disarm"}])
+    assert str(machine) in caplog.text
+    missing = fdhil("status", machine.with_name("none.toml"), capsys=capsys)[0]
+    assert fdhil("status", machine, capsys=capsys)[0] == 2
+    assert fdhil("disarm", machine.with_name("none.toml"), capsys=capsys)[0] == missing
+    shutil.rmtree(machine.parent / "fdhil-data")
+    assert fdhil("disarm", machine, capsys=capsys)[0] == 2
 
 
 @pytest.mark.usefixtures("processes")

@@ -285,6 +285,16 @@ def test_a_history_that_is_replaced_is_reported_and_what_follows_is_in_the_file_
         assert db.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
 
 
+def test_a_folder_of_windows_that_is_removed_is_made_again(tmp_path: Path) -> None:
+    store, _ = opened(tmp_path)
+    assert store.keep([outcome()]) == []
+    shutil.rmtree(tmp_path / "fdhil-data" / "windows")
+    said = [notice.code for _ in range(3) for notice in store.keep([outcome()])]
+    assert (said, store.fault) == (["StoreFault", "StoreRecovered"], None)
+    assert len(list_windows(tmp_path / "fdhil-data" / "windows").windows) == 2
+    store.close()
+
+
 def test_an_acknowledgement_names_notices_of_the_file_that_stands_there(tmp_path: Path) -> None:
     store, _ = opened(tmp_path)
     assert store.keep([Notice("A", "MAJOR", "of before")]) == []
