@@ -13,7 +13,7 @@ import logging
 import math
 import secrets
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -184,12 +184,13 @@ class Access:
         return self.begin(name, user)
 
     def begin(self, name: str, user: User) -> tuple[str, Session]:
-        """Return a new token of a user whose password was right; the oldest login makes room for it."""
+        """Return a new token of a user whose password was right; the oldest of who has the most makes room for it."""
         token, now_s = secrets.token_urlsafe(32), self._now_s()
         session = Session(Asker(name, user.role), user, now_s + LIFE_S, now_s + IDLE_S)
         self._sessions[_key(token)] = session
-        while len(self._sessions) > MOST_TOKENS:
-            self._sessions.popitem(last=False)
+        if len(self._sessions) > MOST_TOKENS:
+            count = Counter(each.asker.name for each in self._sessions.values())
+            del self._sessions[max(self._sessions, key=lambda key: count[self._sessions[key].asker.name])]
         return token, session
 
     def asker(self, token: str | None) -> Asker | None:

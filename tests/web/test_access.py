@@ -133,6 +133,13 @@ def test_tokens_are_kept_as_digests_and_only_so_many(access: Access) -> None:
     assert hashlib.sha256(tokens[-1].encode()).hexdigest() in kept
 
 
+def test_who_logs_in_again_and_again_ends_nobody_elses_login(access: Access) -> None:
+    token, _ = access.begin("op", user("operate"))
+    tokens = [access.begin("ann", user("watch"))[0] for _ in range(2 * MOST_TOKENS)]
+    assert access.asker(token) is not None
+    assert [access.asker(each) is not None for each in (tokens[0], tokens[-1])] == [False, True]
+
+
 async def test_guesses_are_slowed_down_by_user_and_by_address(
     access: Access, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
