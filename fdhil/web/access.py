@@ -9,18 +9,16 @@ import asyncio
 import hashlib
 import ipaddress
 import itertools
-import logging
 import math
 import secrets
 import time
 from collections import Counter, OrderedDict
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from fdhil.config.users import LONGEST_PASSWORD, Role, User, matches, read_users
-from fdhil.errors import ConfigError
+from fdhil.config.users import LONGEST_PASSWORD, Role, User, UsersFile, matches
 from fdhil.web.answers import Refused
 
 LIFE_S = 12 * 3600.0
@@ -123,40 +121,21 @@ class Access:
 
     def __init__(self, users_file: Path | None, now_s: Callable[[], float] = time.monotonic) -> None:
         """Read the users, so that a faulty file is told at the start; ConfigError."""
-        self._users_file = users_file
+        self._users_file = UsersFile(users_file) if users_file else None
         self._now_s = now_s
         self._sessions: OrderedDict[str, Session] = OrderedDict()
         self._guesses = Guesses(now_s)
         # where who has logged in: guesses elsewhere do not lock him out there
         self._places: OrderedDict[tuple[str, str], None] = OrderedDict()
         self._turns = Turns()
-        self._read: tuple[tuple[int, ...], Mapping[str, User]] = ((), {})
-        if users_file:
-            self._users(users_file)
 
     @property
     def by_login(self) -> bool:
         """Whether there are users at all; without, who reaches the address may read, and nobody may act."""
         return self._users_file is not None
 
-    def _users(self, path: Path) -> Mapping[str, User]:
-        """Return who may log in now; the file is read again when it is another one. ConfigError."""
-        try:
-            found = path.stat()
-            stamp: tuple[int, ...] = (found.st_ino, found.st_mtime_ns, found.st_size, found.st_mode)
-        except OSError:
-            stamp = ()
-        if not stamp or stamp != self._read[0]:
-            self._read = stamp, read_users(path)
-        return self._read[1]
-
     def _user(self, name: str) -> User | None:
-        """Return a user; None for one that there is not, or when the file cannot be read any more."""
-        try:
-            return self._users(self._users_file).get(name) if self._users_file else None
-        except ConfigError as error:
-            logging.getLogger("fdhil.web").error("nobody may log in: %s", error)
-            return None
+        return self._users_file.user(name) if self._users_file else None
 
     async def log_in(self, name: str, password: str, address: str) -> tuple[str, Session]:
         """Return a new token and its session; Refused when name or password is wrong, or too many were.

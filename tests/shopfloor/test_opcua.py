@@ -389,6 +389,34 @@ async def test_who_enters_is_known_by_certificate_and_password(
     assert addresses == {"127.0.0.1"}  # by which wrong passwords are counted
 
 
+@pytest.mark.usefixtures("long_computation")
+async def test_a_user_and_a_certificate_that_are_removed_may_read_nothing_more(tmp_path: Path) -> None:
+    trusted = tmp_path / "trusted"
+    trusted.mkdir()
+    for name in ("scada", "mes"):
+        certificate, _ = await certificates(tmp_path, name, f"urn:{name}")
+        (trusted / f"{name}.der").write_bytes(certificate.read_bytes())
+    async with guarded(tmp_path, trusted_clients=str(trusted)) as url:
+        client = Client(url, PATIENCE_S)
+        client.application_uri = "urn:scada"
+        await client.set_security(
+            SecurityPolicyBasic256Sha256, str(tmp_path / "scada.der"), str(tmp_path / "scada.pem")
+        )
+        client.set_user("scada")
+        client.set_password(PASSWORD)
+        async with client:
+            state = await own(client, "state")
+            assert (await told_of(state)).StatusCode.name == "Good"
+            write_users(tmp_path / "users.json", {})
+            assert await refused(told_of(state)) == BadUserAccessDenied.__name__
+        write_users(tmp_path / "users.json", {"scada": hashed(PASSWORD, "watch")})
+        assert await entered(url, tmp_path, "mes", "scada", PASSWORD) == "Good"
+        (trusted / "mes.der").unlink()
+        assert await refused(entered(url, tmp_path, "mes", "scada", PASSWORD)) != "let in"
+        (trusted / "scada.der").unlink()
+        assert await refused(entered(url, tmp_path, "scada", "scada", PASSWORD)) != "let in"
+
+
 @pytest.mark.parametrize(
     ("content", "words"), [(None, "cannot be read"), (b"nonsense", "cannot be used")], ids=["none", "nonsense"]
 )
