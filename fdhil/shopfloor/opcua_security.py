@@ -7,6 +7,7 @@ encrypted. No client can write, call more than ConditionRefresh, or add a node.
 from __future__ import annotations
 
 import time
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,8 @@ from fdhil.shopfloor.opcua_subscriptions import ReportedValues
 
 NAME = "OPC UA server"
 ANYONE = User(role=UserRole.Anonymous)
-MOST_CONNECTIONS = 16
+MOST_CONNECTIONS, MOST_AT_ONCE = 16, 64  # of which those beyond sixteen are being ended
+ACTIVATION_S = 10.0  # for a client to log in
 MOST_SUBSCRIPTIONS = 64
 MOST_FAILURES, FAILURES_S = 10, 60.0
 REFUSED = {
@@ -120,6 +122,23 @@ class Visit(InternalSession):
         return super().activate_session(*given)
 
 
+class Connections(list[Any]):
+    """The transports of all clients: for one too many goes the oldest of an address with two more, or else itself."""
+
+    def append(self, new: Any) -> None:
+        """Take a connection."""
+        super().append(new)
+        there = [each for each in self if not each.is_closing()]
+        if len(there) > MOST_CONNECTIONS:
+            count = Counter(map(_address, there))
+            greedy = [each for each in there if count[_address(each)] > count[_address(new)]]
+            (greedy or [new])[0].abort()
+
+
+def _address(transport: Any) -> str:
+    return str((transport.get_extra_info("peername") or ("",))[0])
+
+
 class ReadServer(InternalServer):
     """An address space that remembers no other servers: who is not let in could fill its memory with them."""
 
@@ -128,7 +147,8 @@ class ReadServer(InternalServer):
         super().__init__(user_manager=Doorkeeper(users))
         self.bind_condition_methods = True
         self.allow_remote_admin = False
-        self.max_connections = MOST_CONNECTIONS
+        self.max_connections, self.max_pending_activation_seconds = MOST_AT_ONCE, ACTIVATION_S
+        self.asyncio_transports = Connections()
         self.max_subscriptions = MOST_SUBSCRIPTIONS
         taken: Any = (ua.UserNameIdentityToken,) if users is not None else (ua.AnonymousIdentityToken,)
         self.supported_tokens = taken

@@ -74,7 +74,7 @@ def read_position(folder: Path) -> Position:
     except (OSError, ValueError, TypeError, RecursionError):
         return Position()
     kinds = all(isinstance(getattr(position, name), str) for name in ("store", "message", "about"))
-    return position if kinds and type(position.entry) is int else Position()
+    return position if kinds and type(position.entry) is int and 0 <= position.entry < 1 << 63 else Position()
 
 
 def write_position(folder: Path, position: Position) -> None:

@@ -159,14 +159,18 @@ def test_when_it_is_full_the_oldest_go_and_are_counted(tmp_path: Path) -> None:
     machine.close()
 
 
+@pytest.mark.usefixtures("often")
 @pytest.mark.parametrize(
-    "content", ["", "{", "[]", "{}", '{"entry": "7"}', '{"store": 1, "entry": 3}', '{"entry": 1e9}', "[" * 2000]
-)
+    "content",
+    ["", "{", "[]", "{}", '{"entry": "7"}', '{"store": 1, "entry": 3}', '{"entry": 1e9}', "[" * 2000,
+     '{"entry": -1}', '{"entry": 9223372036854775808}'],
+)  # fmt: skip
 def test_a_damaged_position_is_the_beginning(content: str, machine: Machine) -> None:
     machine.record(1)
     (folder_of(machine) / outbox.POSITION_FILE).write_text(content)
     with reading(machine) as reader:
         assert reader.start(read_position(folder_of(machine))).entry == 0
+    machine.record(2)  # which lets go what was sent
 
 
 def test_the_position_of_another_file_is_the_beginning(machine: Machine) -> None:

@@ -24,7 +24,7 @@ from fdhil.errors import ConnectError
 from fdhil.shopfloor.news import Listener
 from fdhil.shopfloor.opcua import Served, publish, serving
 from fdhil.shopfloor.opcua_nodes import OWN
-from fdhil.shopfloor.opcua_security import Doorkeeper
+from fdhil.shopfloor.opcua_security import MOST_CONNECTIONS, Doorkeeper
 from fdhil.shopfloor.opcua_subscriptions import is_news
 from fdhil.shopfloor.published import AXIS, BUS, MACHINE
 from tests.daemon.machine import Machine, config_of
@@ -323,6 +323,20 @@ async def test_nonsense_on_the_wire_ends_its_own_connection_alone(stage: Stage, 
             await reader.read()
         writer.close()
     assert await (await own(client, "state")).read_value() == "ACTIVE"
+
+
+async def test_connections_of_one_address_keep_no_other_out(stage: Stage) -> None:
+    held = [await asyncio.open_connection("127.0.0.1", stage.served.port) for _ in range(MOST_CONNECTIONS + 4)]
+    async with asyncio.timeout(PATIENCE_S):
+        for reader, _ in held[MOST_CONNECTIONS:]:
+            assert await reader.read() == b""
+        there = [
+            await asyncio.open_connection("127.0.0.1", stage.served.port, local_addr=("127.0.0.2", 0)) for _ in range(2)
+        ]
+        for reader, _ in held[:2]:
+            assert await reader.read() == b""  # they made room
+    for _, writer in (*held, *there):
+        writer.close()
 
 
 @asynccontextmanager
