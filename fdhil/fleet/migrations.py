@@ -19,6 +19,7 @@ from fdhil.errors import StoreError
 
 FIRST_YEAR, LAST_YEAR = 2020, 2099  # of the partitions: a wrong clock makes no others
 FIRST = datetime(FIRST_YEAR, 1, 1, tzinfo=UTC)  # what was recorded before has the time at which it came
+FUTURE = datetime(LAST_YEAR + 1, 1, 1, tzinfo=UTC)  # of what a clock far ahead has dated
 SHIFT_S = 21_600  # of which the newest set stands for all
 LOCK = 7_170_018  # of the advisory lock under which the schema changes
 _FIRST: LiteralString = """
