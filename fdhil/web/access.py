@@ -15,7 +15,7 @@ import time
 from collections import Counter, OrderedDict
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from fdhil.config.users import LONGEST_PASSWORD, Role, User, UsersFile, matches
@@ -84,36 +84,55 @@ class Guesses:
             self._wrong.pop(key, None)
 
 
+@dataclass(eq=False, slots=True)
+class Waiting:
+    """A login that waits for its check: the fewest wrong passwords first, of those the newest."""
+
+    order: tuple[int, int]
+    turn: asyncio.Event = field(default_factory=asyncio.Event)
+
+
 class Turns:
     """Has one password checked at a time, which takes a tenth of a second and 32 MiB.
 
-    First those from where the fewest were wrong; no more wait than there may be connections.
+    First those from where the fewest were wrong, of them the newest: a crowd of first guesses that waits already delays
+    nobody. Of an address the newest alone waits: the connection of an older one may have ended.
     """
 
     def __init__(self) -> None:
-        self._line: dict[tuple[int, int], asyncio.Event] = {}  # by wrong passwords and arrival
+        self._line: dict[str, Waiting] = {}
         self._arrivals = itertools.count()
-        self._checked: tuple[int, int] | None = None
+        self._checked: Waiting | None = None
 
     @asynccontextmanager
-    async def turn(self, wrong: int) -> AsyncIterator[None]:
-        """Wait for a turn after ``wrong`` wrong passwords."""
-        own = wrong, next(self._arrivals)
-        self._line[own] = turn = asyncio.Event()
+    async def turn(self, place: str, wrong: int) -> AsyncIterator[None]:
+        """Wait for a turn after ``wrong`` wrong passwords from a place; Refused where a newer login is from there."""
+        own, older = Waiting((wrong, -next(self._arrivals))), self._line.get(place)
+        if older is not None:
+            older.turn.set()  # which is refused, or checked already
+        self._line[place] = own
         self._begin_next()
         try:
-            await turn.wait()
+            await own.turn.wait()
+            if self._line.get(place) is not own:
+                raise _too_many(1.0)
             yield
         finally:
-            del self._line[own]
-            if self._checked == own:
+            if self._line.get(place) is own:
+                del self._line[place]
+            if self._checked is own:
                 self._checked = None
             self._begin_next()
 
     def _begin_next(self) -> None:
         if self._checked is None and self._line:
-            self._checked = min(self._line)
-            self._line[self._checked].set()
+            self._checked = min(self._line.values(), key=lambda each: each.order)
+            self._checked.turn.set()
+
+
+def _too_many(wait_s: float) -> Refused:
+    text = "too many logins failed or are being checked; nothing was looked at"
+    return Refused(429, "TooMany", text, f"try again in {max(1.0, wait_s):.0f} s")
 
 
 class Access:
@@ -148,9 +167,8 @@ class Access:
         wrong = self._guesses.count(of_place)
         wait_s = max(map(self._guesses.wait_s, keys)) if wrong or (name, place) in self._places else 0.0
         if wait_s > 0:
-            text = "too many logins failed; nothing was looked at"
-            raise Refused(429, "TooMany", text, f"try again in {max(1.0, wait_s):.0f} s")
-        async with self._turns.turn(wrong):
+            raise _too_many(wait_s)
+        async with self._turns.turn(place, wrong):
             user = await asyncio.to_thread(self._user, name)
             fits = await asyncio.to_thread(matches, user, password[: LONGEST_PASSWORD + 1])
         if user is None or not fits:

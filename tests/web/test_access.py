@@ -224,18 +224,20 @@ async def test_a_guess_from_each_of_many_addresses_locks_nobody_out(
 
 
 async def test_passwords_are_checked_in_order_of_wrong_ones_and_one_who_leaves_delays_nobody() -> None:
-    turns, order = Turns(), list[int]()
+    turns, order = Turns(), list[str]()
 
-    async def check(wrong: int) -> None:
-        async with turns.turn(wrong):
-            order.append(wrong)
+    async def check(place: str, wrong: int) -> None:
+        async with turns.turn(place, wrong):
+            order.append(f"{place} {wrong}")
             await asyncio.sleep(0)
 
-    tasks = [asyncio.create_task(check(wrong)) for wrong in (9, 5, 3, 4, 2)]
+    waiting = [("a", 9), ("f", 5), ("b", 5), ("c", 3), ("d", 4), ("e", 2), ("b", 5), ("a", 0)]
+    tasks = [asyncio.create_task(check(*each)) for each in waiting]
     await asyncio.sleep(0)
-    tasks[-1].cancel()
-    await asyncio.gather(*tasks, return_exceptions=True)
-    assert order == [9, 3, 4, 5]
+    tasks[5].cancel()
+    results = await asyncio.gather(*tasks, return_exceptions=True)
+    assert order == ["a 9", "a 0", "c 3", "d 4", "b 5", "f 5"]
+    assert [type(result) for result in results if result] == [Refused, asyncio.CancelledError]  # the older one of b
 
 
 async def test_one_computer_is_one_place_however_many_addresses_it_has(
