@@ -12,7 +12,7 @@ from typing import Any
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
-MOST_CONNECTIONS = 64
+MOST_CONNECTIONS = 256
 QUIET_S = 20.0
 """For so long, at most twice as long, no request need be whole, and nothing of an answer be read."""
 

@@ -36,6 +36,7 @@ FORGET = 0.02  # share by which a cycle that was late is forgotten in every look
 DEPTH = 8192
 SEEN_READY_S = 1.0  # until halcmd has seen that the bridge was ready: it would end LinuxCNC else
 MOST_WAITING = 1 << 20  # bytes that a listener may be behind
+MOST_LISTENERS = 32
 VALUES = (
     ("motion.motion-type", "s"),
     ("motion.program-line", "s"),
@@ -168,6 +169,8 @@ class Listeners:
             except OSError:  # nobody knocks
                 return
             listener.setblocking(False)
+            if len(self._waiting) >= MOST_LISTENERS:  # the one farthest behind makes room, or the oldest
+                self._let_go(max(self._waiting, key=lambda each: len(self._waiting[each])))
             self._waiting[listener] = bytearray(self._greeting)
 
     def _let_go(self, listener: socket.socket) -> None:

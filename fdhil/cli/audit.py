@@ -41,15 +41,15 @@ def audit(config: Path, last: int, as_json: bool) -> int:
 
 
 def _line(number: int, entry: Mapping[str, Any], wrong: str | None) -> str:
-    if wrong is not None:
+    if wrong is not None or not isinstance(entry.get("who"), dict):
         return f"{number:6d}  NOT AS WRITTEN  {json.dumps(entry)}"
     who = entry["who"]
     by = f" for {entry['by']}" if entry.get("by") else ""
     what = entry.get("asked") or entry.get("answered")
-    told = ", ".join(filter(None, (entry.get("result"), entry.get("text"))))
+    told = ", ".join(map(str, filter(None, (entry.get("result"), entry.get("text")))))
     result = f": {told}" if told else " (asked)"
     program = "".join(f" {entry[key]}" for key in ("axis", "program", "offer") if entry.get(key))
-    return f"{number:6d}  {entry['time']}  {who['user']}{by}  {what}{program}{result}"
+    return f"{number:6d}  {entry.get('time')}  {who.get('user')}{by}  {what}{program}{result}"
 
 
 def _verdict(path: Path, count: int, broken: list[int]) -> str:

@@ -28,12 +28,16 @@ def status(answer: Mapping[str, Any]) -> Iterator[str]:
         missing = f", {machine['missing']} RECORDS MISSING" if machine["missing"] else ""
         axes = ", ".join(f"{axis} revision {told['revision']}" for axis, told in machine["axes"].items())
         heard = f"last heard {machine['last_heard']}, {machine['records']} records"
-        yield f"{machine['machine']}: {axes or 'no parameters yet'}; {heard}{missing}{notices}"
+        yield f"{machine['machine']}: {axes or 'no parameters yet'}; {heard}{missing}{notices}{_doubt(machine)}"
     if not answer["machines"]:
         yield "no machine was heard yet"
     yield from map(_due, answer["due"])
     if answer["refused_messages"]:
         yield f"{answer['refused_messages']} messages were none of ours and are put aside in fleet.refused"
+
+
+def _doubt(told: Mapping[str, Any]) -> str:
+    return f"; NOT OF ONE MACHINE: {told['doubt']}; give each machine a name of its own" if told["doubt"] else ""
 
 
 def _due(each: Mapping[str, Any]) -> str:
@@ -82,7 +86,7 @@ def outliers(answer: Mapping[str, Any]) -> Iterator[str]:
         sisters = f"what {each['sisters']} sisters let expect (median {_number(each['median'])})"
         shared = each["off_by_its_other_axes"] / each["off"] > 0.5 if each["off"] else False
         where = "as its other axes are: look at the machine, its oil and its room" if shared else "look at this axis"
-        yield f"{each['machine']} axis {each['axis']}: {what} off {sisters}, {score}; {where}"
+        yield f"{each['machine']} axis {each['axis']}: {what} off {sisters}, {score}; {where}{_doubt(each)}"
     if not answer["outliers"]:
         yield "no axis is unlike its sisters"
 

@@ -55,10 +55,10 @@ def _ask(
     timeout_s: float = 10.0,
     progress: Callable[[Mapping[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
-    machine = machine_config.load(config)
+    load = machine_config.load_places if request["request"] == "disarm" else machine_config.load
     from fdhil.daemon.control import SOCKET_NAME, ask
 
-    return ask(machine.run_directory / SOCKET_NAME, request, timeout_s, progress)
+    return ask(load(config).run_directory / SOCKET_NAME, request, timeout_s, progress)
 
 
 @click.command()
@@ -66,7 +66,10 @@ def _ask(
 @AS_JSON
 def status(config: Path, as_json: bool) -> None:
     """Ask the running daemon of CONFIG how it is: parameters, windows, frames, guard, notices."""
+    from fdhil.daemon.status import config_difference
+
     answer = _ask(config, {"request": "status"})
+    answer["config_difference"] = config_difference(answer, machine_config.load(config).digest)
     if as_json:
         click.echo(json.dumps(answer))
         return
@@ -106,6 +109,7 @@ def arm(config: Path, program: Path | None, method: str | None, whole: bool, as_
         "program": None if program is None else str(program.resolve()),
         "method": method,
         "whole": whole,
+        "config_digest": machine.digest,
         "token": read_token(machine.run_directory),
     }
     shown = _Shown(as_json)
@@ -182,7 +186,7 @@ def _user() -> str:
 
 def _disarm_at_the_guard(config: Path, silent: DeviceError) -> Mapping[str, Any]:
     """Ask the guard without the daemon; ``silent`` is why. ConnectError when neither answers."""
-    machine = machine_config.load(config)
+    machine = machine_config.load_places(config)
     from fdhil.arming.guard_client import GuardClient
     from fdhil.arming.standing import landed, verdict
 
@@ -209,7 +213,7 @@ def adopt(config: Path, yes: bool, as_json: bool) -> None:
     """
     if as_json and not yes:
         raise click.UsageError("--json cannot ask: give --yes too")
-    machine = machine_config.load(config)
+    machine = machine_config.load_places(config)
     from fdhil.arming.guard_client import GuardClient
     from fdhil.arming.token import read_token
 
@@ -230,7 +234,7 @@ def _written_after(config: Path, what: str, answer: Mapping[str, Any]) -> Iterat
     try:
         yield
     finally:
-        write_after(machine_config.load(config), what, answer)
+        write_after(machine_config.load_places(config), what, answer)
 
 
 def _adopted(guard: GuardClient, token: Callable[[], str], yes: bool, quiet: bool) -> Mapping[str, Any]:
@@ -258,6 +262,8 @@ def _adopted(guard: GuardClient, token: Callable[[], str], yes: bool, quiet: boo
 
 def _tell(answer: Mapping[str, Any], as_json: bool) -> None:
     """Show an answer; exit 1 when it is no, or as the answer says where something could not be read."""
+    if difference := answer.get("config_difference"):
+        click.echo(without_controls(difference), err=True)
     if as_json:
         click.echo(json.dumps(answer))
     elif answer["ok"]:

@@ -47,6 +47,8 @@ def show(status: Mapping[str, Any], console: Console | None = None) -> None:
     out = console or open_console()
     guard = status.get("guard") or {}
     out.print(f"[bold]{escape(status['machine'])}[/bold]: {_heard(status)}, up {_ago(status['uptime_s'])}")
+    if difference := status.get("config_difference"):
+        out.print(f"[red]{escape(difference)}[/red]")
     out.print(counted(status.get("counters", {})))
     if nc := status.get("nc"):
         out.print(escape(nc_line(nc)))

@@ -22,7 +22,7 @@ from fdhil.config.controller import Identification, Nc
 from fdhil.config.machine import MachineConfig
 from fdhil.config.offset_bounds import VARIATION_MM, OffsetBounds, share_fault
 from fdhil.config.position_range import PositionRange
-from fdhil.config.reading import load, parse, read_toml, toml_document, unlikely
+from fdhil.config.reading import load, load_places, parse, read_toml, toml_document, unlikely
 from fdhil.config.reality import Reality
 from fdhil.config.regulators import Regulators
 from fdhil.config.section import Section
@@ -61,6 +61,7 @@ __all__ = [
     "Thermometer",
     "Voltage",
     "load",
+    "load_places",
     "parse",
     "read_toml",
     "share_fault",

@@ -17,6 +17,7 @@ from fdhil.config.machine import MachineConfig
 from fdhil.config.plausible import doubts
 from fdhil.config.section import LARGEST, Section
 from fdhil.config.sensors import unit_remark
+from fdhil.config.service import Guard, Store
 from fdhil.errors import ConfigError, ConfigFault
 
 MAX_CONFIG_BYTES = 256 * 1024
@@ -37,6 +38,30 @@ def load(path: Path) -> MachineConfig:
     for sentence in unlikely(config):
         logging.getLogger("fdhil").warning("%s: %s", path, sentence)  # nobody else may be there to tell: on stderr
     return config
+
+
+def load_places(path: Path) -> MachineConfig:
+    """Read a configuration to take an offset away; of one with faults the places of sockets and store are enough.
+
+    ConfigError where there are no such places either.
+    """
+    try:
+        return load(path)
+    except ConfigError as error:
+        faults = error
+    try:
+        tables = read_toml(path, "a machine config")
+        store = Store.model_validate(tables.get("store", {}))
+        guard = Guard.model_validate(tables.get("guard", {}))
+    except (ConfigError, ValidationError):
+        store, guard = Store(), Guard()
+    store, guard = _placed_store(store, path.parent), _placed_guard(guard, path.parent)
+    run_directories = [place for place in (store.run_directory, guard.run_directory) if place is not None]
+    if not path.is_file() or not any(place.exists() for place in run_directories):
+        raise faults
+    logging.getLogger("fdhil").warning("%s", faults)
+    found: dict[str, Any] = {"store": store, "guard": guard}
+    return MachineConfig.model_construct(**found)
 
 
 def read_toml(path: Path, what: str, advice: str = "check the path") -> dict[str, Any]:
@@ -86,17 +111,7 @@ def parse(
         config = MachineConfig.model_validate(document, context={"made_up": made_up})
     except ValidationError as error:
         raise ConfigError(source, _faults(error)) from None
-    directory = folder / config.store.directory
-    run, key = config.store.run_directory, config.store.commissioning_key
-    store = config.store.model_copy(
-        update={
-            "directory": directory,
-            "run_directory": folder / run if run else directory / "run",
-            "commissioning_key": folder / key if key else None,
-        }
-    )
-    guard_run = config.guard.run_directory
-    guard = config.guard.model_copy(update={"run_directory": folder / guard_run if guard_run else None})
+    store, guard = _placed_store(config.store, folder), _placed_guard(config.guard, folder)
     worn = {
         name: axis.model_copy(update={"eds": folder / axis.eds if axis.eds else None})
         for name, axis in config.sim.axis.items()
@@ -109,6 +124,20 @@ def parse(
     placed |= {"offers": config.offers.placed(folder)}
     placed |= {"uplink": config.uplink.placed(folder)} if config.uplink else {}
     return config.model_copy(update=placed)
+
+
+def _placed_store(store: Store, folder: Path) -> Store:
+    directory, run, key = folder / store.directory, store.run_directory, store.commissioning_key
+    places = {
+        "directory": directory,
+        "run_directory": folder / run if run else directory / "run",
+        "commissioning_key": folder / key if key else None,
+    }
+    return store.model_copy(update=places)
+
+
+def _placed_guard(guard: Guard, folder: Path) -> Guard:
+    return guard.model_copy(update={"run_directory": folder / guard.run_directory if guard.run_directory else None})
 
 
 def load_as(whole: type[S], path: Path, what: str) -> S:

@@ -10,6 +10,7 @@ import base64
 import hashlib
 import hmac
 import json
+import logging
 import os
 import secrets
 import stat
@@ -79,6 +80,34 @@ def read_users(path: Path) -> Mapping[str, User]:
         raise _fault(
             path, "is no users file", "move it away, then make it anew with fdhil web-user CONFIG NAME"
         ) from None
+
+
+class UsersFile:
+    """The users of a file, which is read again when it is another one: who was removed may do nothing from then on."""
+
+    def __init__(self, path: Path) -> None:
+        """Read the file, so that a faulty one is reported at the start; ConfigError."""
+        self._path = path
+        self._read: tuple[tuple[int, ...], Mapping[str, User]] = ((), {})
+        self._users()
+
+    def _users(self) -> Mapping[str, User]:
+        try:
+            found = self._path.stat()
+            stamp: tuple[int, ...] = (found.st_ino, found.st_mtime_ns, found.st_size, found.st_mode)
+        except OSError:
+            stamp = ()
+        if not stamp or stamp != self._read[0]:
+            self._read = stamp, read_users(self._path)
+        return self._read[1]
+
+    def user(self, name: str) -> User | None:
+        """Return a user; None for one that there is not, or when the file cannot be read any more."""
+        try:
+            return self._users().get(name)
+        except ConfigError as error:
+            logging.getLogger("fdhil").error("nobody may log in: %s", error)
+            return None
 
 
 def write_users(path: Path, users: Mapping[str, User]) -> None:

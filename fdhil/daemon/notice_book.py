@@ -40,6 +40,7 @@ class NoticeBook:
     def begin(self, notices: Sequence[StoredNotice]) -> None:
         """Start from what the history has, oldest first."""
         with self._lock:
+            self._last.clear()
             asking = [notice for notice in notices if notice.notice.severity != "info"]
             self._known = {notice.number: notice.acknowledged or notice for notice in asking}
 

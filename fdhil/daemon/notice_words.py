@@ -86,6 +86,10 @@ WORDS: Mapping[str, tuple[str, str]] = {
     "StrayFiles": ("none: they are left alone", "move them out of the store"),
     "StoreFault": ("nothing is kept, and nothing can be armed", "check the disk and its rights"),
     "DiskFull": ("nothing is kept, and nothing can be armed", "free the disk"),
+    "StoreReplaced": (
+        "what was recorded since that file was written is in no history; identification goes on",
+        "stop the daemon before you restore a backup; bring back the file that was moved away where it is wanted",
+    ),
     "StoreRecovered": ("what came in between was not kept", "arm again when it is wanted"),
     "SchemaVersion": ("nothing is kept, and nothing can be armed", "use the fdhil that wrote the store"),
 }  # fmt: skip

@@ -105,14 +105,12 @@ class OutcomeStore:
         """Open or create the store; a damaged history is put aside, never deleted. Return what must be told."""
         notices = []
         try:
-            self._open()
+            notices += self._open()
         except StoreError as error:
             if error.code == "CorruptFile":
                 notices += self._put_aside(error)
             else:
                 notices += self._refused(error)
-        notices += self._damaged_rows()
-        notices += self._begin_notices()
         if self.strays:
             names = ", ".join(self.strays[:5])
             folder = self._directory / WINDOWS_FOLDER
@@ -120,7 +118,9 @@ class OutcomeStore:
             notices.append(Notice("StrayFiles", "minor", text))
         return notices
 
-    def _open(self) -> None:
+    def _open(self) -> list[Notice]:
+        """Open what is not open; return the notice of damaged rows that were put aside."""
+        new = self._history is None
         if self._history is None:
             outbox = self._outbox
             adding = (outbox.enter, outbox.begin) if outbox else (None, None)
@@ -128,24 +128,28 @@ class OutcomeStore:
         folder = self._directory / WINDOWS_FOLDER
         self._windows = WindowStore(folder, self._config.store.keep_windows, self._config.digest)
         self.strays = tuple(map(journal.printable, self._windows.strays))
-
-    def _damaged_rows(self) -> list[Notice]:
-        """Put damaged rows aside, so that they are told once."""
-        try:
-            places = self._history.put_damaged_aside() if self._history is not None else ""
-        except StoreError as error:
-            return self._refused(error)
-        if not places:
+        if not new:
             return []
+        places = self._history.put_damaged_aside()
+        self.notices.begin(self._history.notices(limit=NEWEST))
+        self._history.checkpoint()
         text = f"Damaged rows of the history were put aside, older ones are used: {places}; check the disk."
-        return [Notice("CorruptFile", "MAJOR", text)]
+        return [Notice("CorruptFile", "MAJOR", text)] if places else []
 
-    def _begin_notices(self) -> list[Notice]:
-        try:
-            self.notices.begin(self._history.notices(limit=NEWEST) if self._history is not None else [])
-        except StoreError as error:
-            return self._refused(error)
-        return []
+    def _leave_replaced(self) -> list[Notice]:
+        """Close a history whose file was replaced, removed or overwritten; what stands there is opened next."""
+        if self._history is None or self._history.is_in_place():
+            return []
+        with suppress(OSError):
+            self._history.abandon()
+        self._history = None
+        for rows in self._accepted.values():
+            rows.clear()  # numbers of rows in the file that was
+        path = self._directory / FILE_NAME
+        text = f"{path} was replaced, removed or overwritten while the daemon ran: what was recorded since that file"
+        return [
+            Notice("StoreReplaced", "MAJOR", f"{text} was written is not in it; new records go to what stands there.")
+        ]
 
     def _put_aside(self, error: StoreError) -> list[Notice]:
         path = self._directory / FILE_NAME
@@ -158,11 +162,11 @@ class OutcomeStore:
                 with suppress(FileNotFoundError):
                     path.with_name(FILE_NAME + suffix).rename(path.with_name(aside.name + suffix))
             sync_folder(self._directory)
-            self._open()
+            notices = self._open()
         except (OSError, StoreError):
             return self._refused(error)
         text = f"The history was damaged, it is kept as {aside.name} and a new one was begun; check the disk."
-        return [Notice("CorruptFile", "MAJOR", text)]
+        return [Notice("CorruptFile", "MAJOR", text), *notices]
 
     def close(self) -> None:
         """Close the history."""
@@ -203,18 +207,27 @@ class OutcomeStore:
     def keep(self, outcomes: Sequence[Outcome]) -> list[Notice]:
         """Store outcomes durably in their order; return a notice when that fails, and one when it works again."""
         with self._lock:
+            told = []
             try:
-                if self._history is None or self._windows is None:
-                    self._open()
-                for outcome in outcomes:
-                    self._keep(outcome)
+                told += self._leave_replaced()
+                told += self._write(outcomes)
+                if replaced := self._leave_replaced():  # while it was written
+                    told += [*replaced, *self._write(outcomes)]
             except StoreError as error:
-                return self._refused(error)
-            told = self._left_files()
+                return told + self._refused(error)
+            told += self._left_files()
             if self.fault is not None and any(isinstance(outcome, WindowOutcome) for outcome in outcomes):
                 self.fault = None
                 text = "The store can be written again; what came in between was not kept, arm again when needed."
                 told.append(Notice("StoreRecovered", "info", text))
+        return told
+
+    def _write(self, outcomes: Sequence[Outcome]) -> list[Notice]:
+        told = self._open() if self._history is None or self._windows is None else []
+        assert self._history is not None
+        for outcome in outcomes:
+            self._keep(outcome)
+        self._history.checkpoint()
         return told
 
     def _left_files(self) -> list[Notice]:
@@ -235,12 +248,20 @@ class OutcomeStore:
             if self._history is None:
                 self._open()
             assert self._history is not None
+            self._require_in_place(self._history)
             if given.notices:
                 self._history.add_acknowledgement(given)
+                self._require_in_place(self._history)
+                self._history.checkpoint()
                 self.notices.acknowledged(given)
         text = f"{counted(given.notices)} acknowledged by {given.who}; {self.notices.status()['count']} more wait"
         journal.write_line(text)
         return {"ok": True, "text": text, "acknowledged": list(given.notices)}
+
+    def _require_in_place(self, history: History) -> None:
+        if not history.is_in_place():
+            text = f"{self._directory / FILE_NAME} was replaced; nothing is acknowledged; look at the notices again"
+            raise StoreError(text, "StoreReplaced")
 
     def _keep(self, outcome: Outcome) -> None:
         assert self._history is not None
@@ -265,6 +286,7 @@ class OutcomeStore:
 
     def _refused(self, error: StoreError) -> list[Notice]:
         again, self.fault = self.fault == error.code, error.code
+        self._windows = None  # its folder may be gone
         if again:
             return []
         return [Notice(error.code, "MAJOR", f"{error}; the daemon goes on in shadow and cannot be armed.")]

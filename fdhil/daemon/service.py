@@ -302,6 +302,7 @@ class Service:
             self._resources = uses()
             self._tell([*watch.look(self._resources), *clock.look(time.time(), time.monotonic())])
             self._tell(await asyncio.to_thread(offers.look))
+            self._tell(await asyncio.to_thread(self._store.keep, ()))  # tells whether the history still stands there
             await asyncio.sleep(RESOURCES_S)
 
     # control ---------------------------------------------------------------------------------------------------
@@ -314,7 +315,9 @@ class Service:
         if request["request"] == "arm":
             answer = await self._desk.arm(request, lambda: self._control.hung_up)
             self._tell([_told(answer)])
-            return answer
+            if "config_digest" not in request:
+                return answer
+            return {**answer, "config_difference": self._watch.config_difference(request["config_digest"])}
         if request["request"] == "disarm":
             return await self._desk.disarm()
         if request["request"] == "acknowledge":

@@ -71,6 +71,10 @@ class Watch:
         else:
             self._axes[outcome.axis].skill = outcome
 
+    def config_difference(self, digest: object) -> str:
+        """Return that a client has another configuration than this daemon; empty: the same."""
+        return config_difference({"config_digest": self._config.digest, "limits": _limits(self._config)}, digest)
+
     def troubles(self, now_s: float) -> list[Notice]:
         """Return what became wrong since the last call, and what is no longer."""
         before = self._troubles
@@ -92,6 +96,7 @@ class Watch:
             "schema": SCHEMA,
             "machine": self._config.machine.name,
             "config_digest": self._config.digest,
+            "limits": _limits(self._config),
             "uptime_s": round(now_s - self._started_s, 3),
             **self.hearing.status(now_s),
             "nc": self.nc.status(now_s),
@@ -127,6 +132,30 @@ class Watch:
             "samples_s_ago": self.hearing.samples_s_ago(axis, now_s),
             "moves": self.hearing.moves[axis].status(),
         }
+
+
+def _limits(config: MachineConfig) -> dict[str, dict[str, float | None]]:
+    """Return what may be sent to each axis that may be corrected; null where nothing of that kind is."""
+    return {
+        name: {
+            "max_offset_um": axis.correction.max_offset_um,
+            "max_speed_mm_s": axis.correction.max_speed_mm_s,
+            "max_acceleration_mm_s2": axis.correction.max_acceleration_mm_s2,
+            "max_torque_nm": None if axis.feedforward is None else axis.feedforward.max_torque_nm,
+            "max_speed_rad_s": None if axis.feedforward is None else axis.feedforward.max_speed_rad_s,
+        }
+        for name, axis in config.axis.items()
+        if axis.correction is not None
+    }
+
+
+def config_difference(status: Mapping[str, Any], digest: object) -> str:
+    """Return that the daemon of a status document runs with another configuration than the file's; empty: the same."""
+    if status.get("config_digest") == digest:
+        return ""
+    offsets = ", ".join(f"{axis} {told['max_offset_um']:g} um" for axis, told in status.get("limits", {}).items())
+    text = "the daemon runs with another configuration than the file, which was changed since: its own limits hold"
+    return f"{text} ({offsets or 'nothing is sent'}); restart daemon and guard to use the file"
 
 
 def severity_of(code: str) -> Literal["minor", "MAJOR"]:

@@ -12,7 +12,7 @@ import asyncio
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from itertools import islice
 from typing import LiteralString, NamedTuple, NoReturn
 
@@ -37,6 +37,7 @@ from fdhil.fleet.transport import (
 )
 
 BATCH = 100  # messages that are committed together
+AHEAD = timedelta(days=1)  # by which a machine's clock may be ahead of the server's
 WAIT_S = 2.0  # for the first of them
 _COLUMNS = "machine, message, recorded_at, store, sequence, axis, kind, stored_at, window_name, record"
 _INCOMING = "CREATE TEMP TABLE IF NOT EXISTS incoming (LIKE fleet.records) ON COMMIT DELETE ROWS"
@@ -180,7 +181,9 @@ class Collector:
 
     async def _write(self, received: Sequence[Received], db: psycopg.AsyncConnection) -> None:
         """Write windows, then records and what is none, in one transaction."""
-        known = [(each.told, each.stored_at) for each in received if isinstance(each.told, Record)]
+        known = [
+            (_dated(each.told, each.stored_at), each.stored_at) for each in received if isinstance(each.told, Record)
+        ]
         for record, _ in known:
             if record.window is not None and record.window_name is not None:
                 objects.keep(self._fleet.objects.directory, record.window_name, record.window)
@@ -196,6 +199,11 @@ class Collector:
                 await _put_aside(cursor, aside)
         for subject, unread in aside:
             journal.write_line(f"a part of what {subject} told is put aside: {unread.reason}", "minor")
+
+
+def _dated(record: Record, stored_at: datetime) -> Record:
+    """Return a record; one from the future under the time of all such: no clock makes a partition of each month."""
+    return record if record.recorded_at <= stored_at + AHEAD else record._replace(recorded_at=migrations.FUTURE)
 
 
 async def _written(known: Known, aside: Aside, db: psycopg.AsyncConnection) -> bool:

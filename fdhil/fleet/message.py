@@ -35,7 +35,8 @@ _SUBJECT = re.compile(r"fdhil\.v1\.([A-Za-z0-9_-]{1,64})\.records")
 _HEAD = re.compile(
     rb"fdhil-record-1 ([0-9a-f]{32}) ([A-Z]|-) ([a-z]{1,20}) ([0-9a-f]{64}) (\d{1,18}) (\d{1,10}\.\d{6}) (\d{1,9}|-)\n"
 )
-MANY_DIGITS = 200 * b"0"
+MANY_DIGITS = 100 * b"0"
+LARGEST_NUMBER = 1e100  # what is reckoned with is squared
 _ONLY_DIGITS = bytes.maketrans(b"123456789E-", b"000000000e+")
 _JSON_COLUMNS = {"reasons", "parameters", "covariance", "window_ids", "terms", "warnings", "friction", "nc", "gains",
                  "notices", "loops"}  # fmt: skip
@@ -230,9 +231,9 @@ def _no_number(name: str) -> None:
 
 
 def _bounded(number: str) -> float:
-    """Return a number that a float holds; PostgreSQL makes no 0 of one that is too small, and refuses it."""
+    """Return a number to reckon with; PostgreSQL makes no 0 of one that is too small, and refuses it."""
     value = float(number)
-    if not math.isfinite(value) or (value == 0.0 and _IS_SOMETHING.match(number)):
+    if not abs(value) < LARGEST_NUMBER or (value == 0.0 and _IS_SOMETHING.match(number)):
         raise BadMessage("it holds a number beyond all bounds")
     return value
 

@@ -17,6 +17,7 @@ from fdhil.errors import StoreError
 
 FIRST_YEAR, LAST_YEAR = 2020, 2099  # of the partitions: a wrong clock makes no others
 FIRST = datetime(FIRST_YEAR, 1, 1, tzinfo=UTC)  # what was recorded before has the time at which it came
+FUTURE = datetime(LAST_YEAR + 1, 1, 1, tzinfo=UTC)  # of what a clock far ahead has dated
 SHIFT_S = 21_600  # of which the newest set stands for all
 LOCK = 7_170_018  # of the advisory lock under which the schema changes
 _FIRST: LiteralString = """
@@ -193,8 +194,21 @@ CREATE OR REPLACE VIEW fleet.newest_parameter_sets AS {KNOWN_AXES}
   SELECT n.* FROM known k, LATERAL (SELECT * FROM fleet.parameter_sets s
     WHERE s.machine = k.machine AND s.axis = k.axis ORDER BY s.stored_at DESC, s.sequence DESC LIMIT 1) n;
 """
+# two machines of one name, or an older copy of a history: numbers come ``repeated``, or of two histories ``in_turn``
+_REPEATED: LiteralString = """
+CREATE OR REPLACE VIEW fleet.machines AS
+  SELECT h.machine, sum(h.records)::bigint AS records, max(h.last_stored_at) AS last_stored_at,
+    least(sum(greatest(h.last_sequence - h.records, 0)), 1e18)::bigint AS missing, count(*) AS stores,
+    (SELECT a.record FROM fleet.told a WHERE a.machine = h.machine AND a.axis = '' AND a.kind = 'about'
+     ORDER BY a.stored_at DESC LIMIT 1) AS about,
+    sum(greatest(h.records - h.last_sequence, 0))::bigint AS repeated,
+    coalesce(bool_or(h.last_before > h.first_stored_at), false) AS in_turn
+  FROM (SELECT *, max(last_stored_at) OVER (PARTITION BY machine ORDER BY first_stored_at, store
+      ROWS BETWEEN UNBOUNDED PRECEDING AND 1 PRECEDING) AS last_before FROM fleet.heard) h
+  GROUP BY h.machine;
+"""
 # what leads from each version to the next, in order: a new one is added at the end, an old one never changes
-_STEPS: tuple[LiteralString, ...] = (_FIRST, _VIEWS, _REANALYSES, _ROLL_OUT, _SISTERS, _SHIFTS)
+_STEPS: tuple[LiteralString, ...] = (_FIRST, _VIEWS, _REANALYSES, _ROLL_OUT, _SISTERS, _SHIFTS, _REPEATED)
 VERSION = len(_STEPS)
 
 

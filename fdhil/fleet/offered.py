@@ -128,9 +128,19 @@ def judge(place: Path, machine: Present) -> Judged:
         judged = replace(judged, offer=offer, answers=[each for each in machine.answers if _is_of(each, offer)])
         _require_in_force(offer, machine)
         _require_for(offer, machine)
-        return _weighed(judged, offer, machine)
+        weighed = _weighed(judged, offer, machine)
+        _require_same(weighed)
+        return weighed
     except OfferRefused as error:
         return replace(judged, wrong=str(error))
+
+
+def _require_same(judged: Judged) -> None:
+    """OfferRefused where the version was accepted with other values: a version is one change, at every stage."""
+    accepted = [each for each in judged.answers if each.answer == "accepted"]
+    if judged.changes and accepted and judged.document not in [each.document for each in accepted]:
+        text = f"{judged.offer} was accepted with other values by {accepted[-1].by}, and a version never changes"
+        raise OfferRefused(f"{text}; ask the works for a newer version, and who signed this one")
 
 
 def _is_of(answer: Answer, offer: Offer) -> bool:

@@ -40,6 +40,7 @@ def status(db: Db) -> dict[str, Any]:
             "last_heard": date_of(row["last_stored_at"]),
             "records": row["records"],
             "missing": row["missing"],
+            "doubt": _doubt(row),
             "open_notices": waiting.get(row["machine"], 0),
             "axes": newest.get(row["machine"], {}),
         }
@@ -47,6 +48,14 @@ def status(db: Db) -> dict[str, Any]:
     ]
     refused = db.execute("SELECT count(*) AS refused FROM fleet.refused").fetchone()
     return {"machines": machines, "due": due(db), "refused_messages": refused["refused"] if refused else 0}
+
+
+def _doubt(row: Row) -> str | None:
+    """Return why what was told under a machine's name may not be of one machine; None: nothing shows that."""
+    if not row["repeated"] and not row["in_turn"]:
+        return None
+    shown = f"{row['repeated']} records under numbers that were sent before" if row["repeated"] else "two histories"
+    return f"{shown}: two machines send under this name, or an older copy of its history was put back"
 
 
 def trend(db: Db, machine: str, axis: str, parameter: str) -> dict[str, Any]:
@@ -111,11 +120,15 @@ def _group(
 def outliers(db: Db, by: str, axis: str | None) -> dict[str, Any]:
     """Return the axes that are unlike their sisters in a parameter, the farthest first."""
     groups, found = _groups(db, by, axis), []
+    doubts = {row["machine"]: _doubt(row) for row in db.execute("SELECT * FROM fleet.machines")}
     for parameter in PARAMETERS:
         for group in _compared(groups, parameter):
             of_group = {name: group[name] for name in ("label", "axis", "median", "bound")}
             found += [
-                {"parameter": parameter, "unit": unit_of(parameter), "sisters": len(group["sisters"])} | of_group | each
+                {"parameter": parameter, "unit": unit_of(parameter), "sisters": len(group["sisters"])}
+                | of_group
+                | each
+                | {"doubt": doubts.get(each["machine"])}
                 for each in group["outliers"]
             ]
     found.sort(key=lambda each: -math.inf if each["score"] is None else -abs(each["score"]))

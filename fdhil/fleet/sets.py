@@ -95,7 +95,7 @@ def std_of(row: Row, parameter: str) -> float:
         return math.nan if row["stds"][k] is None else float(row["stds"][k])
     try:
         variance = float(row["covariance"][k][k])
-    except (TypeError, IndexError, ValueError):
+    except (TypeError, LookupError, ValueError):
         return math.nan
     return math.sqrt(variance) if variance >= 0 else math.nan
 

@@ -5,12 +5,12 @@ from typing import Any
 
 from fdhil.records import PARAMETERS
 
-LARGEST = 1 << 62
-COUNTS: Mapping[str, tuple[str, ...]] = {
-    "parameters": ("revision", "windows"),
-    "window": ("number", "accepted", "direction"),
-    "notice": ("number",),
-    "offer": ("version", "stage"),
+MOST_ROWS = 100  # of a covariance
+COUNTS: Mapping[str, Mapping[str, int]] = {  # with the largest that the views' type takes
+    "parameters": {"revision": 1 << 53, "windows": 1 << 53},
+    "window": {"number": 1 << 53, "accepted": 1, "direction": 1},
+    "notice": {"number": 1 << 53},
+    "offer": {"version": 1 << 30, "stage": 1 << 30},
 }
 MEASURES: Mapping[str, tuple[str, ...]] = {
     "parameters": (*PARAMETERS, "temperature_c"),
@@ -21,28 +21,40 @@ MEASURES: Mapping[str, tuple[str, ...]] = {
 
 def fault(kind: str, record: Mapping[str, Any]) -> str:
     """Return what is wrong with a record of a kind; empty: nothing."""
-    for name in COUNTS.get(kind, ()):
-        if record.get(name) is not None and not _is_count(record[name]):
-            return f"its {name} is no whole number"
+    for name, largest in COUNTS.get(kind, {}).items():
+        if record.get(name) is not None and not _is_count(record[name], largest):
+            return f"its {name} is no whole number of that kind"
     for name in MEASURES.get(kind, ()):
-        value = record.get(name)
-        if value is not None and not isinstance(value, float) and not _is_count(value):
+        if not _is_measure(record.get(name)):
             return f"its {name} is no number"
+    if kind == "parameters" and not _is_matrix(record.get("covariance", [])):
+        return "its covariance is no table of numbers"
     if kind == "acknowledgement":
         notices = record.get("notices", [])
         return "" if isinstance(notices, list) and all(map(_is_count, notices)) else "its notices are no numbers"
     return _about_fault(record) if kind == "about" else ""
 
 
-def _is_count(value: object) -> bool:
-    return type(value) is int and -LARGEST < value < LARGEST
+def _is_count(value: object, largest: int = 1 << 53) -> bool:
+    return type(value) is int and -largest <= value <= largest
+
+
+def _is_measure(value: object) -> bool:
+    return value is None or isinstance(value, float) or _is_count(value)
+
+
+def _is_matrix(value: Any) -> bool:
+    rows = isinstance(value, list) and len(value) <= MOST_ROWS
+    return rows and all(
+        isinstance(row, list) and len(row) == len(value) and all(map(_is_measure, row)) for row in value
+    )
 
 
 def _about_fault(record: Mapping[str, Any]) -> str:
     labels, of_axes = record.get("labels", {}), record.get("axis_labels", {})
     if not isinstance(of_axes, dict) or not all(map(_are_labels, (labels, *of_axes.values()))):
         return "its labels are no texts"
-    return ""
+    return "" if isinstance(record.get("name", ""), str) else "its name is no text"
 
 
 def _are_labels(labels: object) -> bool:

@@ -46,6 +46,7 @@ END_S = 10.0
 DEATH_S = 2.0  # a broker that does not take our death certificate sends the one it has
 REBIRTH_S = 1.0  # births are sent no more often
 WAITING = 32  # messages of the broker that wait to be looked at
+HOST_AHEAD_MS = 60_000  # by which the clock of a host application may be ahead of this computer's
 MOST_EVENTS = 256  # notices that wait to be told
 NOTICE = "the newest notice"
 BROKER = ("MQTT broker", "publish.mqtt")  # as errors name it
@@ -220,11 +221,15 @@ class Session:
                 self._stir.set()
 
     def _note_host(self, state: HostState | None) -> None:
-        """Take the host's word, the newest one: an older death is that of a connection before."""
+        """Accept the newest state of the host: an older death belongs to an earlier connection.
+
+        A time stamp ahead of this computer's clock orders nothing: later states would be ignored until that time.
+        """
         known = self._host_state
         if state is None or (known is not None and state.stamp_ms < known.stamp_ms):
             return
-        self._host_state = state
+        is_ahead = state.stamp_ms > _now_ms() + HOST_AHEAD_MS
+        self._host_state = HostState(state.online, 0) if is_ahead else state
         self._stir.set()
         if self._born and not state.online:
             raise HostGone

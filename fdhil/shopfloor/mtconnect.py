@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
+from collections import Counter
 
 from fdhil.config import MachineConfig
 from fdhil.config.publish import MtConnectAdapter
@@ -88,7 +89,7 @@ class Adapter:
 
     async def attend(self, reader: asyncio.StreamReader, agent: asyncio.StreamWriter) -> None:
         """Attend to one agent until it leaves."""
-        if not self._has_room():
+        if not self._has_room(agent):
             journal.write_line(f"{MAX_AGENTS} agents are connected, another one is sent away", "minor")
             agent.close()
             return
@@ -105,15 +106,18 @@ class Adapter:
             self._pinging.discard(agent)
             agent.close()
 
-    def _has_room(self) -> bool:
-        """Whether one more may come; of those that never pinged, which no agent is, the first makes room for it."""
+    def _has_room(self, new: asyncio.StreamWriter) -> bool:
+        """Whether one more may come; for it goes the first that never pinged, or that of the address with two more."""
         if len(self._agents) < MAX_AGENTS:
             return True
-        silent = next((agent for agent in self._agents if agent not in self._pinging), None)
-        if silent is None:
+        count = Counter(map(_address, self._agents))
+        silent = [agent for agent in self._agents if agent not in self._pinging]
+        greedy = [agent for agent in self._agents if count[_address(agent)] > count[_address(new)] + 1]
+        leaving = next(iter(silent or greedy), None)
+        if leaving is None:
             return False
-        self._agents.pop(silent)
-        silent.transport.abort()
+        self._agents.pop(leaving)
+        leaving.transport.abort()
         return True
 
     def _greet(self, agent: asyncio.StreamWriter) -> None:
@@ -138,3 +142,7 @@ class Adapter:
             return
         with contextlib.suppress(OSError):
             agent.write("".join(f"{line}\n" for line in said).encode())
+
+
+def _address(agent: asyncio.StreamWriter) -> str:
+    return str((agent.get_extra_info("peername") or ("",))[0])

@@ -5,7 +5,8 @@ encrypted. No client can write, call more than ConditionRefresh, or add a node.
 """
 
 import time
-from collections.abc import Mapping
+from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +22,14 @@ from asyncua.server.user_managers import UserManager
 
 from fdhil.config.publish import OpcUaServer
 from fdhil.config.users import User as KnownUser
-from fdhil.config.users import matches, read_users
+from fdhil.config.users import UsersFile, matches
 from fdhil.errors import ConnectError
 from fdhil.shopfloor.opcua_subscriptions import ReportedValues
 
 NAME = "OPC UA server"
 ANYONE = User(role=UserRole.Anonymous)
-MOST_CONNECTIONS = 16
+MOST_CONNECTIONS, MOST_AT_ONCE = 16, 64  # of which those beyond sixteen are being ended
+ACTIVATION_S = 10.0  # for a client to log in
 MOST_SUBSCRIPTIONS = 64
 MOST_FAILURES, FAILURES_S = 10, 60.0
 REFUSED = {
@@ -47,14 +49,24 @@ CHECKED = (
 )
 
 
-class ForReading(SimpleRoleRuleset):
-    """Every user may read, browse and subscribe; nobody may do more."""
+@dataclass
+class Reader(User):
+    """A user who has logged in, as the users file had him then."""
 
-    def __init__(self) -> None:
+    known: KnownUser | None = None
+
+
+class ForReading(SimpleRoleRuleset):
+    """Every user may read, browse and subscribe, until he is removed or changed in the file; nobody may do more."""
+
+    def __init__(self, users: UsersFile | None = None) -> None:
+        self._users = users
         self._permitted = {ua.NodeId(ua.Int32(kind)) for kind in USER_TYPES if kind not in REFUSED}
 
     def check_validity(self, user: User, action_type_id: ua.NodeId, body: Any) -> bool:
         """Whether a request of that type is served."""
+        if self._users is not None and isinstance(user, Reader) and self._users.user(user.name or "") != user.known:
+            return False
         return action_type_id in self._permitted
 
 
@@ -65,8 +77,8 @@ class Doorkeeper(UserManager):
     slow, cheap to refuse, and locks nobody else out.
     """
 
-    def __init__(self, users: Mapping[str, KnownUser] | None) -> None:
-        self._users = users
+    def __init__(self, users: UsersFile | None) -> None:
+        self.users = users
         self._failures: list[tuple[str, float]] = []  # from where, and when
         self.address = ""
         """Where who asks next is."""
@@ -75,15 +87,16 @@ class Doorkeeper(UserManager):
         self, iserver: Any, username: str | None = None, password: str | None = None, certificate: Any = None
     ) -> User | None:
         """Return the user of a session; None: it is not let in."""
-        if self._users is None:
+        if self.users is None:
             return User(role=UserRole.User)
         now_s = time.monotonic()
         self._failures = [(address, at_s) for address, at_s in self._failures if now_s - at_s < FAILURES_S]
         failures = sum(address == self.address for address, _ in self._failures)
         if failures >= MOST_FAILURES or username is None or password is None:
             return None
-        if matches(self._users.get(username), password):
-            return User(role=UserRole.User, name=username)
+        known = self.users.user(username)
+        if matches(known, password):
+            return Reader(role=UserRole.User, name=username, known=known)
         self._failures.append((self.address, now_s))
         return None
 
@@ -107,15 +120,33 @@ class Visit(InternalSession):
         return super().activate_session(*given)
 
 
+class Connections(list[Any]):
+    """The transports of all clients: for one too many goes the oldest of an address with two more, or else itself."""
+
+    def append(self, new: Any) -> None:
+        """Take a connection."""
+        super().append(new)
+        there = [each for each in self if not each.is_closing()]
+        if len(there) > MOST_CONNECTIONS:
+            count = Counter(map(_address, there))
+            greedy = [each for each in there if count[_address(each)] > count[_address(new)]]
+            (greedy or [new])[0].abort()
+
+
+def _address(transport: Any) -> str:
+    return str((transport.get_extra_info("peername") or ("",))[0])
+
+
 class ReadServer(InternalServer):
     """An address space that remembers no other servers: who is not let in could fill its memory with them."""
 
     def __init__(self, settings: OpcUaServer) -> None:
-        users = None if settings.users_file is None else read_users(settings.users_file)
+        users = None if settings.users_file is None else UsersFile(settings.users_file)
         super().__init__(user_manager=Doorkeeper(users))
         self.bind_condition_methods = True
         self.allow_remote_admin = False
-        self.max_connections = MOST_CONNECTIONS
+        self.max_connections, self.max_pending_activation_seconds = MOST_AT_ONCE, ACTIVATION_S
+        self.asyncio_transports = Connections()
         self.max_subscriptions = MOST_SUBSCRIPTIONS
         taken: Any = (ua.UserNameIdentityToken,) if users is not None else (ua.AnonymousIdentityToken,)
         self.supported_tokens = taken
@@ -135,7 +166,9 @@ async def secure(server: Server, settings: OpcUaServer, uri: str) -> None:
         server.set_security_policy([ua.SecurityPolicyType.NoSecurity], ForReading())
         await server.set_application_uri(uri)
         return
-    server.set_security_policy(POLICIES, ForReading())
+    door = server.iserver.user_manager
+    assert isinstance(door, Doorkeeper)
+    server.set_security_policy(POLICIES, ForReading(door.users))
     for key, load in (("certificate_file", server.load_certificate), ("private_key_file", server.load_private_key)):
         content = _read(key, getattr(settings, key))
         try:
@@ -161,7 +194,20 @@ async def _validator(folder: Path) -> CertificateValidator:
         await trusted.load()
     except (OSError, ValueError) as error:
         raise _fault("trusted_clients", f"{folder} cannot be used ({str(error)[:100]})") from None
-    return CertificateValidator(CHECKED, trusted)
+    return Validator(CHECKED, trusted)
+
+
+class Validator(CertificateValidator):
+    """Trusts the certificates that are in the folder when a client comes."""
+
+    async def validate(self, cert: Any, app_description: Any) -> None:
+        """Check a client's certificate; ServiceError."""
+        assert self._trust_store is not None
+        try:
+            await self._trust_store.load()
+        except (OSError, ValueError):  # none is left, or a file is being written
+            raise ServiceError(ua.StatusCodes.BadCertificateUntrusted) from None
+        await super().validate(cert, app_description)
 
 
 def _application_uri(certificate: Any) -> str | None:

@@ -11,7 +11,7 @@ import json
 import math
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import asdict, replace
 from itertools import islice
 from pathlib import Path
@@ -50,6 +50,7 @@ class History:
         self._tell = tell
         self._damaged: dict[tuple[str, int], dict[str, Any]] = {}
         self._also = also
+        self._stamp, self._log = _stamp_of(path), _stamp_of(_log_of(path))[:2]
 
     @classmethod
     def open(cls, directory: Path, also: Also | None = None, begin: Begin | None = None) -> History:
@@ -89,6 +90,24 @@ class History:
         path = directory / FILE_NAME
         db, version = schema.open_to_read(path, checked)
         return cls(db, path, version, tell)
+
+    def checkpoint(self) -> None:
+        """Bring what was written from the log into the file, whose state is noted; what cannot be stays in the log."""
+        with suppress(sqlite3.Error):
+            self._db.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
+        self._stamp = self._stamp[:2] + _stamp_of(self._path)[2:]
+
+    def is_in_place(self) -> bool:
+        """Whether the file of that name is the one that was opened, and nobody else has written to it."""
+        return self._stamp == _stamp_of(self._path)
+
+    def abandon(self) -> None:
+        """Close a file that has lost its name or its content; its log must not become that of another file."""
+        with suppress(sqlite3.Error):
+            self._db.close()
+        if self._log and _stamp_of(_log_of(self._path))[:2] == self._log:  # others were reading
+            for suffix in ("-wal", "-shm"):
+                self._path.with_name(self._path.name + suffix).unlink(missing_ok=True)
 
     def close(self) -> None:
         """Close the database; tell what was left out."""
@@ -337,6 +356,19 @@ class History:
             row = self._db.execute("SELECT file FROM windows WHERE file != '' ORDER BY id DESC LIMIT 1").fetchone()
         digits = "".join(c for c in str(row[0]).partition("-")[0] if c in "0123456789") if row else ""
         return int(digits[:12] or 0)
+
+
+def _log_of(path: Path) -> Path:
+    return path.with_name(path.name + "-wal")
+
+
+def _stamp_of(path: Path) -> tuple[int, ...]:
+    """Return what tells a file from another one and its content from an earlier one; nothing where there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return ()
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
 
 
 def _of(axis: str | None) -> dict[str, str]:

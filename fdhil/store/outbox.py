@@ -43,6 +43,10 @@ _WHOLE = {
     "some": "file <> '' AND id % {every} = 1 % {every}",
     "none": "0",
 }
+_NEW_IDENTITY = """
+BEGIN IMMEDIATE; DELETE FROM outbox; UPDATE sqlite_sequence SET seq = 0 WHERE name = 'outbox';
+UPDATE outbox_of SET store = lower(hex(randomblob(16))), dropped = 0; COMMIT
+"""
 _OF_NO_AXIS = {"acknowledgements": "''"}
 
 
@@ -55,6 +59,10 @@ class Position:
     message: str = ""
     about: str = ""
 
+    def is_beyond(self, newest: int, store: str) -> bool:
+        """Whether more of a store was sent than it has: it is an older copy, all of which was sent."""
+        return self.store == store and self.entry > newest
+
 
 def read_position(folder: Path) -> Position:
     """Return how far the outbox was sent; the beginning where that is not known: all is sent again then."""
@@ -65,7 +73,7 @@ def read_position(folder: Path) -> Position:
     except (OSError, ValueError, TypeError, RecursionError):
         return Position()
     kinds = all(isinstance(getattr(position, name), str) for name in ("store", "message", "about"))
-    return position if kinds and type(position.entry) is int else Position()
+    return position if kinds and type(position.entry) is int and 0 <= position.entry < 1 << 63 else Position()
 
 
 def write_position(folder: Path, position: Position) -> None:
@@ -93,8 +101,14 @@ class Outbox:
             self._prune(db, number)
 
     def begin(self, db: sqlite3.Connection) -> None:
-        """Enter what was recorded before there was an [uplink], the newest of it, once; sqlite3.Error."""
-        if db.execute("SELECT 1 FROM sqlite_sequence WHERE name = 'outbox'").fetchone():
+        """Enter what was recorded before there was an [uplink], the newest of it, once; sqlite3.Error.
+
+        An older copy of the history, of which more was sent than it has, gets an identity of its own.
+        """
+        if begun := db.execute("SELECT seq, store FROM sqlite_sequence, outbox_of WHERE name = 'outbox'").fetchone():
+            position = read_position(self._folder)
+            if position.is_beyond(*begun):
+                db.executescript(_NEW_IDENTITY)
             return
         whole = _WHOLE[self._settings.windows].format(every=self._settings.every_window)
         tables = " UNION ALL ".join(
@@ -173,7 +187,14 @@ class OutboxReader:
             return self._db.execute(query, values).fetchall()
 
     def start(self, position: Position) -> Position:
-        """Return where to go on: at ``position``, or at the beginning where that is not of this file."""
+        """Return where to go on: at ``position``, or at the beginning where that is not of this file.
+
+        StoreError: the file is an older copy of what was sent.
+        """
+        newest = self._ask("SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE name = 'outbox'", ())[0][0]
+        if position.is_beyond(newest, self.store):
+            text = f"{self._path} is an older copy: {position.entry} records of it were sent, and it has {newest}"
+            raise StoreError(f"{text}; start the daemon again, which gives it an identity of its own", "OlderCopy")
         query = "SELECT count(*) FROM outbox WHERE id = ? AND message = ?"
         ((known,),) = self._ask(query, (position.entry, position.message))
         if position.store == self.store and known:

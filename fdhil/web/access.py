@@ -6,16 +6,17 @@ A token is 256 random bits that live in this process alone, kept as their SHA-25
 import asyncio
 import hashlib
 import ipaddress
-import logging
+import itertools
+import math
 import secrets
 import time
-from collections import OrderedDict
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections import Counter, OrderedDict
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from fdhil.config.users import LONGEST_PASSWORD, Role, User, matches, read_users
-from fdhil.errors import ConfigError
+from fdhil.config.users import LONGEST_PASSWORD, Role, User, UsersFile, matches
 from fdhil.web.answers import Refused
 
 LIFE_S = 12 * 3600.0
@@ -26,8 +27,6 @@ LONGEST_WAIT_S = 300.0
 FORGET_S = 3600.0
 MOST_GUESSERS = 4096
 MOST_PLACES = 1024
-WAITING_LOGINS = 4
-"""Logins that may wait for their check; each takes a tenth of a second and 32 MiB, one at a time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,29 +48,31 @@ class Session:
 
 
 class Guesses:
-    """Counts wrong passwords by who is guessed and from where; each one beyond five doubles the wait."""
+    """Counts wrong passwords by user and by address; each one beyond five doubles the wait."""
 
     def __init__(self, now_s: Callable[[], float]) -> None:
         self._now_s = now_s
         self._wrong: OrderedDict[str, tuple[int, float]] = OrderedDict()
 
-    def wait_s(self, *keys: str) -> float:
-        """Return for how long none of these may try again; 0 when they may."""
-        return max((self._wait_of(key) for key in keys), default=0.0)
+    def wait_s(self, key: str) -> float:
+        """Return how long it is until the next guess is allowed; 0 when it is."""
+        wait_s = min(LONGEST_WAIT_S, 2.0 ** min(60, self.count(key) - FREE_GUESSES))
+        return max(0.0, self._last_s(key) + wait_s - self._now_s()) if self.count(key) >= FREE_GUESSES else 0.0
 
-    def _wait_of(self, key: str) -> float:
-        count, at_s = self._wrong.get(key, (0, 0.0))
-        if count < FREE_GUESSES:
-            return 0.0
-        wait_s = min(LONGEST_WAIT_S, 2.0 ** (count - FREE_GUESSES))
-        return max(0.0, at_s + wait_s - self._now_s())
+    def count(self, key: str) -> int:
+        """Return how many passwords were wrong in the last hour."""
+        return self._wrong[key][0] if self._now_s() - self._last_s(key) < FORGET_S else 0
+
+    def _last_s(self, key: str) -> float:
+        return self._wrong.get(key, (0, -math.inf))[1]
 
     def wrong(self, *keys: str) -> None:
         """Note a wrong password."""
         now_s = self._now_s()
         for key in keys:
-            count, at_s = self._wrong.pop(key, (0, now_s))
-            self._wrong[key] = (count + 1 if now_s - at_s < FORGET_S else 1, now_s)
+            count = self.count(key) + 1
+            self._wrong.pop(key, None)
+            self._wrong[key] = (count, now_s)
             while len(self._wrong) > MOST_GUESSERS:
                 self._wrong.popitem(last=False)
 
@@ -81,62 +82,93 @@ class Guesses:
             self._wrong.pop(key, None)
 
 
+@dataclass(eq=False, slots=True)
+class Waiting:
+    """A login that waits for its check: the fewest wrong passwords first, of those the newest."""
+
+    order: tuple[int, int]
+    turn: asyncio.Event = field(default_factory=asyncio.Event)
+
+
+class Turns:
+    """Has one password checked at a time, which takes a tenth of a second and 32 MiB.
+
+    First those from where the fewest were wrong, of them the newest: a crowd of first guesses that waits already delays
+    nobody. Of an address the newest alone waits: the connection of an older one may have ended.
+    """
+
+    def __init__(self) -> None:
+        self._line: dict[str, Waiting] = {}
+        self._arrivals = itertools.count()
+        self._checked: Waiting | None = None
+
+    @asynccontextmanager
+    async def turn(self, place: str, wrong: int) -> AsyncIterator[None]:
+        """Wait for a turn after ``wrong`` wrong passwords from a place; Refused where a newer login is from there."""
+        own, older = Waiting((wrong, -next(self._arrivals))), self._line.get(place)
+        if older is not None:
+            older.turn.set()  # which is refused, or checked already
+        self._line[place] = own
+        self._begin_next()
+        try:
+            await own.turn.wait()
+            if self._line.get(place) is not own:
+                raise _too_many(1.0)
+            yield
+        finally:
+            if self._line.get(place) is own:
+                del self._line[place]
+            if self._checked is own:
+                self._checked = None
+            self._begin_next()
+
+    def _begin_next(self) -> None:
+        if self._checked is None and self._line:
+            self._checked = min(self._line.values(), key=lambda each: each.order)
+            self._checked.turn.set()
+
+
+def _too_many(wait_s: float) -> Refused:
+    text = "too many logins failed or are being checked; nothing was looked at"
+    return Refused(429, "TooMany", text, f"try again in {max(1.0, wait_s):.0f} s")
+
+
 class Access:
     """The users of one machine, and who of them is logged in."""
 
     def __init__(self, users_file: Path | None, now_s: Callable[[], float] = time.monotonic) -> None:
         """Read the users, so that a faulty file is told at the start; ConfigError."""
-        self._users_file = users_file
+        self._users_file = UsersFile(users_file) if users_file else None
         self._now_s = now_s
         self._sessions: OrderedDict[str, Session] = OrderedDict()
         self._guesses = Guesses(now_s)
         # where who has logged in: guesses elsewhere do not lock him out there
         self._places: OrderedDict[tuple[str, str], None] = OrderedDict()
-        self._checking = asyncio.Semaphore(1)
-        self._waiting = 0
-        self._read: tuple[tuple[int, ...], Mapping[str, User]] = ((), {})
-        if users_file:
-            self._users(users_file)
+        self._turns = Turns()
 
     @property
     def by_login(self) -> bool:
         """Whether there are users at all; without, who reaches the address may read, and nobody may act."""
         return self._users_file is not None
 
-    def _users(self, path: Path) -> Mapping[str, User]:
-        """Return who may log in now; the file is read again when it is another one. ConfigError."""
-        try:
-            found = path.stat()
-            stamp: tuple[int, ...] = (found.st_ino, found.st_mtime_ns, found.st_size, found.st_mode)
-        except OSError:
-            stamp = ()
-        if not stamp or stamp != self._read[0]:
-            self._read = stamp, read_users(path)
-        return self._read[1]
-
     def _user(self, name: str) -> User | None:
-        """Return a user; None for one that there is not, or when the file cannot be read any more."""
-        try:
-            return self._users(self._users_file).get(name) if self._users_file else None
-        except ConfigError as error:
-            logging.getLogger("fdhil.web").error("nobody may log in: %s", error)
-            return None
+        return self._users_file.user(name) if self._users_file else None
 
     async def log_in(self, name: str, password: str, address: str) -> tuple[str, Session]:
-        """Return a new token and its session; Refused when name or password is wrong, or too many were."""
+        """Return a new token and its session; Refused when name or password is wrong, or too many were.
+
+        Where no password was wrong before one is checked, and first: guessing elsewhere locks nobody out.
+        """
         place = place_of(address)
-        keys = (f"user {name[:64]} {place if (name, place) in self._places else ''}", f"address {place}")
-        wait_s = self._guesses.wait_s(*keys)
-        if wait_s > 0 or self._waiting >= WAITING_LOGINS:
-            text = "too many logins failed or are being checked; nothing was looked at"
-            raise Refused(429, "TooMany", text, f"try again in {max(1.0, wait_s):.0f} s")
-        self._waiting += 1
-        try:
-            async with self._checking:
-                user = await asyncio.to_thread(self._user, name)
-                fits = await asyncio.to_thread(matches, user, password[: LONGEST_PASSWORD + 1])
-        finally:
-            self._waiting -= 1
+        of_place = f"address {place}"
+        keys = (f"user {name[:64]} {place if (name, place) in self._places else ''}", of_place)
+        wrong = self._guesses.count(of_place)
+        wait_s = max(map(self._guesses.wait_s, keys)) if wrong or (name, place) in self._places else 0.0
+        if wait_s > 0:
+            raise _too_many(wait_s)
+        async with self._turns.turn(place, wrong):
+            user = await asyncio.to_thread(self._user, name)
+            fits = await asyncio.to_thread(matches, user, password[: LONGEST_PASSWORD + 1])
         if user is None or not fits:
             self._guesses.wrong(*keys)
             raise Refused(401, "AuthRequired", "name or password is wrong", "check both; fdhil web-user sets a new one")
@@ -147,12 +179,13 @@ class Access:
         return self.begin(name, user)
 
     def begin(self, name: str, user: User) -> tuple[str, Session]:
-        """Return a new token of a user whose password was right; the oldest login makes room for it."""
+        """Return a new token of a user whose password was right; the oldest of who has the most makes room for it."""
         token, now_s = secrets.token_urlsafe(32), self._now_s()
         session = Session(Asker(name, user.role), user, now_s + LIFE_S, now_s + IDLE_S)
         self._sessions[_key(token)] = session
-        while len(self._sessions) > MOST_TOKENS:
-            self._sessions.popitem(last=False)
+        if len(self._sessions) > MOST_TOKENS:
+            count = Counter(each.asker.name for each in self._sessions.values())
+            del self._sessions[max(self._sessions, key=lambda key: count[self._sessions[key].asker.name])]
         return token, session
 
     def asker(self, token: str | None) -> Asker | None:

@@ -7,8 +7,10 @@ are laid on one count of this process by when its first block came, and stay on 
 
 import asyncio
 import time
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +28,18 @@ RETRY_S = 1.0
 LINGER_S = 60.0  # a browser that comes back within it finds what it missed
 SAME_COUNT_S = 1.0
 LONGEST_LINE = 16 * 1024 * 1024
+MAX_BROWSERS = 8
+UNDRAWN_S = 5.0  # a browser that draws does so at least once a second
 NONSENSE = (ValueError, LookupError, TypeError, ArithmeticError, RecursionError)
+
+
+@dataclass(eq=False, slots=True)
+class Viewer:
+    """A browser that looks on: its user or address, when it last drew, and whether another one has its place."""
+
+    owner: str
+    drawn_s: float
+    replaced: bool = False
 
 
 class LiveFeed:
@@ -40,18 +53,36 @@ class LiveFeed:
         self.skipped_lines = 0
         self._bases: dict[str, int] = {}
         self._line: tuple[float, float] | None = None
-        self.viewers = 0
+        self.viewers: list[Viewer] = []
         self._wanted = asyncio.Event()
 
     @asynccontextmanager
-    async def watched(self) -> AsyncIterator[None]:
+    async def watched(self, viewer: Viewer) -> AsyncIterator[None]:
         """Have the daemon asked while the block is open, and a minute longer."""
-        self.viewers += 1
+        self.viewers.append(viewer)
         self._wanted.set()
         try:
             yield
         finally:
-            self.viewers -= 1
+            if not viewer.replaced:
+                self.viewers.remove(viewer)
+
+    def make_room(self, owner: str) -> bool:
+        """Return whether a browser of ``owner`` may look on.
+
+        Where all places are taken, one that draws nothing leaves for it, or one of the owner who has two more.
+        """
+        if len(self.viewers) < MAX_BROWSERS:
+            return True
+        count = Counter(each.owner for each in self.viewers)
+        idle = [each for each in self.viewers if time.monotonic() - each.drawn_s > UNDRAWN_S]
+        greedy = [each for each in self.viewers if count[each.owner] > count[owner] + 1]
+        leaving = min(idle or greedy, key=lambda each: (-count[each.owner], each.drawn_s), default=None)
+        if leaving is None:
+            return False
+        leaving.replaced = True
+        self.viewers.remove(leaving)
+        return True
 
     async def run(self) -> None:
         """Serve for ever: connect while somebody looks on, and again when the daemon went away."""

@@ -32,9 +32,10 @@ class View:
         """Whether the browser has drawn enough of what it was sent."""
         return self._number - self._seen < MOST_UNSEEN
 
-    def drawn(self, number: int) -> None:
-        """The browser has drawn message ``number``."""
-        self._seen = max(self._seen, min(number, self._number))
+    def drawn(self, number: int) -> bool:
+        """Note that the browser has drawn message ``number``; return whether it was not drawn before."""
+        before, self._seen = self._seen, max(self._seen, min(number, self._number))
+        return self._seen > before
 
     def has_news(self, rings: Mapping[str, Ring]) -> bool:
         """Whether a column of any axis is complete."""

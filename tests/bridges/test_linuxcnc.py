@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from fdhil.bridges.linuxcnc import MOST_WAITING, NAME, Cycle, Listeners, Status, Teller
+from fdhil.bridges.linuxcnc import MOST_LISTENERS, MOST_WAITING, NAME, Cycle, Listeners, Status, Teller
 
 MS = 1_000_000
 STATUS = Status(1.0, 1.0, False, 2, "part.ngc")
@@ -77,6 +77,19 @@ def test_a_listener_that_does_not_read_is_let_go_and_holds_nobody_up() -> None:
                     listeners.send(line)
                     assert lines.readline() == line
         listeners.send(b"last\n")
+    listeners.close()
+
+
+def test_listeners_that_do_nothing_keep_no_other_out() -> None:
+    listeners = Listeners("127.0.0.1", 0, b"greeting\n")
+    held = []
+    for _ in range(MOST_LISTENERS + 2):
+        held.append(socket.create_connection(("127.0.0.1", listeners.port)))
+        listeners.send(b"")
+    with held[0].makefile("rb") as first, held[-1].makefile("rb") as last:
+        assert (first.readline(), first.readline(), last.readline()) == (b"greeting\n", b"", b"greeting\n")
+    for each in held:
+        each.close()
     listeners.close()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -18,6 +19,7 @@ import pytest
 
 from fdhil.arming.token import ensure_token
 from fdhil.cli.status_view import believed, sparkline
+from fdhil.config import load
 from fdhil.daemon import journal
 from fdhil.daemon.status import Watch
 from fdhil.records import Notice
@@ -134,6 +136,7 @@ def test_arm_sends_the_token_and_says_what_is_promised(machine: Path, tmp_path: 
     token = (machine.parent / "fdhil-data" / "run" / "token").read_text()
     program = str((tmp_path / "p.ngc").resolve())
     wanted = {"request": "arm", "program": program, "method": "mirror", "whole": True, "token": token, "progress": True}
+    wanted["config_digest"] = load(machine).digest
     assert requests == [wanted]
 
 
@@ -146,6 +149,22 @@ def test_a_refusal_exits_1_with_class_cause_and_next_action(machine: Path, tmp_p
     with answering(machine, answer):
         code, out, _ = fdhil("disarm", machine, "--json", capsys=capsys)
     assert (code, json.loads(out)) == (1, answer)
+
+
+@pytest.mark.parametrize("edited", ["[axis.X", "[axis.X]\nscrew_pitch_mm = 0\n", "\0", "[store]\nkeep_windows = 0"])
+def test_a_faulty_configuration_keeps_nobody_from_disarming(
+    edited: str, machine: Path, capsys: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    machine.write_text(edited)
+    with answering(machine, {"ok": True, "text": "guard: OFF, offset 0"}) as requests:
+        code, out, _ = fdhil("disarm", machine, capsys=capsys)
+    assert (code, out, requests) == (0, "guard: OFF, offset 0\n", [{"request": "disarm"}])
+    assert str(machine) in caplog.text
+    missing = fdhil("status", machine.with_name("none.toml"), capsys=capsys)[0]
+    assert fdhil("status", machine, capsys=capsys)[0] == 2
+    assert fdhil("disarm", machine.with_name("none.toml"), capsys=capsys)[0] == missing
+    shutil.rmtree(machine.parent / "fdhil-data")
+    assert fdhil("disarm", machine, capsys=capsys)[0] == 2
 
 
 @pytest.mark.usefixtures("processes")

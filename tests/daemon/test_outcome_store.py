@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import sqlite3
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +18,11 @@ import pytest
 from fdhil.daemon import outcome_store
 from fdhil.daemon.outcome_json import as_document
 from fdhil.daemon.outcome_store import OutcomeStore, raw_scales
+from fdhil.errors import StoreError
 from fdhil.identification.pooling import member
 from fdhil.records import LoopEstimate, Notice, Outcome, Verdict, frozen
 from fdhil.store.history import FILE_NAME, History
+from fdhil.store.rows import Comparison, Stamp
 from fdhil.store.set_document import set_document
 from fdhil.store.windows import encode_window, list_windows
 from tests.daemon.machine import config_of
@@ -228,4 +233,83 @@ def test_a_stray_whose_name_is_no_unicode_is_named_escaped(tmp_path: Path) -> No
     (folder / "b\udcf6hlen.txt").write_text("")
     store, _ = opened(tmp_path)
     assert store.strays == ("b\\udcf6hlen.txt",)
+    store.close()
+
+
+def replace_by_rename(history: Path, backup: Path) -> None:
+    shutil.copy(backup, backup.with_name("other"))
+    backup.with_name("other").replace(history)
+
+
+def move_the_folder(history: Path, backup: Path) -> None:
+    history.parent.rename(history.parent.with_name("moved"))
+
+
+@pytest.mark.parametrize("read", [False, True])  # while somebody reads the log outlives its file
+@pytest.mark.parametrize(
+    "change",
+    [
+        replace_by_rename,
+        lambda history, backup: shutil.copyfile(backup, history),
+        lambda history, backup: history.unlink(),
+        move_the_folder,
+    ],
+)
+@pytest.mark.fault("F17")
+def test_a_history_that_is_replaced_is_reported_and_what_follows_is_in_the_file_that_stands_there(
+    change: Callable[[Path, Path], object], read: bool, tmp_path: Path
+) -> None:
+    history, backup = tmp_path / "fdhil-data" / FILE_NAME, tmp_path / "backup"
+    store, _ = opened(tmp_path)
+    assert store.keep([outcome(), Notice("A", "MAJOR", "seen")]) == []
+    with closing(sqlite3.connect(history)) as db, closing(sqlite3.connect(backup)) as copy:
+        db.backup(copy)
+    for k in range(20):
+        assert store.keep([Notice("B", "MAJOR", f"record {k} " + "x" * 1500)]) == []
+    reader = sqlite3.connect(f"{history.as_uri()}?mode=ro", uri=True)
+    if read:
+        reader.execute("SELECT count(*) FROM notices").fetchone()
+    change(history, backup)
+    whole = outcome()
+    said = [notice.code for k in range(8) for notice in store.keep([whole, Notice("C", "MAJOR", f"after {k}")])]
+    assert (said, store.fault) == (["StoreReplaced"], None)
+    last = store.notices.status()["newest"][-1]["number"]
+    assert store.acknowledge({"notices": [last], "by": "anna"})["ok"]
+    with History.read(tmp_path / "fdhil-data") as found:
+        assert len(found.windows()) in (8, 9)
+        assert [n.notice.text for n in found.notices()][-8:] == [f"after {k}" for k in range(8)]
+        assert found.notices()[-1].acknowledged is not None
+    reader.close()
+    store.close()
+    with closing(sqlite3.connect(history)) as db:
+        assert db.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
+
+
+def test_a_folder_of_windows_that_is_removed_is_made_again(tmp_path: Path) -> None:
+    store, _ = opened(tmp_path)
+    assert store.keep([outcome()]) == []
+    shutil.rmtree(tmp_path / "fdhil-data" / "windows")
+    said = [notice.code for _ in range(3) for notice in store.keep([outcome()])]
+    assert (said, store.fault) == (["StoreFault", "StoreRecovered"], None)
+    assert len(list_windows(tmp_path / "fdhil-data" / "windows").windows) == 2
+    store.close()
+
+
+def test_an_acknowledgement_names_notices_of_the_file_that_stands_there(tmp_path: Path) -> None:
+    store, _ = opened(tmp_path)
+    assert store.keep([Notice("A", "MAJOR", "of before")]) == []
+    (tmp_path / "fdhil-data" / FILE_NAME).unlink()
+    with pytest.raises(StoreError, match="was replaced; nothing is acknowledged"):
+        store.acknowledge({"notices": [1], "by": "anna"})
+    assert [notice.code for notice in store.keep([])] == ["StoreReplaced"]
+    assert store.acknowledge({"notices": [1], "by": "anna"})["code"] == "NoSuchNotice"
+    store.close()
+
+
+def test_another_program_that_writes_to_the_history_does_not_replace_it(tmp_path: Path) -> None:
+    store, _ = opened(tmp_path)
+    assert store.keep([outcome()]) == []
+    with History.open(tmp_path / "fdhil-data") as other:
+        other.add_comparison(Comparison("p", "name", "", {}, 1.0, ()), Stamp.now())
+    assert [store.keep([outcome()]) for _ in range(3)] == [[]] * 3
     store.close()

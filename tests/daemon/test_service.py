@@ -15,8 +15,10 @@ from typing import Any
 
 import pytest
 
+from fdhil.cli.demo.toml import to_toml
+from fdhil.cli.doctor.devices import examine_daemon
 from fdhil.commissioning.void import void_path
-from fdhil.config import MachineConfig
+from fdhil.config import MachineConfig, load
 from fdhil.daemon.control import ask
 from fdhil.daemon.hearing import Hearing
 from fdhil.daemon.lock import BusLocked
@@ -25,7 +27,9 @@ from fdhil.errors import ConnectError, DeviceError
 from fdhil.records import Notice
 from fdhil.store.history import History
 from fdhil.store.windows import list_windows
+from tests.bench import bench_document
 from tests.daemon.machine import NOMINAL, Machine, config_of, rapids
+from tests.daemon.shop import fdhil
 
 
 @pytest.fixture(autouse=True)
@@ -86,6 +90,25 @@ async def test_rapids_become_parameters_with_intervals_in_status_and_history(tmp
     listing = list_windows(config.store.directory / "windows")
     assert [file.number for file in listing.windows] == [1, 2]
     assert not path.exists()
+
+
+async def test_a_configuration_that_was_edited_while_the_daemon_runs_is_reported_with_the_limits_that_hold(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "machine.toml"
+    file.write_text(to_toml(bench_document()))
+    async with serving(load(file), Machine()):
+        document = bench_document()
+        document["axis"]["X"]["correction"]["max_offset_um"] = 5.0
+        file.write_text(to_toml(document))
+        (tmp_path / "p.ngc").write_text("G0 X1")
+        asked = [("status",), ("status", "--json"), ("arm", tmp_path / "p.ngc"), ("arm", tmp_path / "p.ngc", "--json")]
+        answers = [await asyncio.to_thread(fdhil, command, file, *more, capsys=capsys) for command, *more in asked]
+        (trouble,) = await asyncio.to_thread(lambda: list(examine_daemon(load(file))))
+    assert trouble.code == "ConfigDiffers"
+    said = [" ".join((out + err).split()) for _, out, err in answers]
+    assert [("another configuration than the file" in text, "X 250 um" in text) for text in said] == [(True, True)] * 4
+    assert json.loads(answers[1][1])["limits"]["X"]["max_offset_um"] == 250.0
 
 
 async def test_a_restarted_daemon_goes_on_where_the_history_ends(tmp_path: Path) -> None:

@@ -174,7 +174,7 @@ def test_a_number_beyond_all_bounds(number: bytes) -> None:
     assert "bounds" in refused(text)
 
 
-@pytest.mark.parametrize("number", [b"0e999", b"0." + 400 * b"0", b"1e300", b"5e-324", b"1e-0300"])
+@pytest.mark.parametrize("number", [b"0e999", b"0." + 400 * b"0", b"1e99", b"5e-324", b"1e-0300"])
 def test_a_number_that_a_float_holds(number: bytes) -> None:
     (told,) = decode("fdhil.v1.mill-1.records", payload_of(GOOD).replace(b"0.05", number))
     assert isinstance(told, Record)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -13,7 +14,9 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil.cli.demo.toml import to_toml
-from fdhil.errors import ConfigError
+from fdhil.cli.doctor.uplink import _outbox
+from fdhil.errors import ConfigError, StoreError
+from fdhil.records import Notice
 from fdhil.store import outbox
 from fdhil.store.history import FILE_NAME, History
 from fdhil.store.outbox import OutboxReader, Position, read_position, write_position
@@ -97,6 +100,33 @@ def often(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(outbox, "PRUNE_EVERY", 10)
 
 
+@pytest.mark.parametrize("running", [True, False])
+def test_an_older_copy_of_the_history_is_sent_under_an_identity_of_its_own(running: bool, machine: Machine) -> None:
+    machine.record(1)
+    history = machine.config.store.directory / FILE_NAME
+    shutil.copy(history, history.with_name("backup"))
+    machine.record(2)
+    with reading(machine) as reader:
+        *_, last = reader.entries(0, 1000)
+        sent = Position(reader.store, last.number, last.message)
+    write_position(folder_of(machine), sent)
+    if running:
+        history.with_name("backup").replace(history)
+        assert [notice.code for notice in machine.store.keep([])] == ["StoreReplaced"]
+    else:
+        machine.close()
+        history.with_name("backup").replace(history)
+        with reading(machine) as reader, pytest.raises(StoreError, match="is an older copy"):
+            reader.start(sent)
+        assert [trouble.code for trouble in _outbox(machine.config)] == ["UplinkOutbox"]
+        assert machine.store.open() == []
+    machine.store.keep([Notice("A", "minor", "after")])
+    with reading(machine) as reader:
+        assert reader.store != sent.store
+        assert reader.start(sent) == Position(reader.store)
+        assert [(entry.number, entry.row["text"]) for entry in reader.entries(0, 1000)] == [(1, "after")]
+
+
 @pytest.mark.usefixtures("often")
 def test_what_was_sent_goes_and_the_last_stays_to_be_known_again(machine: Machine) -> None:
     machine.record(3)
@@ -129,27 +159,27 @@ def test_when_it_is_full_the_oldest_go_and_are_counted(tmp_path: Path) -> None:
     machine.close()
 
 
+@pytest.mark.usefixtures("often")
 @pytest.mark.parametrize(
-    "content", ["", "{", "[]", "{}", '{"entry": "7"}', '{"store": 1, "entry": 3}', '{"entry": 1e9}', "[" * 2000]
-)
+    "content",
+    ["", "{", "[]", "{}", '{"entry": "7"}', '{"store": 1, "entry": 3}', '{"entry": 1e9}', "[" * 2000,
+     '{"entry": -1}', '{"entry": 9223372036854775808}'],
+)  # fmt: skip
 def test_a_damaged_position_is_the_beginning(content: str, machine: Machine) -> None:
     machine.record(1)
     (folder_of(machine) / outbox.POSITION_FILE).write_text(content)
     with reading(machine) as reader:
         assert reader.start(read_position(folder_of(machine))).entry == 0
+    machine.record(2)  # which lets go what was sent
 
 
-def test_the_position_of_another_file_or_an_older_copy_is_the_beginning(machine: Machine) -> None:
+def test_the_position_of_another_file_is_the_beginning(machine: Machine) -> None:
     machine.record(1)
     with reading(machine) as reader:
         third = reader.entries(0, 10)[2]
         good = Position(reader.store, third.number, third.message)
         assert reader.start(good) == good
-        for other in (
-            replace(good, store="0" * 32),
-            replace(good, message="0" * 64),
-            replace(good, entry=10_000),
-        ):
+        for other in (replace(good, store="0" * 32), replace(good, message="0" * 64)):
             assert reader.start(other) == Position(reader.store)
 
 

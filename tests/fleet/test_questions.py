@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -66,6 +67,7 @@ async def test_the_questions(
         (f"mill-{k}", {0: 22, 3: 33}.get(k, 21), 0) for k in range(6)
     ]
     assert [m["open_notices"] for m in document["machines"]] == [1, 3, 3, 6, 3, 3]
+    assert {m["doubt"] for m in document["machines"]} == {None}
     first = document["machines"][0]["axes"]["Y"]
     assert (first["revision"], first["parameters"]["ft"]["value"]) == (3, 0.05)
     assert first["parameters"]["ft"]["low"] < 0.05 < first["parameters"]["ft"]["high"]
@@ -102,6 +104,34 @@ async def test_records_that_do_not_come_are_counted(
     document, text = asked(capsys, 0, "status", works)
     assert document["machines"][0]["missing"] == 3
     assert f"{count - 3} records, 3 RECORDS MISSING" in text
+
+
+@pytest.mark.parametrize("same_history", [True, False])
+async def test_two_machines_of_one_name_are_reported(
+    same_history: bool, works: Path, database: Postgres, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = Machine(written(tmp_path / "1", "mill-1"))
+    first.record(1)
+    if same_history:
+        first.close()
+        shutil.copytree(tmp_path / "1", tmp_path / "2")
+        first = Machine(tmp_path / "1" / "machine.toml")
+        second = Machine(tmp_path / "2" / "machine.toml")
+    else:
+        second = Machine(written(tmp_path / "2", "mill-1"))
+    begun = [told_by(first), told_by(second)]
+    first.record(2)
+    second.record(1, parameters={"ft": 0.4})
+    for machine in (first, second):
+        machine.close()
+    later = [told_by(machine)[len(before) :] for machine, before in zip((first, second), begun, strict=True)]
+    messages = [begun[0], begun[1], *later]
+    await gather(fleet_of(database, tmp_path), [message for part in messages for message in part])
+    document, text = asked(capsys, 0, "status", works)
+    (told,) = document["machines"]
+    assert "two machines send under this name" in told["doubt"]
+    assert told["missing"] == 0
+    assert "give each machine a name of its own" in text
 
 
 def test_a_database_without_the_fleet_is_told(works: Path, capsys: pytest.CaptureFixture[str]) -> None:

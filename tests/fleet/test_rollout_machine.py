@@ -15,7 +15,7 @@ import pytest
 from fdhil import config as machine_config
 from fdhil.errors import OutputError, StoreError
 from fdhil.fleet import offered
-from fdhil.fleet.offer import OfferRefused
+from fdhil.fleet.offer import Offer, OfferRefused
 from fdhil.fleet.offered import Judged, accept, judge, kept_file, present, reject
 from fdhil.store.atomic import write_file
 from fdhil.store.offers import (
@@ -142,6 +142,19 @@ def test_an_older_version_never_follows_a_newer_one(works: Works, file: Path) ->
     assert "offered version 5 in its place" in judged(works, file, version=4).wrong
     assert judge(lie / file_name("friction", 7), present(file)).wrong == "it is no file; have it written again"
     assert judge(lie, present(file)).wrong == "it is no file; have it written again"
+
+
+def test_a_version_that_was_accepted_is_not_accepted_with_other_values(works: Works, file: Path) -> None:
+    accept(works.carried(), file, "Bert", may_loosen=False)
+    before = file.read_bytes()
+    for other in ({"values": {"axis.X.nominal.ft": 0.09}}, {"values": {"axis.X.nominal.ft": 0.09}, "stage": 2}):
+        with pytest.raises(OfferRefused, match="was accepted with other values by Bert"):
+            accept(works.carried(**other), file, "Bert", may_loosen=True)
+    assert file.read_bytes() == before
+    assert judged(works, file, stage=2).wrong == ""  # a later stage of the same change
+    kept_file(file, Offer(**TOLD)).replace(file)
+    accept(works.carried(), file, "Bert", may_loosen=False)  # the same document, after the old values were put back
+    assert file.read_bytes() == before
 
 
 def test_a_loosened_limit_is_named_and_asked_for(works: Works, file: Path) -> None:

@@ -104,9 +104,9 @@ class Connected:
 
 
 @asynccontextmanager
-async def connected(devices_xml: str, port: int) -> AsyncIterator[Connected]:
-    """Connect an agent to an adapter on this computer until the block is left."""
-    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+async def connected(devices_xml: str, port: int, address: str = "127.0.0.1") -> AsyncIterator[Connected]:
+    """Connect an agent from an address of this computer to an adapter there until the block is left."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", port, local_addr=(address, 0))
     agent = Connected(Agent(devices_xml), reader, writer)
     try:
         yield agent

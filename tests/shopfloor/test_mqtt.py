@@ -223,6 +223,22 @@ async def test_a_primary_host_is_waited_for_and_left_when_it_goes(tmp_path: Path
     assert broker.host.verbs[-1] == "NDEATH"
 
 
+async def test_a_host_state_of_the_far_future_does_not_silence_the_publisher(tmp_path: Path) -> None:
+    daemon, session = Daemon(tmp_path), session_of(primary_host="scada")
+    session.node.will(NOW)
+    broker, state = Broker(), "spBv1.0/STATE/scada"
+    serving = asyncio.create_task(session.run(cast(aiomqtt.Client, broker)))
+    session.hear(daemon.news())
+    broker.send(state, host_says(False, 4_000_000_000_000))
+    broker.send(state, host_says(True, NOW))
+    await broker.until(is_born)
+    broker.send(state, host_says(True, 10**400))
+    broker.send(state, host_says(False, NOW + 1))
+    with pytest.raises(ExceptionGroup) as gone:
+        await serving
+    assert gone.group_contains(HostGone)
+
+
 async def test_a_broker_that_is_not_there_is_told_of_once_and_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -208,6 +208,9 @@ async def test_one_agent_too_many_is_sent_away(tmp_path: Path) -> None:
             await agent.until(lambda agent: agent.pongs)
         async with connected(text, port) as another:
             await another.until_let_go()
+        async with connected(text, port, "127.0.0.2") as elsewhere:  # one address has no claim to all places
+            elsewhere.send(b"* PING\n")
+            await elsewhere.until(lambda agent: agent.pongs)
 
 
 async def test_who_only_listens_makes_room_for_an_agent(tmp_path: Path) -> None:

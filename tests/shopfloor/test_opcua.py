@@ -24,7 +24,7 @@ from fdhil.errors import ConnectError
 from fdhil.shopfloor.news import Listener
 from fdhil.shopfloor.opcua import Served, publish, serving
 from fdhil.shopfloor.opcua_nodes import OWN
-from fdhil.shopfloor.opcua_security import Doorkeeper
+from fdhil.shopfloor.opcua_security import MOST_CONNECTIONS, Doorkeeper
 from fdhil.shopfloor.opcua_subscriptions import is_news
 from fdhil.shopfloor.published import AXIS, BUS, MACHINE
 from tests.daemon.machine import Machine, config_of
@@ -325,6 +325,20 @@ async def test_nonsense_on_the_wire_ends_its_own_connection_alone(stage: Stage, 
     assert await (await own(client, "state")).read_value() == "ACTIVE"
 
 
+async def test_connections_of_one_address_keep_no_other_out(stage: Stage) -> None:
+    held = [await asyncio.open_connection("127.0.0.1", stage.served.port) for _ in range(MOST_CONNECTIONS + 4)]
+    async with asyncio.timeout(PATIENCE_S):
+        for reader, _ in held[MOST_CONNECTIONS:]:
+            assert await reader.read() == b""
+        there = [
+            await asyncio.open_connection("127.0.0.1", stage.served.port, local_addr=("127.0.0.2", 0)) for _ in range(2)
+        ]
+        for reader, _ in held[:2]:
+            assert await reader.read() == b""  # they made room
+    for _, writer in (*held, *there):
+        writer.close()
+
+
 @asynccontextmanager
 async def guarded(folder: Path, **keys: Any) -> AsyncIterator[str]:
     """Serve with a certificate and a user; yield the address."""
@@ -387,6 +401,34 @@ async def test_who_enters_is_known_by_certificate_and_password(
     said = capfd.readouterr()
     assert PASSWORD not in said.out + said.err
     assert addresses == {"127.0.0.1"}  # by which wrong passwords are counted
+
+
+@pytest.mark.usefixtures("long_computation")
+async def test_a_user_and_a_certificate_that_are_removed_may_read_nothing_more(tmp_path: Path) -> None:
+    trusted = tmp_path / "trusted"
+    trusted.mkdir()
+    for name in ("scada", "mes"):
+        certificate, _ = await certificates(tmp_path, name, f"urn:{name}")
+        (trusted / f"{name}.der").write_bytes(certificate.read_bytes())
+    async with guarded(tmp_path, trusted_clients=str(trusted)) as url:
+        client = Client(url, PATIENCE_S)
+        client.application_uri = "urn:scada"
+        await client.set_security(
+            SecurityPolicyBasic256Sha256, str(tmp_path / "scada.der"), str(tmp_path / "scada.pem")
+        )
+        client.set_user("scada")
+        client.set_password(PASSWORD)
+        async with client:
+            state = await own(client, "state")
+            assert (await told_of(state)).StatusCode.name == "Good"
+            write_users(tmp_path / "users.json", {})
+            assert await refused(told_of(state)) == BadUserAccessDenied.__name__
+        write_users(tmp_path / "users.json", {"scada": hashed(PASSWORD, "watch")})
+        assert await entered(url, tmp_path, "mes", "scada", PASSWORD) == "Good"
+        (trusted / "mes.der").unlink()
+        assert await refused(entered(url, tmp_path, "mes", "scada", PASSWORD)) != "let in"
+        (trusted / "scada.der").unlink()
+        assert await refused(entered(url, tmp_path, "scada", "scada", PASSWORD)) != "let in"
 
 
 @pytest.mark.parametrize(

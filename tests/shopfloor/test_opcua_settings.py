@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from fdhil.config.users import hashed
+from fdhil.config.users import UsersFile, hashed, write_users
 from fdhil.errors import ConfigError
 from fdhil.shopfloor.opcua_security import MOST_FAILURES, Doorkeeper
 from fdhil.shopfloor.opcua_shown import UNITS, unit_of
@@ -22,9 +22,10 @@ def test_every_unit_has_a_common_code() -> None:
     assert unit_of("N.m/A").UnitId == 4602160  # as OPC Foundation's table of UNECE codes has F90
 
 
-def test_guessing_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_guessing_is_ended(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("fdhil.shopfloor.opcua_security.matches", lambda user, password: password == PASSWORD)
-    door = Doorkeeper({"scada": hashed(PASSWORD, "watch")})
+    write_users(tmp_path / "users.json", {"scada": hashed(PASSWORD, "watch")})
+    door = Doorkeeper(UsersFile(tmp_path / "users.json"))
     assert door.get_user(None, "scada", PASSWORD) is not None
     for _ in range(MOST_FAILURES):
         assert door.get_user(None, "scada", "wrong") is None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,17 @@ import pytest
 
 from fdhil.config.users import Role, User, matches, read_users, write_users
 from fdhil.errors import ConfigError
-from fdhil.web.access import FREE_GUESSES, IDLE_S, LIFE_S, LONGEST_WAIT_S, MOST_TOKENS, Access, Asker, place_of
+from fdhil.web.access import (
+    FREE_GUESSES,
+    IDLE_S,
+    LIFE_S,
+    LONGEST_WAIT_S,
+    MOST_TOKENS,
+    Access,
+    Asker,
+    Turns,
+    place_of,
+)
 from fdhil.web.answers import Refused
 from tests.web.clients import PASSWORD, user
 
@@ -122,6 +133,13 @@ def test_tokens_are_kept_as_digests_and_only_so_many(access: Access) -> None:
     assert hashlib.sha256(tokens[-1].encode()).hexdigest() in kept
 
 
+def test_who_logs_in_again_and_again_ends_nobody_elses_login(access: Access) -> None:
+    token, _ = access.begin("op", user("operate"))
+    tokens = [access.begin("ann", user("watch"))[0] for _ in range(2 * MOST_TOKENS)]
+    assert access.asker(token) is not None
+    assert [access.asker(each) is not None for each in (tokens[0], tokens[-1])] == [False, True]
+
+
 async def test_guesses_are_slowed_down_by_user_and_by_address(
     access: Access, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -136,11 +154,13 @@ async def test_guesses_are_slowed_down_by_user_and_by_address(
         with pytest.raises(Refused, match="name or password is wrong"):
             await access.log_in("op", f"guess {k}", "192.0.2.1")
     with pytest.raises(Refused, match="too many logins failed") as told:
-        await access.log_in("op", PASSWORD, "192.0.2.2")  # elsewhere, the same user
-    assert told.value.status == 429
-    with pytest.raises(Refused, match="too many"):
         await access.log_in("ann", PASSWORD, "192.0.2.1")  # the same place, another user
+    assert told.value.status == 429
     assert len(looked) == FREE_GUESSES  # a refused one costs nothing
+    with pytest.raises(Refused, match="name or password is wrong"):
+        await access.log_in("op", "guess", "192.0.2.2")  # elsewhere, the same user: one guess, and no more
+    with pytest.raises(Refused, match="too many"):
+        await access.log_in("op", "guess", "192.0.2.2")
     clock.now_s += LONGEST_WAIT_S
     await access.log_in("op", PASSWORD, "192.0.2.2")
     await access.log_in("op", PASSWORD, "192.0.2.2")  # and all is forgotten
@@ -174,14 +194,50 @@ async def test_a_stranger_does_not_lock_out_who_has_logged_in_where_he_is(
     for k in range(FREE_GUESSES):
         with pytest.raises(Refused, match="name or password is wrong"):
             await access.log_in("op", "a guess", f"198.51.100.{k}")
-    with pytest.raises(Refused, match="too many"):
-        await access.log_in("op", PASSWORD, "198.51.100.77")  # where he never was
+    await access.log_in("op", PASSWORD, "198.51.100.77")  # where he never was, and nobody guessed
     await access.log_in("op", PASSWORD, "192.0.2.1")
     for _ in range(FREE_GUESSES):
         with pytest.raises(Refused, match="name or password is wrong"):
             await access.log_in("op", "a guess", "192.0.2.1")
     with pytest.raises(Refused, match="too many"):
         await access.log_in("op", PASSWORD, "192.0.2.1")  # but where he is it is guessed no faster than elsewhere
+
+
+async def test_a_guess_from_each_of_many_addresses_locks_nobody_out(
+    access: Access, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fdhil.web.access.matches", lambda _, password: password == PASSWORD)
+
+    async def guess(k: int) -> str:
+        try:
+            await access.log_in("op", "a guess", f"198.51.{k // 100}.{k % 100}")
+        except Refused as refused:
+            return str(refused.document["code"])
+        return "in"
+
+    for _ in range(6):
+        guesses = [asyncio.create_task(guess(k)) for k in range(183)]
+        await asyncio.sleep(0)
+        await access.log_in("op", PASSWORD, "192.0.2.9")
+        assert set(await asyncio.gather(*guesses)) <= {"AuthRequired", "TooMany"}
+        access._places.clear()  # as after a restart
+
+
+async def test_passwords_are_checked_in_order_of_wrong_ones_and_one_who_leaves_delays_nobody() -> None:
+    turns, order = Turns(), list[str]()
+
+    async def check(place: str, wrong: int) -> None:
+        async with turns.turn(place, wrong):
+            order.append(f"{place} {wrong}")
+            await asyncio.sleep(0)
+
+    waiting = [("a", 9), ("f", 5), ("b", 5), ("c", 3), ("d", 4), ("e", 2), ("b", 5), ("a", 0)]
+    tasks = [asyncio.create_task(check(*each)) for each in waiting]
+    await asyncio.sleep(0)
+    tasks[5].cancel()
+    results = await asyncio.gather(*tasks, return_exceptions=True)
+    assert order == ["a 9", "a 0", "c 3", "d 4", "b 5", "f 5"]
+    assert [type(result) for result in results if result] == [Refused, asyncio.CancelledError]  # the older one of b
 
 
 async def test_one_computer_is_one_place_however_many_addresses_it_has(

@@ -17,14 +17,17 @@ from anyio import to_thread
 
 from fdhil.arming.token import ensure_token
 from fdhil.config import MachineConfig
+from fdhil.config.users import Role, write_users
 from fdhil.web.app import make_app
 from tests.daemon.machine import Machine
 from tests.daemon.test_service import serving
-from tests.web.clients import OWN, client_of, daemon_that, machine_of
+from tests.web.clients import OWN, client_of, daemon_that, machine_of, user
 
 PROGRAM = b"G21 G90\nG1 X10 F1000\nM2\n"
 DIGEST = hashlib.sha256(PROGRAM).hexdigest()
 ARMED = {"ok": True, "state": "ARMED", "text": "armed part.ngc", "program_digest": DIGEST}
+LIMITS = {"max_offset_um": 250.0, "max_speed_mm_s": 20.0, "max_acceleration_mm_s2": 2000.0, "max_torque_nm": None}
+RUNNING = {"config_digest": "another", "limits": {"X": {**LIMITS, "max_speed_rad_s": None}}}
 PLAN = "/api/machine/plan?program=part.ngc"
 
 
@@ -37,7 +40,11 @@ def config(tmp_path: Path) -> MachineConfig:
 
 def granting(request: Mapping[str, Any]) -> Mapping[str, Any]:
     """Answer as a daemon does to whom nothing is wrong."""
-    return ARMED if request["request"] == "arm" else {"ok": True, "state": "OFF", "text": "guard: OFF, offset 0"}
+    if request["request"] == "arm":
+        return ARMED
+    return {"ok": True, "state": "OFF", "text": "guard: OFF, offset 0"} | (
+        RUNNING if request["request"] == "status" else {}
+    )
 
 
 async def confirmed(client: httpx.AsyncClient) -> dict[str, Any]:
@@ -52,7 +59,8 @@ async def test_what_would_move_is_shown_and_that_is_armed_by_name(config: Machin
         choice = (await client.get("/api/machine/programs")).json()
         plan = (await client.get(PLAN)).json()
         assert [program["name"] for program in choice["programs"]] == ["part.ngc"]
-        assert plan["axes"]["X"]["max_offset_um"] == 250.0
+        assert plan["axes"]["X"]["max_offset_um"] == 250.0  # the daemon's, whatever the file says
+        assert "the daemon runs with another configuration than the file" in plan["difference"]
         assert plan["program"]["sha256"] == DIGEST
         assert "path" not in plan["program"]
         assert all(request["request"] == "status" for request in asked)  # showing does nothing
@@ -171,6 +179,29 @@ async def test_who_goes_away_while_a_program_is_checked_has_nothing_armed(config
     async with daemon_that(config, checking, abandoned.set), client_of(app, "operator") as client:
         await _posting(app, client, await confirmed(client), gone)
         await abandoned.wait()
+
+
+@pytest.mark.usefixtures("real_time")
+@pytest.mark.parametrize("left", [{}, {"operator": "watch"}])
+async def test_a_user_who_is_removed_while_a_program_is_checked_has_nothing_armed(
+    config: MachineConfig, tmp_path: Path, left: dict[str, Role]
+) -> None:
+    ensure_token(_made(config))
+    abandoned = asyncio.Event()
+
+    async def checking(request: Mapping[str, Any]) -> Mapping[str, Any]:
+        if request["request"] == "arm":
+            write_users(tmp_path / "users.json", {name: user(role) for name, role in left.items()})
+            await abandoned.wait()
+        return granting(request)
+
+    async with (
+        daemon_that(config, checking, abandoned.set),
+        client_of(make_app(config), "operator", **OWN) as client,
+    ):
+        answer = await client.post("/api/machine/arm", json=await confirmed(client))
+        await abandoned.wait()
+    assert (answer.status_code, answer.json()["code"]) == (401, "AuthRequired")
 
 
 async def _posting(app: Any, client: httpx.AsyncClient, document: dict[str, Any], gone: asyncio.Event) -> None:

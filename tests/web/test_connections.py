@@ -69,7 +69,7 @@ async def test_who_takes_every_connection_keeps_nobody_out(sent: bytes, tmp_path
 
 
 async def test_sockets_that_never_end_keep_nobody_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fdhil.web.pages.live.MAX_BROWSERS", 0)
+    monkeypatch.setattr("fdhil.web.live_feed.MAX_BROWSERS", 0)
     async with served(tmp_path, users=False) as port:
         socket_head = b"Connection: upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
         socket_head += b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nHost: localhost\r\n\r\n"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
@@ -22,6 +23,7 @@ from fdhil.config.users import hashed, write_users
 from fdhil.daemon.control import SOCKET_NAME, ControlServer
 from fdhil.daemon.live import LiveStream
 from fdhil.web.app import make_app
+from fdhil.web.live_feed import MAX_BROWSERS, LiveFeed, Viewer
 from fdhil.web.pages import live as page
 from tests.daemon.machine import config_of
 from tests.daemon.test_live import block
@@ -108,10 +110,11 @@ class Browser:
         return sum(part["columns"] * part["per_column"] for part, _ in self.parts)
 
 
-async def heard_out(socket: ClientConnection) -> None:
+async def heard_out(socket: ClientConnection, told: list[object] | None = None) -> None:
     """Take messages until the server closes; ConnectionClosed."""
+    told = [] if told is None else told
     while True:
-        await asyncio.wait_for(socket.recv(), WAIT_S)
+        told.append(await asyncio.wait_for(socket.recv(), WAIT_S))
 
 
 async def begun(socket: ClientConnection) -> tuple[dict[str, Any], Browser]:
@@ -226,7 +229,7 @@ async def _said(place: str, query: str, says: str | bytes | None) -> None:
 
 
 async def test_so_many_may_look_on_and_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page, "MAX_BROWSERS", 2)
+    monkeypatch.setattr("fdhil.web.live_feed.MAX_BROWSERS", 2)
     async with pages(config_of(tmp_path)) as place, stream_of(place) as first, stream_of(place) as second:
         for socket in (first, second):
             await socket.recv()
@@ -243,11 +246,35 @@ async def test_so_many_may_look_on_and_no_more(tmp_path: Path, monkeypatch: pyte
                     continue
 
 
+async def test_browsers_that_never_draw_make_room_for_one_that_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fdhil.web.live_feed.MAX_BROWSERS", 2)
+    monkeypatch.setattr("fdhil.web.live_feed.UNDRAWN_S", -1.0)
+    async with pages(config_of(tmp_path)) as place, stream_of(place) as first, stream_of(place) as second:
+        for socket in (first, second):
+            await socket.recv()
+        async with stream_of(place) as third:
+            assert json.loads(await third.recv())["axes"] == ["X"]
+            with pytest.raises(ConnectionClosed, match="another browser has this place"):
+                await heard_out(first)
+
+
+def test_an_owner_of_all_places_makes_room_for_another_owner(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    feed = LiveFeed(tmp_path / "none", {"X": None}, 1e-3)
+    feed.viewers = [Viewer("anna", time.monotonic()) for _ in range(MAX_BROWSERS)]
+    assert not feed.make_room("anna")
+    assert feed.make_room("otto")
+    assert (len(feed.viewers), feed.viewers[0].replaced) == (MAX_BROWSERS - 1, False)
+    feed.viewers += [Viewer("otto", time.monotonic())]
+    feed.viewers = [Viewer(f"user {k // 2}", time.monotonic()) for k in range(MAX_BROWSERS)]
+    assert not feed.make_room("user 0")  # as many as others
+
+
 @pytest.mark.usefixtures("long_computation")
 async def test_a_stranger_is_told_nothing_and_a_login_that_ends_ends_the_stream(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(page, "LOGIN_S", 0.05)
     write_users(tmp_path / "users.json", {"ann": hashed(PASSWORD, "watch")})
     config = config_of(tmp_path, web={"users_file": "users.json"})
     async with (
@@ -274,3 +301,11 @@ async def test_a_stranger_is_told_nothing_and_a_login_that_ends_ends_the_stream(
             await client.delete("/api/session", headers={"Authorization": f"Bearer {token}"})
             with pytest.raises(ConnectionClosed, match="the login has ended"):
                 await heard_out(socket)
+        token = (await client.post("/api/session", json={"name": "ann", "password": PASSWORD})).json()["token"]
+        async with stream_of(place, subprotocols=["fdhil", f"bearer.{token}"]) as socket:
+            await socket.recv()
+            write_users(tmp_path / "users.json", {})
+            told: list[object] = []
+            with pytest.raises(ConnectionClosed, match="the login has ended"):
+                await heard_out(socket, told)
+            assert len(told) <= 1  # which was on its way

@@ -16,7 +16,7 @@ from fdhil.web import daemon as asking
 from fdhil.web import live_feed
 from fdhil.web.daemon import Daemon
 from fdhil.web.forecast import desk
-from fdhil.web.live_feed import LiveFeed
+from fdhil.web.live_feed import LiveFeed, Viewer
 from tests.web.clients import machine_of
 
 WAIT_S = 60.0
@@ -65,7 +65,7 @@ async def test_a_stream_of_nonsense_is_told_and_the_next_one_is_read(
     feed = LiveFeed(tmp_path / "s", {"X": None}, 1e-3)
     async with listening(tmp_path / "s", f"{begin}\n{line}", f"{begin}\n{warm}") as asked:
         task = asyncio.create_task(feed.run())
-        async with feed.watched(), asyncio.timeout(WAIT_S):
+        async with feed.watched(Viewer("", 0.0)), asyncio.timeout(WAIT_S):
             while len(asked) < 2 or feed.trouble:
                 await asyncio.sleep(0.01)
                 assert not task.done()

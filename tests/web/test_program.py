@@ -226,7 +226,7 @@ def test_what_is_asked_wrongly_is_told(client: Client, judged: dict[str, Any]) -
     assert client.post("/api/program", params={"name": "a"}, content=b"", headers=WRITES).status_code == 422
 
 
-async def test_programs_that_are_being_sent_are_counted_as_those_that_wait(
+async def test_programs_that_are_still_being_sent_take_no_places_and_those_that_were_sent_do(
     machine: MachineConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def never(*_: Any) -> None:
@@ -239,6 +239,9 @@ async def test_programs_that_are_being_sent_are_counted_as_those_that_wait(
         yield content
         await sent.wait()
 
+    async def whole() -> AsyncIterator[bytes]:
+        yield b"G0 Z1"
+
     empty = [asyncio.create_task(taking.take("empty.ngc", pieces(b""))) for _ in range(places)]
     await asyncio.sleep(0)
     sent.set()
@@ -250,6 +253,14 @@ async def test_programs_that_are_being_sent_are_counted_as_those_that_wait(
     answers = await asyncio.gather(*programs, return_exceptions=True)
     assert [isinstance(answer, desk.Job) for answer in answers] == [True] * places + [False] * 5
     assert answers[places:] == [AnyRefusal("TooMany")] * 5
+    for job in taking.jobs:
+        await taking.cancel(job.digest)
+    sent.clear()
+    slow = [asyncio.create_task(taking.take("slow.ngc", pieces(b"G0 Y%d" % k))) for k in range(places + 5)]
+    await asyncio.sleep(0)
+    assert isinstance(await taking.take("a.ngc", whole()), desk.Job)
+    sent.set()
+    await asyncio.gather(*slow, return_exceptions=True)
     await taking.close()
 
 

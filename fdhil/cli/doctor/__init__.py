@@ -64,6 +64,7 @@ def _in_order(config: MachineConfig, offline: bool) -> Iterator[Trouble]:
         heard = {name for name, troubles in buses.items() if not any(trouble.grave for trouble in troubles)}
         recorded = {trouble.place for trouble in secrets if trouble.code == storage.RECORD_BAD}
         yield from devices.examine_devices(config, heard, recorded, print_progress)
+    yield from _seen("daemon", lambda: devices.examine_daemon(config))
     yield from _seen("guard", lambda: devices.examine_guard(config))
     yield from _seen("uplink", lambda: uplink.examine_uplink(config, offline))
     yield from _seen("offers", lambda: offers.examine_offers(config))

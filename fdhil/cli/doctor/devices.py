@@ -7,6 +7,9 @@ from fdhil.cli.doctor.trouble import Trouble
 from fdhil.commissioning.compare import POINT
 from fdhil.commissioning.config_check import Place, check_machine
 from fdhil.config import MachineConfig
+from fdhil.daemon.control import SOCKET_NAME as DAEMON_SOCKET
+from fdhil.daemon.control import ask
+from fdhil.daemon.status import config_difference
 from fdhil.errors import DeviceError
 from fdhil.guard.protocol import SOCKET_NAME
 
@@ -59,6 +62,22 @@ def troubles_of(found: Sequence[Place]) -> list[Trouble]:
         for place, finding in differ
         if place not in away or finding.point in ("drive", *MEANS)
     ]
+
+
+def examine_daemon(config: MachineConfig) -> Iterator[Trouble]:
+    """Ask a running daemon whether the configuration is the one that it runs with."""
+    if not (config.run_directory / DAEMON_SOCKET).exists():
+        return
+    try:
+        difference = config_difference(ask(config.run_directory / DAEMON_SOCKET, {"request": "status"}), config.digest)
+    except DeviceError as error:
+        what, _, mend = str(error).partition("; ")
+        yield Trouble("DaemonSilent", "daemon", what, "nothing is identified, and nothing can be armed", mend)
+        return
+    if difference:
+        what, _, mend = difference.partition("; ")
+        means = "what is shown or edited in the file is not what the machine is corrected by"
+        yield Trouble("ConfigDiffers", "daemon", what, means, mend, False)
 
 
 def examine_guard(config: MachineConfig) -> Iterator[Trouble]:

@@ -58,7 +58,7 @@ def _outbox(config: MachineConfig) -> Iterator[Trouble]:
             waiting, first = reader.waiting(position.entry), reader.entries(position.entry, 1)
             dropped = reader.dropped
     except StoreError as error:
-        if error.code == "SchemaVersion":  # of a damaged one the store's own trouble tells
+        if error.code in ("SchemaVersion", "OlderCopy"):  # of a damaged one the store's own trouble tells
             what, _, mend = str(error).partition(": ")
             yield Trouble("UplinkOutbox", PLACE, what, "nothing is sent", mend)
         return

@@ -84,7 +84,8 @@ class ToldG0:
             state = self._new[0]
             begin_ns, end_ns = state.stamp_ns - state.error_ns, state.stamp_ns + state.error_ns
             bounds = self._clock.bounds(begin_ns, end_ns)
-            if bounds is None and not self._clock.is_past(begin_ns):
+            is_last = not any(later.stamp_ns < begin_ns for later in self._new)  # else its time stamp is wrong
+            if bounds is None and is_last and not self._clock.is_past(begin_ns):
                 return
             self._new.popleft()
             if bounds is not None:

@@ -87,7 +87,6 @@ class Desk:
         self._folder: Path | None = None
         self._jobs: OrderedDict[str, Job] = OrderedDict()
         self._one = asyncio.Semaphore(1)
-        self._coming = 0
 
     @property
     def jobs(self) -> list[Job]:
@@ -114,16 +113,9 @@ class Desk:
     async def take(self, name: str, content: AsyncIterable[bytes]) -> Job:
         """Take a program's bytes and have it forecast; the same bytes again are forecast anew, unless they are now.
 
-        Refused where too many wait or are being sent, or what came is empty.
+        Refused where too many wait, or what came is empty. One that is still being sent takes no place of others.
         """
         self._check_room()
-        self._coming += 1
-        try:
-            return await self._taken(name, content)
-        finally:
-            self._coming -= 1
-
-    async def _taken(self, name: str, content: AsyncIterable[bytes]) -> Job:
         suffix = ".csv" if name.lower().endswith(".csv") else ".ngc"
         part = self._room() / f".{os.urandom(8).hex()}.part"
         try:
@@ -131,6 +123,7 @@ class Desk:
             running = self._jobs.get(digest)
             if running is not None and not running.over:
                 return running
+            self._check_room()
             folder = self._room() / digest
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir()
@@ -158,8 +151,8 @@ class Desk:
         return job
 
     def _check_room(self) -> None:
-        if self._coming + sum(not work.over for job in self._jobs.values() for work in job.works) > MOST_WAITING:
-            text = f"{MOST_WAITING} programs wait for their turn or are being sent already, this one was not taken"
+        if sum(not work.over for job in self._jobs.values() for work in job.works) > MOST_WAITING:
+            text = f"{MOST_WAITING} programs wait for their turn already, this one was not taken"
             raise Refused(429, "TooMany", text, "wait for one of them, or cancel it")
 
     def _start(self, job: Job, work: Work) -> None:

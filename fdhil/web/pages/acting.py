@@ -12,13 +12,16 @@ from pydantic import BaseModel, Field
 from fdhil import tables
 from fdhil.arming.token import TOKEN_NAME, given_credential, read_token
 from fdhil.config import MachineConfig
+from fdhil.daemon.status import config_difference
 from fdhil.web.answers import Refused, granted
 from fdhil.web.context import Asking, Context, Here
+from fdhil.web.gate import token_of
 from fdhil.web.programs import NAME, Program, listed, look_at
 
 router = APIRouter(prefix="/api/machine")
 DISARM_S = 15.0  # the daemon waits for the guard's answer and for the ramp
 ARM_S = 600.0
+FED = ("max_torque_nm", "max_speed_rad_s")
 LOOK_S = 0.5  # whether the browser that asked is still there
 PLAN_ID = r"^[0-9a-f]{64}$"
 
@@ -53,6 +56,7 @@ class Plan(BaseModel):
     method: Method
     axes: Mapping[str, AxisReach]
     state: str
+    difference: str
     confirm: str
 
 
@@ -86,38 +90,33 @@ async def plan(
     here: Here, program: Annotated[ProgramName | None, Query()] = None, method: Annotated[Method, Query()] = "inverse"
 ) -> Plan:
     """Tell what arming would move. Nothing is done yet."""
-    found = await asyncio.to_thread(_plan, here.config, program, method)
-    status = await here.daemon.status()
-    return found.model_copy(update={"state": str(status["state"])})
+    return await _plan(here, program, method)
 
 
-def _plan(config: MachineConfig, name: str | None, method: Method) -> Plan:
+async def _plan(here: Context, name: str | None, method: Method) -> Plan:
+    """Return what the daemon that runs would arm: its limits, whatever the file says by now."""
+    config = here.config
     if name is None and method != "flatness":
         raise Refused(422, "BadRequest", f"the method {method} corrects a program, and none is named", "choose one")
-    program = look_at(config.web.programs_directory, name) if name is not None else None
-    axes = _reaches(config, feeds=program is None)
+    program = None if name is None else await asyncio.to_thread(look_at, config.web.programs_directory, name)
+    status = await here.daemon.status()
+    axes = _reaches(status["limits"], feeds=program is None)
     if not axes:
         text = "the configuration lets nothing be sent to any axis"
         raise Refused(409, "WritingOff", text, "see how a correction is commissioned in docs/how-to/commission.md")
     told = [program and program.sha256, method, {axis: reach.model_dump() for axis, reach in axes.items()}]
     confirm = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
-    return Plan(program=program, method=method, axes=axes, state="", confirm=confirm)
+    state, difference = str(status["state"]), config_difference(status, config.digest)
+    return Plan(program=program, method=method, axes=axes, state=state, difference=difference, confirm=confirm)
 
 
-def _reaches(config: MachineConfig, feeds: bool) -> dict[str, AxisReach]:
+def _reaches(limits: Mapping[str, Mapping[str, float | None]], feeds: bool) -> dict[str, AxisReach]:
     """Return the limits of the axes that are sent to: position offsets, or with ``feeds`` speed and torque."""
-    found = {}
-    for name, axis in config.axis.items():
-        offset, feed = axis.correction, axis.feedforward if feeds else None
-        if offset is not None and (feed is not None or not feeds):
-            found[name] = AxisReach(
-                max_offset_um=None if feeds else offset.max_offset_um,
-                max_speed_mm_s=None if feeds else offset.max_speed_mm_s,
-                max_acceleration_mm_s2=None if feeds else offset.max_acceleration_mm_s2,
-                max_torque_nm=feed and feed.max_torque_nm,
-                max_speed_rad_s=feed and feed.max_speed_rad_s,
-            )
-    return found
+    return {
+        name: AxisReach(**{key: None if (key in FED) is not feeds else value for key, value in told.items()})
+        for name, told in limits.items()
+        if not feeds or told["max_torque_nm"] is not None
+    }
 
 
 @router.post("/arm")
@@ -126,7 +125,7 @@ async def arm(arming: Arming, request: Request, here: Here, asking: Asking) -> D
 
     What the daemon then says it has armed is compared with what was shown, and disarmed where it differs.
     """
-    shown = await asyncio.to_thread(_plan, here.config, arming.program, arming.method)
+    shown = await _plan(here, arming.program, arming.method)
     if shown.confirm != arming.confirm:
         text = "the program or the limits are not those that were shown; nothing is armed"
         raise Refused(409, "PlanChanged", text, "look at what is shown now, and confirm again")
@@ -148,12 +147,16 @@ async def arm(arming: Arming, request: Request, here: Here, asking: Asking) -> D
 
 
 async def _while_there(request: Request, here: Context, asked: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Ask the daemon as long as the browser waits for it; by its progress the daemon notices that nobody does."""
+    """Ask the daemon as long as the browser waits and its user may arm; else the daemon abandons the check."""
     asking = asyncio.ensure_future(here.daemon.ask(asked, ARM_S, progress=lambda _: None))
     try:
         while not (await asyncio.wait([asking], timeout=LOOK_S))[0]:
             if await request.is_disconnected():
                 raise Refused(409, "Abandoned", "nobody waited for the answer, nothing is armed", "arm again")
+            asker = here.access.asker(token_of(request.headers))
+            if asker is None or asker.role != "operate":
+                text = "the login has ended, or the user lost the role operate: nothing is armed"
+                raise Refused(401, "AuthRequired", text, "log in again")
         return await asking
     finally:
         asking.cancel()

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from typing import Annotated, Any, Literal
@@ -12,17 +13,16 @@ from starlette.requests import HTTPConnection
 from starlette.websockets import WebSocketDisconnect
 
 from fdhil.daemon.control import SOCKET_NAME
+from fdhil.web.access import place_of
 from fdhil.web.answers import Refused
-from fdhil.web.context import Here
+from fdhil.web.context import Asking, Here
 from fdhil.web.gate import token_of
-from fdhil.web.live_feed import KEPT_S, LiveFeed
+from fdhil.web.live_feed import KEPT_S, MAX_BROWSERS, LiveFeed, Viewer
 from fdhil.web.live_ring import DRAWN, UNITS
 from fdhil.web.live_view import View, finite
 
 TELL_S = 0.1
 ALIVE_S = 1.0
-LOGIN_S = 10.0
-MAX_BROWSERS = 8
 LEAST_S, MOST_S = 0.5, 60.0
 POLICY, TRY_LATER = 1008, 1013  # RFC 6455, 7.4.1 and the registry of close codes
 
@@ -121,6 +121,7 @@ def _axes_of(here: Here, axes: str) -> list[str]:
 async def stream(
     socket: WebSocket,
     here: Here,
+    asking: Asking,
     feed: Feed,
     seconds: Annotated[float, Query(ge=LEAST_S, le=MOST_S)] = 20.0,
     columns: Columns = 800,
@@ -134,25 +135,25 @@ async def stream(
     except Refused as refused:
         await socket.close(POLICY, refused.document["text"])
         return
-    if feed.viewers >= MAX_BROWSERS:
+    owner = asking.name or place_of(socket.client.host if socket.client else "")
+    if not feed.make_room(owner):
         await socket.close(TRY_LATER, f"{MAX_BROWSERS} browsers look on already; close one of them")
         return
     view = View(named, seconds, columns, feed.period_s)
     signals = [{"name": name, "unit": UNITS[name]} for name in DRAWN]
     begin = {"sync_period_s": feed.period_s, "axes": named, "signals": signals, "ticks_per_column": view.per_column}
-    async with feed.watched():
+    viewer = Viewer(owner, time.monotonic())
+    async with feed.watched(viewer):
         with suppress(WebSocketDisconnect):  # it left
             await socket.send_json({**begin, "kept_s": KEPT_S})
-            await socket.close(POLICY, await _converse(socket, view, feed, here))
+            await socket.close(POLICY, await _converse(socket, view, viewer, feed, here))
 
 
-async def _converse(socket: WebSocket, view: View, feed: LiveFeed, here: Here) -> str:
-    """Tell and hear; return why that is over. WebSocketDisconnect when the browser has left."""
-    drawn = asyncio.Event()
+async def _converse(socket: WebSocket, view: View, viewer: Viewer, feed: LiveFeed, here: Here) -> str:
+    """Send samples and receive what was drawn; return why that is over. WebSocketDisconnect if the browser left."""
     tasks = [
-        asyncio.create_task(_hear(socket, view, drawn)),
-        asyncio.create_task(_tell(socket, view, feed, drawn)),
-        asyncio.create_task(_login_ends(socket, here)),
+        asyncio.create_task(_hear(socket, view, viewer)),
+        asyncio.create_task(_tell(socket, view, viewer, feed, here)),
     ]
     try:
         over, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -163,7 +164,7 @@ async def _converse(socket: WebSocket, view: View, feed: LiveFeed, here: Here) -
     return next(iter(over)).result()
 
 
-async def _hear(socket: WebSocket, view: View, drawn: asyncio.Event) -> str:
+async def _hear(socket: WebSocket, view: View, viewer: Viewer) -> str:
     """Take in what the browser has drawn, until it says anything else."""
     while True:
         try:
@@ -172,28 +173,24 @@ async def _hear(socket: WebSocket, view: View, drawn: asyncio.Event) -> str:
             told = None
         if not isinstance(told, dict) or type(told.get("drawn")) is not int:
             return 'what came is not understood; send {"drawn": the number of the newest message that was drawn}'
-        view.drawn(told["drawn"])
-        drawn.set()
+        if view.drawn(told["drawn"]):
+            viewer.drawn_s = time.monotonic()
 
 
-async def _tell(socket: WebSocket, view: View, feed: LiveFeed, drawn: asyncio.Event) -> str:
-    """Tell what is new, some ten times a second, as fast as the browser draws; a word of life when nothing is."""
-    told_s = 0.0
-    loop = asyncio.get_running_loop()
+async def _tell(socket: WebSocket, view: View, viewer: Viewer, feed: LiveFeed, here: Here) -> str:
+    """Send what is new, some ten times a second, as fast as the browser draws; a word of life when nothing is.
+
+    The login is checked each time: a user who was removed receives no further sample.
+    """
+    told_s, token = 0.0, token_of(socket.headers)
     while True:
         await asyncio.sleep(TELL_S)
-        while not view.may_send():
-            drawn.clear()
-            await drawn.wait()
-        if view.has_news(feed.rings) or loop.time() - told_s > ALIVE_S:
-            told_s = loop.time()
-            about = {"trouble": feed.trouble, "skipped_lines": feed.skipped_lines}
-            await socket.send_bytes(view.message(feed.rings, about))
-
-
-async def _login_ends(socket: WebSocket, here: Here) -> str:
-    token = token_of(socket.headers)
-    while True:
-        await asyncio.sleep(LOGIN_S)
         if here.access.asker(token) is None:
             return "the login has ended; log in again"
+        if viewer.replaced:
+            return "another browser has this place: this one drew nothing, or its user has more; close one of them"
+        now_s = time.monotonic()
+        if view.may_send() and (view.has_news(feed.rings) or now_s - told_s > ALIVE_S):
+            told_s = now_s
+            about = {"trouble": feed.trouble, "skipped_lines": feed.skipped_lines}
+            await socket.send_bytes(view.message(feed.rings, about))

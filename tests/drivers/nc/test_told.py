@@ -225,3 +225,11 @@ def test_blocks_do_not_matter(block: int, lag: int) -> None:
     told = course(PROGRAM)
     states = exact(told, 0)
     assert edges(hear(told, states, lag, block=block)) == edges(hear(told, states, lag))
+
+
+def test_one_state_from_the_future_silences_no_other() -> None:
+    told = course(PROGRAM)
+    states = exact(told, 20 * MS)
+    source = ToldG0("X", machine(g0={"source": "linuxcnc"}))
+    source.feed(replace(states[0], stamp_ns=4 * 10**17))
+    assert edges(hear(told, states, 20, source)) == edges(hear(told, states, 20))

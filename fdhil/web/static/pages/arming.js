@@ -95,6 +95,7 @@ function planNodes(plan, {t, number, when}) {
     ? [t("machine.axis"), t("arm.torque"), t("arm.turning")] : [t("machine.axis"), t("arm.offset"), t("arm.speed"), t("arm.acceleration")];
   const keys = feeds ? ["max_torque_nm", "max_speed_rad_s"] : ["max_offset_um", "max_speed_mm_s", "max_acceleration_mm_s2"];
   return [
+    plan.difference ? el("p", {class: "fault"}, plan.difference) : null,
     el("p", {}, el("strong", {}, t(feeds ? "arm.moves.feeds" : "arm.moves", {axes: names.join(", "), program: plan.program?.name ?? ""}))),
     table({
       caption: t("arm.limits"), head,

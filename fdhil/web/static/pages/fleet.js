@@ -64,7 +64,7 @@ function machines(rows) {
   return table({
     caption: t("fleet.machines.caption"), stack: true,
     head: heads("machine", "labels", "heard", "records", "missing", "notices", "axes"),
-    rows: rows.map((row) => [row.machine, {class: "long", text: labels(row)}, minute(row.last_heard), number(row.records, 9),
+    rows: rows.map((row) => [row.doubt ? lamp("bad", `${row.machine}: ${row.doubt}`) : row.machine, {class: "long", text: labels(row)}, minute(row.last_heard), number(row.records, 9),
       row.missing > 0 ? lamp("bad", number(row.missing, 9)) : t("fleet.missing.none"),
       row.open_notices ? lamp("warn", String(row.open_notices)) : "0", axes(row)]),
   });
