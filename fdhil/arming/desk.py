@@ -34,6 +34,7 @@ from fdhil.arming.standstill import Standstill
 from fdhil.arming.stream_feeder import StreamFeeder
 from fdhil.arming.token import ensure_token
 from fdhil.arming.whole_plan import plan_whole
+from fdhil.clock import SYSTEM_CLOCK, Clock
 from fdhil.config import MachineConfig
 from fdhil.errors import DeviceError
 from fdhil.guard.protocol import LANDING
@@ -59,23 +60,25 @@ class Storing(Protocol):
 class ArmingDesk:
     """Knows when a correction may be armed, and withdraws what it no longer vouches for."""
 
-    def __init__(self, config: MachineConfig, store: Storing, run_directory: Path) -> None:
-        self._config = config
+    def __init__(
+        self, config: MachineConfig, store: Storing, run_directory: Path, clock: Clock = SYSTEM_CLOCK
+    ) -> None:
+        self._config, self._clock = config, clock
         self._store = store
         self._run_directory = run_directory
         self._token = ""
-        self.knowledge = Knowledge(config.axis)
+        self.knowledge = Knowledge(config.axis, clock)
         self._arming = asyncio.Lock()
         self._armed: tuple[Armament | Feeding, Mapping[str, Any]] | None = None
         self._check = BackgroundCheck(config)
-        self._passes = Passes(config)
+        self._passes = Passes(config, clock)
         self._standstill = Standstill(config)
         self._feeder: StreamFeeder | None = None
         self._given_up = False
         self._hung_up: Callable[[], bool] = lambda: False
         self._disarms: int | None = None
         self._disarming: asyncio.Future[Answer] | None = None
-        self.guard = GuardLink(config.guard.run_directory or run_directory, config.store.directory)
+        self.guard = GuardLink(config.guard.run_directory or run_directory, config.store.directory, clock)
 
     def begin(self, newest: Mapping[str, Revision], skills: Sequence[Skill]) -> None:
         """Start from what the history knows; the token is made where there is none. DeviceError when it cannot be."""
@@ -139,7 +142,7 @@ class ArmingDesk:
 
     async def _landed(self) -> bool:
         """Wait a moment for the end of what ramps down; return whether the guard is at rest, or absent."""
-        await in_own_thread(landed, self.guard.look, LANDING_S, LANDING)
+        await in_own_thread(landed, self.guard.look, LANDING_S, LANDING, self._clock)
         if self.guard.state in REST:
             self._release()
         return self.guard.state in REST

@@ -10,11 +10,11 @@ import json
 import os
 import socket
 import threading
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
+from fdhil.clock import SYSTEM_CLOCK, Clock
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
 from fdhil.guard import table
 from fdhil.guard.protocol import SOCKET_NAME
@@ -34,8 +34,8 @@ class GuardClient:
     no answer comes. Safe to use from two threads: ``alive`` may be called while another waits for an answer.
     """
 
-    def __init__(self, run_directory: Path, timeout_s: float = ANSWER_S) -> None:
-        self._timeout_s = timeout_s
+    def __init__(self, run_directory: Path, timeout_s: float = ANSWER_S, clock: Clock = SYSTEM_CLOCK) -> None:
+        self._timeout_s, self._clock = timeout_s, clock
         self._asking, self._sending = threading.Lock(), threading.Lock()
         self._number = 0
         self._inbox = b""
@@ -136,7 +136,7 @@ class GuardClient:
             self._number += 1
             number = self._number
             self._send({**request, "id": number}, descriptor)
-            deadline_s = time.monotonic() + (timeout_s or self._timeout_s)
+            deadline_s = self._clock.now_s() + (timeout_s or self._timeout_s)
             while True:
                 answer = self._line(deadline_s)
                 if answer.pop("id", None) == number:
@@ -154,14 +154,10 @@ class GuardClient:
 
     def _line(self, deadline_s: float) -> dict[str, Any]:
         while b"\n" not in self._inbox:
-            left_s = deadline_s - time.monotonic()
-            if left_s <= 0:
-                raise DeviceTimeout("guard", "gave no answer; look at its journal, then restart it")
-            self._socket.settimeout(left_s)
             try:
+                if not self._clock.wait_readable(self._socket, max(0.0, deadline_s - self._clock.now_s())):
+                    raise DeviceTimeout("guard", "gave no answer; look at its journal, then restart it")
                 chunk = self._socket.recv(1 << 16)
-            except TimeoutError:
-                continue
             except OSError as error:
                 raise self._lost(error.strerror or str(error)) from None
             if not chunk:

@@ -6,6 +6,7 @@ Those of asyncio's pool may all wait for a disk, and a disarm must not wait behi
 from __future__ import annotations
 
 import asyncio
+import functools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import ParamSpec, TypeVar
@@ -18,6 +19,6 @@ async def in_own_thread(call: Callable[Given, Said], *given: Given.args, **named
     """Return what a call returns; it goes on where this is cancelled."""
     thread = ThreadPoolExecutor(1, "call")
     try:
-        return await asyncio.wrap_future(thread.submit(call, *given, **named))
+        return await asyncio.get_running_loop().run_in_executor(thread, functools.partial(call, *given, **named))
     finally:
         thread.shutdown(wait=False)

@@ -10,6 +10,7 @@ from contextlib import suppress
 from typing import Any
 
 from fdhil.arming.answers import Answer
+from fdhil.clock import SYSTEM_CLOCK, Clock
 from fdhil.config import MachineConfig
 from fdhil.daemon import journal
 from fdhil.daemon.notice_book import NEWEST, NotAcknowledged, NoticeBook, acknowledgement_of, counted
@@ -87,8 +88,8 @@ class OutcomeStore:
     outcome stays in memory only, and each next one is tried again (a window always as a new file).
     """
 
-    def __init__(self, config: MachineConfig) -> None:
-        self._config = config
+    def __init__(self, config: MachineConfig, clock: Clock = SYSTEM_CLOCK) -> None:
+        self._config, self._clock = config, clock
         self._directory = config.store.directory
         self._lock = threading.Lock()
         self._outbox = Outbox(config.uplink, config.uplink_directory) if config.uplink else None
@@ -229,7 +230,7 @@ class OutcomeStore:
         """Store who has seen which notices, so that they are open no more; StoreError when the disk refuses."""
         with self._lock:
             try:
-                given = acknowledgement_of(request, self.notices.chosen(request))
+                given = acknowledgement_of(request, self.notices.chosen(request), Stamp.now(self._clock))
             except NotAcknowledged as refused:
                 return refused.answer
             if self._history is None:
@@ -245,7 +246,7 @@ class OutcomeStore:
     def _keep(self, outcome: Outcome) -> None:
         assert self._history is not None
         assert self._windows is not None
-        stamp = Stamp.now()
+        stamp = Stamp.now(self._clock)
         if isinstance(outcome, WindowOutcome):
             axis = outcome.window.axis
             last = self._history.last_window_number()

@@ -8,6 +8,7 @@ import select
 import socket
 import time
 from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 KEPT_EVENTS = 32
@@ -18,8 +19,13 @@ MOST_CHARACTERS = 500  # of a text, so that a line is never longer than the pipe
 class Journal:
     """One JSON line per event; a reader that is slow costs lines, never time: ``dropped`` counts them."""
 
-    def __init__(self, descriptor: int = 1) -> None:
-        self._descriptor = descriptor
+    def __init__(
+        self,
+        descriptor: int = 1,
+        now_s: Callable[[], float] = time.monotonic,
+        wall_s: Callable[[], float] = time.time,
+    ) -> None:
+        self._descriptor, self._now_s, self._wall_s = descriptor, now_s, wall_s
         self._writable = select.poll()
         self._writable.register(descriptor, select.POLLOUT)
         self.recent: deque[dict[str, Any]] = deque(maxlen=KEPT_EVENTS)
@@ -27,7 +33,7 @@ class Journal:
 
     def write(self, event: str, **fields: Any) -> None:
         """Write an event with its monotonic and wall time."""
-        stamps = {"mono_s": round(time.monotonic(), 6), "wall_s": round(time.time(), 6)}
+        stamps = {"mono_s": round(self._now_s(), 6), "wall_s": round(self._wall_s(), 6)}
         short = {key: value[:MOST_CHARACTERS] if isinstance(value, str) else value for key, value in fields.items()}
         record = {"event": event, **stamps, **short}
         self.recent.append(record)

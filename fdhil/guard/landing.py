@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import select
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from fdhil.cia402 import COB_SYNC, pack
 from fdhil.guard.can_socket import BusDown, CanSocket
@@ -16,7 +16,14 @@ from fdhil.guard.state import State
 ZEROS = 5
 
 
-def land(state: State, unsent: Sequence[int], settings: Settings, can: CanSocket) -> tuple[int, ...]:
+def land(
+    state: State,
+    unsent: Sequence[int],
+    settings: Settings,
+    can: CanSocket,
+    now_s: Callable[[], float] = time.monotonic,
+    new_poll: Callable[[], select.poll] = select.poll,
+) -> tuple[int, ...]:
     """Ramp the offsets to zero and return what was sent last, in increments per axis; it stops when SYNC or bus stop.
 
     ``unsent`` are the axes whose last offset did not leave. Speed and torque offsets are set to zero at once. Nothing
@@ -26,7 +33,7 @@ def land(state: State, unsent: Sequence[int], settings: Settings, can: CanSocket
     feeds = () if state.feed.mode is FeedMode.OFF else settings.feeds
     zeros = 0 if state.sending else ZEROS
     try:
-        while zeros < ZEROS and _sync(can, settings.silence_s):
+        while zeros < ZEROS and _sync(can, now_s() + settings.silence_s, now_s, new_poll()):
             if state.mode in SENDING:
                 moving = _step(settings, can, moving)
             for feed in feeds:
@@ -47,12 +54,10 @@ def _step(settings: Settings, can: CanSocket, moving: list[tuple[int, int]]) -> 
     return stepped
 
 
-def _sync(can: CanSocket, silence_s: float) -> bool:
-    """Wait for the next SYNC; False when none comes for too long."""
-    poll = select.poll()
+def _sync(can: CanSocket, end_s: float, now_s: Callable[[], float], poll: select.poll) -> bool:
+    """Wait for the next SYNC; False when none comes until ``end_s``."""
     poll.register(can, select.POLLIN)
-    end_s = time.monotonic() + silence_s
-    while (left_s := end_s - time.monotonic()) > 0:
+    while (left_s := end_s - now_s()) > 0:
         if poll.poll(left_s * 1000) and any(cob_id == COB_SYNC for cob_id, _, _ in can.receive()):
             return True
     return False
