@@ -9,11 +9,11 @@ import hashlib
 import io
 import json
 import os
+import select
 import shutil
 import socket
-import struct
 import tempfile
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -21,8 +21,8 @@ from fdhil import config as machine_config
 from fdhil.arming.guard_client import GuardClient
 from fdhil.arming.guard_settings import corrected_bus, settings_of
 from fdhil.arming.token import make_directory, operator_token
-from fdhil.cia402 import unpack
-from fdhil.commissioning.record import CommissioningRecord, axis_digest, save_record
+from fdhil.commissioning.record import CommissioningRecord, axis_digest, load_record, save_record
+from fdhil.commissioning.void import confirm_record, void_mark
 from fdhil.config import MachineConfig
 from fdhil.daemon.control import SOCKET_NAME
 from fdhil.daemon.service import Service
@@ -39,8 +39,13 @@ from tests.machine.memory_bus import GuardPoll, GuardSocket, MemoryBus
 from tests.machine.virtual_time import Killed, VirtualClock, VirtualLoop
 
 WALL_CLOCK_S = 0.05  # between two looks of the simulated drives at their own clock
-SHUTTLE = "G21 G90 G94\n" + "G0 X200 Y200\nG4 P0.3\nG0 X0 Y0\nG4 P0.3\n" * 2 + "M2\n"
 BOOT_S = 10.0
+
+
+def shuttle(axes: Iterable[str] = "XY", times: int = 2) -> str:
+    """Return a program of rapids from which the daemon identifies every axis."""
+    there, back = (" ".join(f"{axis}{place}" for axis in axes) for place in (200, 0))
+    return "G21 G90 G94\n" + f"G0 {there}\nG4 P0.3\nG0 {back}\nG4 P0.3\n" * times + "M2\n"
 
 
 def document(axes: str = "XY", **sections: Any) -> dict[str, Any]:
@@ -78,13 +83,14 @@ class Machine:
         self.events: list[dict[str, Any]] = []
         self.wrong: list[str] = []
         self.at_sync: Callable[[], None] = lambda: None
+        self.at_guard_frame: Callable[[int, bytes], None] = lambda _cob_id, _data: None
+        self.at_foreign_frame: Callable[[int, bytes], None] = lambda _cob_id, _data: None
         self.guard: Guard | None = None
         self.guard_exit: int | None = None
         self.service: Service | None = None
         self._loop: VirtualLoop | None = None
         self._serving: asyncio.Task[Any] | None = None
         self._guard_due_s = self._sync_s = self._wall_s = self.clock.now_s()
-        self._folder_of_trace = self.folder / "trace"
         make_directory(self.config.run_directory)
         self._commission()
         self._put(self.plant.power_on())
@@ -152,6 +158,18 @@ class Machine:
         """Have the guard take over what the drives hold and ramp it to zero."""
         with GuardClient(self.config.guard_directory, clock=self.clock) as client:
             return client.adopt(self.token)
+
+    def attest(self) -> None:
+        """Confirm every drive's record, to the guard and on the disk, as ``fdhil check`` does where nothing differs."""
+        directory = self.config.store.directory
+        marks = {axis: void_mark(directory, axis) for axis in self.config.axis}
+        records = {axis: load_record(directory, axis) for axis in self.config.axis}
+        with GuardClient(self.config.guard_directory, clock=self.clock) as client:
+            touched = client.touched(self.token)
+            seen = {axis: record.fingerprint for axis, record in records.items() if record is not None}
+            answer = client.compared(self.token, seen, touched)
+        for axis in set(seen) - {each["axis"] for each in answer.get("refused", [])}:
+            confirm_record(directory, axis, marks[axis])
 
     @property
     def token(self) -> str:
@@ -268,7 +286,6 @@ class Machine:
         journal = Journal(journal_far, self.clock.now_s, self.clock.wall_s)
         self.guard_exit = None
         self.guard = Guard(settings, can, journal, Notifier(None), wake, self.clock.now_s, poll)
-        self._offsets = {axis.offset.cob_id: (axis.name, axis.offset.entries) for axis in settings.axes}
         self.guard.begin()
         self._guard_due_s = self.clock.now_s()
 
@@ -404,6 +421,7 @@ class Machine:
         self._arrive([frame for frame, _ in faults.due("received", now_s)])
 
     def _from_guard(self, cob_id: int, data: bytes) -> bool:
+        self.at_guard_frame(cob_id, data)
         frame = (cob_id, data)
         faults = self.bus.faults
         passed = [frame] if faults.idle else [each for each, _ in faults.take(frame, "received", self.clock.time_s)]
@@ -417,6 +435,8 @@ class Machine:
     def _arrive(self, frames: list[tuple[int, bytes]], *, of_guard: bool = False) -> None:
         for frame in frames:
             self.bus.put([frame], of_guard=of_guard)
+            if not of_guard:
+                self.at_foreign_frame(*frame)
             if answers := self.plant.receive("can0", frame):
                 self.bus.put(answers)
 
@@ -481,8 +501,6 @@ def _cancel_all(loop: VirtualLoop) -> None:
 
 
 def _is_readable(connection: socket.socket) -> bool:
-    import select
-
     poll = select.poll()
     poll.register(connection, select.POLLIN)
     return bool(poll.poll(0))
