@@ -86,15 +86,17 @@ class Judge:
             self._held_since_s = None
 
     def _true_guard(self) -> None:
-        """A guard that is at rest and says what a drive holds says the truth, by the time it has read it back."""
+        """A guard at rest reports no offset of a drive as less than it is, or as another, once it has read it back."""
         guard = self._machine.guard
         if guard is None or guard.state.mode not in AT_REST or guard._silent:
             self._untrue.clear()
             return
         for (unit, _), said in zip(self._wires.values(), may_stand(guard.state), strict=True):
-            self._untrue[unit.axis] = 0 if said is None or said == self._held(unit) else self._untrue[unit.axis] + 1
+            held = self._held(unit)
+            is_true = said in (None, held) or held == 0  # more than there is may be feared
+            self._untrue[unit.axis] = 0 if is_true else self._untrue[unit.axis] + 1
             if self._untrue[unit.axis] == LAG_SYNC:
-                self.wrong(f"the guard says that axis {unit.axis} holds {said}, it holds {self._held(unit)}")
+                self.wrong(f"the guard says that axis {unit.axis} holds {said}, it holds {held}")
 
     def status(self) -> dict[str, Any]:
         """Ask for the daemon's status; what it says of offsets that may be applied must be true."""

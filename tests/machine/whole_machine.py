@@ -40,6 +40,7 @@ from tests.machine.virtual_time import Killed, VirtualClock, VirtualLoop
 
 WALL_CLOCK_S = 0.05  # between two looks of the simulated drives at their own clock
 BOOT_S = 10.0
+LATER_S = 1000.0  # a machine begins after the end of that whose store it has
 
 
 def shuttle(axes: Iterable[str] = "XY", times: int = 2) -> str:
@@ -53,7 +54,6 @@ def document(axes: str = "XY", **sections: Any) -> dict[str, Any]:
     return {
         "machine": {"name": "bench", "sync_period_s": 0.001},
         "axis": {name: bench_axis() for name in axes},
-        "guard": {"clock": "sync"},
         "bus": {"can0": {"interface": "virtual", "channel": "memory"}},
         **sections,
     }
@@ -76,6 +76,7 @@ class Machine:
         if store is not None:
             shutil.copytree(store, self.config.store.directory)
         self.clock = _MachineClock(self)
+        self.clock.time_s += 0.0 if store is None else LATER_S
         self.plant = Plant(self.config)
         self.bus = MemoryBus("can0", self.clock.now_s, self.plant.wires["can0"])
         self.bus.from_guard = self._from_guard
@@ -90,6 +91,7 @@ class Machine:
         self.service: Service | None = None
         self._loop: VirtualLoop | None = None
         self._serving: asyncio.Task[Any] | None = None
+        self._hung_until_s = 0.0
         self._guard_due_s = self._sync_s = self._wall_s = self.clock.now_s()
         make_directory(self.config.run_directory)
         self._commission()
@@ -202,6 +204,16 @@ class Machine:
     def kill(self, name: str) -> None:
         """End it as SIGKILL does: what is on the disk stays as it is, the other end of each connection sees its end."""
         self._kill_daemon() if name == "daemon" else self._kill_guard()
+
+    def hang(self, name: str, seconds: float) -> None:
+        """Stop it as SIGSTOP does, and let it go on after so long."""
+        end_s = self.clock.now_s() + seconds
+        if name == "guard":
+            self._hung_until_s = end_s
+            self.run(seconds)
+            self._guard_due_s = end_s
+        else:
+            self.clock.advance(end_s)
 
     def restart(self, name: str) -> None:
         """End it and start it again."""
@@ -349,8 +361,9 @@ class Machine:
         clock.time_s = max(clock.time_s, until_s)
 
     def _due_s(self) -> float:
+        """Return when the next thing is due."""
         due_s = min(self._sync_s, self._wall_s) if self.plant.nc.on else self._wall_s
-        return min(due_s, self._guard_due_s) if self.guard is not None else due_s
+        return due_s if self.guard is None else min(due_s, max(self._guard_due_s, self._hung_until_s))
 
     def _work(self) -> None:
         """Do all that is due now."""
@@ -371,8 +384,10 @@ class Machine:
             self.at_sync()
 
     def _turn_guard(self) -> None:
-        guard = self.guard
-        if guard is None or not (self.bus.guard is not None and self.bus.guard.is_readable or self.clock.time_s >= self._guard_due_s):
+        guard, can, now_s = self.guard, self.bus.guard, self.clock.time_s
+        if guard is None or can is None or now_s < self._hung_until_s:
+            return
+        if not can.is_readable and now_s < self._guard_due_s:
             return
         self.guard_exit = guard.turn()
         if self.guard_exit is not None:
