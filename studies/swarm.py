@@ -119,7 +119,7 @@ class Life:
                 machine.nc(on=True)
         machine.plant.nc.stop()
         machine.run(1.5)
-        if machine.guard is not None and machine.guard.state.mode.value == "FROZEN":
+        if machine.guard_state == "FROZEN":
             answer = machine.adopt()
             self.happened["adopted" if answer["ok"] else "adoption refused"] += 1
             machine.run(1.0)
@@ -143,12 +143,11 @@ class Life:
 
 def fault(kind: str, low: float | None = None, high: float | None = None, **fields: Any) -> Callable[[Life], None]:
     """Return what begins a fault of the simulated machine for a while, with a value between two bounds."""
-    whole = isinstance(low, int) and isinstance(high, int)
 
     def begin(life: Life) -> None:
         rng, given = life.rng, dict(fields)
         if low is not None and high is not None:
-            given["value"] = rng.randint(int(low), int(high)) if whole else rng.uniform(low, high)
+            given["value"] = rng.randint(int(low), int(high)) if isinstance(low, int) else rng.uniform(low, high)
         if given.pop("of_axis", True):
             given["axis"] = life.axis
         if given.pop("share", False):
@@ -319,9 +318,9 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
     lived_s = counted["milliseconds"] / 1e3
     lines = pages.head("Swarm: random machines, programs and faults on one virtual clock", "swarm", run)
     lines += pages.paragraph(
-        f"""Each machine comes from one seed: its axes, programs, faults and their times. Daemon, guard, store, simulated
-        drives and NC run in one process on one virtual clock (`tests/machine`), so that a seed gives the same frames,
-        history and log each time. {figures["machines"]} machines lived {lived_s:.0f} machine-seconds in
+        f"""Each machine comes from one seed: its axes, programs, faults and their times. Daemon, guard, store,
+        simulated drives and NC run in one process on one virtual clock (`tests/machine`), so that a seed gives the same
+        frames, history and log each time. {figures["machines"]} machines lived {lived_s:.0f} machine-seconds in
         {figures["processor_s"]:.0f} s of processor time ({lived_s / figures["processor_s"]:.1f} times real time,
         judging included)."""
     )

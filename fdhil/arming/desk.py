@@ -34,12 +34,12 @@ from fdhil.arming.standstill import Standstill
 from fdhil.arming.stream_feeder import StreamFeeder
 from fdhil.arming.token import ensure_token
 from fdhil.arming.whole_plan import plan_whole
-from fdhil.clock import SYSTEM_CLOCK, Clock
 from fdhil.config import MachineConfig
 from fdhil.errors import DeviceError
 from fdhil.guard.protocol import LANDING
 from fdhil.records import AxisSamples, NcState, Notice, Skill
 from fdhil.store.rows import Revision
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 STREAM_S = 0.05
 ALIVE_S = 0.1  # the guard calls us lost after 0.5 s
@@ -60,9 +60,7 @@ class Storing(Protocol):
 class ArmingDesk:
     """Knows when a correction may be armed, and withdraws what it no longer vouches for."""
 
-    def __init__(
-        self, config: MachineConfig, store: Storing, run_directory: Path, clock: Clock = SYSTEM_CLOCK
-    ) -> None:
+    def __init__(self, config: MachineConfig, store: Storing, run_directory: Path, clock: Clock = SYSTEM_CLOCK) -> None:
         self._config, self._clock = config, clock
         self._store = store
         self._run_directory = run_directory

@@ -14,10 +14,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from fdhil.clock import SYSTEM_CLOCK, Clock
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
 from fdhil.guard import table
 from fdhil.guard.protocol import SOCKET_NAME
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 ANSWER_S = 13.0  # the guard answers a request at a SYNC, or when it has missed it for up to 10 s
 

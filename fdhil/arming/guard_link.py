@@ -14,10 +14,10 @@ from fdhil.arming.guard_client import GuardClient
 from fdhil.arming.preparing import Armament, Feeding
 from fdhil.arming.standing import ABSENT, GONE, START_AND_ADOPT, Standing, landed, lost, standing
 from fdhil.arming.standing_mark import StandingMark
-from fdhil.clock import SYSTEM_CLOCK, Clock
 from fdhil.errors import ConnectError, DeviceError
 from fdhil.guard.protocol import AT_REST, CHARGED
 from fdhil.records import Notice
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 SETTLING_TRIES = 25
 SETTLING_S = 0.2

@@ -6,10 +6,10 @@ from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from fdhil.clock import SYSTEM_CLOCK, Clock
 from fdhil.identification.loops import better_loops
 from fdhil.records import LoopEstimate, Notice, Outcome, ParameterSet, Skill, Temperature
 from fdhil.store.rows import Revision
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 SKILL_MOVES = 3  # FAULTS E19: the last three recorded moves
 

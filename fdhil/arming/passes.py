@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fdhil.arming.lessons import Pupil
-from fdhil.clock import SYSTEM_CLOCK, Clock
 from fdhil.config import MachineConfig
 from fdhil.correction import gate
 from fdhil.correction.learning import Lesson
@@ -25,6 +24,7 @@ from fdhil.prediction import contour_error_um
 from fdhil.prediction.contour import WINDOW_S
 from fdhil.prediction.gain import plus_minus
 from fdhil.records import AxisSamples, Float, Int, MoveKind, NcState, Notice, Parameters, Reason
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 Rows = tuple[Int, Float, Float]
 """Tick, demand and position (n,) of an axis."""

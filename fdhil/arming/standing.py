@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass
 from typing import Any
 
-from fdhil.clock import SYSTEM_CLOCK, Clock
 from fdhil.guard.protocol import AT_REST
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 GONE = frozenset({"absent", "lost"})
 REST: frozenset[str] = AT_REST | GONE

@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 
 from fdhil.arming.answers import Answer, refusal
 from fdhil.arming.own_thread import in_own_thread
-from fdhil.clock import SYSTEM_CLOCK, Clock
 from fdhil.daemon import journal
 from fdhil.daemon.peers import NEEDS, Peer
 from fdhil.errors import StoreError
 from fdhil.guard.peers import Role
 from fdhil.store import audit
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 LOOKING = ("status", "live")
 DONE_FIRST = ("disarm", "stop")

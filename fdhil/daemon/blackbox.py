@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from fdhil.clock import SYSTEM_CLOCK, Clock
 from fdhil.errors import StoreError
 from fdhil.records import Notice
 from fdhil.store.atomic import make_folder, store_error, write_file
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 FOLDER = "blackbox"
 KEPT_FILES = 8
@@ -49,9 +49,7 @@ def kept(store: Path) -> list[BlackBox]:
     return sorted(found, key=lambda box: box.number)
 
 
-def dump(
-    store: Path, code: str, frames: Callable[[], Mapping[str, str]], clock: Clock = SYSTEM_CLOCK
-) -> Notice:
+def dump(store: Path, code: str, frames: Callable[[], Mapping[str, str]], clock: Clock = SYSTEM_CLOCK) -> Notice:
     """Write what ``frames`` gives, each bus' candump log, to ``blackbox/`` in the store; the oldest files go.
 
     Returns what is to be told, also when the disk refuses: the correction is off already.

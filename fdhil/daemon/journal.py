@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from datetime import datetime
 from typing import Literal, TextIO
 
-from fdhil.clock import SYSTEM_CLOCK, Clock
 from fdhil.records import (
     PARAMETERS,
     UNITS,
@@ -24,6 +23,7 @@ from fdhil.records import (
     WindowOutcome,
     unit_of,
 )
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 Severity = Literal["info", "minor", "MAJOR"]
 # syslog priorities, see sd-daemon(3)

@@ -10,7 +10,6 @@ from contextlib import suppress
 from typing import Any
 
 from fdhil.arming.answers import Answer
-from fdhil.clock import SYSTEM_CLOCK, Clock
 from fdhil.config import MachineConfig
 from fdhil.daemon import journal
 from fdhil.daemon.notice_book import NEWEST, NotAcknowledged, NoticeBook, acknowledgement_of, counted
@@ -38,6 +37,7 @@ from fdhil.store.newest_sets import newest_loops, newest_sets
 from fdhil.store.outbox import Outbox
 from fdhil.store.rows import Revision, Stamp, StoredWindow
 from fdhil.store.windows import RawScale, Scales, WindowStore
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 SKILLS = 3
 # of the history: its newest rows may be in the log alone, which goes aside first; beside no file SQLite removes it

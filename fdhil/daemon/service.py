@@ -18,7 +18,6 @@ from fdhil.arming.desk import ArmingDesk
 from fdhil.arming.guard_link import TRIPPED, VOIDING
 from fdhil.arming.standing import ADOPT, START_AND_ADOPT, Standing
 from fdhil.commissioning.void import void_record
-from fdhil.clock import SYSTEM_CLOCK, Clock
 from fdhil.config import MachineConfig, unlikely
 from fdhil.daemon import blackbox, heap, journal
 from fdhil.daemon.acquisition import Acquisition, OpenSource
@@ -39,6 +38,7 @@ from fdhil.daemon.status import Watch
 from fdhil.errors import FdhilError, StoreError
 from fdhil.pipeline import AxisPipeline, Record
 from fdhil.records import AxisSamples, NcState, Notice, Outcome, Temperature, TickTimes
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 NOTICE_QUEUE = 200
 WATCHDOG_S = 2.0
@@ -243,8 +243,9 @@ class Service:
             notice = await self._notices.get()
             self._say(await asyncio.to_thread(self._store.keep, [notice]))
             if notice.code == TRIPPED and self._acquisition.source is not None:
-                code, store = notice.text.partition(":")[0], self._config.store.directory
-                self._tell([await asyncio.to_thread(blackbox.dump, store, code, self._acquisition.source.black_box, self._clock)])
+                code, frames = notice.text.partition(":")[0], self._acquisition.source.black_box
+                store = self._config.store.directory
+                self._tell([await asyncio.to_thread(blackbox.dump, store, code, frames, self._clock)])
             self._notices.task_done()
 
     async def _void_records(self) -> None:

@@ -19,10 +19,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from fdhil.clock import SYSTEM_CLOCK, Clock
 from fdhil.errors import StoreError
 from fdhil.store.atomic import store_error, sync_folder, write_all
 from fdhil.store.rows import Stamp
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 FILE_NAME = "audit.jsonl"
 TAIL_BYTES = 16 * 1024

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from fdhil.clock import SYSTEM_CLOCK, Clock
 from fdhil.records import (
     PARAMETERS,
     Float,
@@ -23,6 +22,7 @@ from fdhil.records import (
     Verdict,
     frozen,
 )
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 
 @dataclass(frozen=True, slots=True)

@@ -102,8 +102,9 @@ class Judge:
         """Ask for the daemon's status; what it says of offsets that may be applied must be true."""
         told = self._machine.ask("status")
         self.counted["statuses"] += 1
-        since_s = self._held_since_s
-        if told["may_stand"]["nothing"] and since_s is not None and self._machine.clock.now_s() - since_s > STATUS_LAG_S:
+        now_s = self._machine.clock.now_s()
+        since_s = now_s if self._held_since_s is None else self._held_since_s
+        if told["may_stand"]["nothing"] and now_s - since_s > STATUS_LAG_S:
             self.wrong(f"the daemon says that nothing is applied, the drives hold {self._machine.held_um()} um")
         return told
 
@@ -125,12 +126,11 @@ class Judge:
     def _records(self, log: str) -> None:
         logged = Counter(WINDOW_LINE.findall(log))
         history = self._machine.config.store.directory / "history.sqlite"
+        key = "axis, start_tick, monotonic_ns"
         with closing(sqlite3.connect(history)) as db:
-            rows = {table: db.execute(f"SELECT * FROM {table}").fetchall() for table in TABLES}  # noqa: S608 - our names
+            rows = {table: db.execute(f"SELECT * FROM {table}").fetchall() for table in TABLES}
             kept = Counter(axis for (axis,) in db.execute("SELECT axis FROM windows"))
-            doubled = db.execute(
-                "SELECT axis, start_tick, monotonic_ns FROM windows GROUP BY axis, start_tick, monotonic_ns HAVING count(*) > 1"
-            ).fetchall()
+            doubled = db.execute(f"SELECT {key} FROM windows GROUP BY {key} HAVING count(*) > 1").fetchall()
             (sound,) = db.execute("PRAGMA integrity_check").fetchone()
         self.counted["records"] += sum(map(len, rows.values()))
         for axis, count in logged.items():

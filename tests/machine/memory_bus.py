@@ -13,7 +13,7 @@ import numpy as np
 from fdhil import config
 from fdhil.drivers.can.filters import passing
 from fdhil.drivers.can.frames import Frames, frames_of
-from fdhil.drivers.can.port import Filter
+from fdhil.drivers.can.port import Filter, Stamps
 from fdhil.errors import ConnectError
 from fdhil.guard.can_socket import MOST_FRAMES, BusDown, CanSocket, Frame
 from fdhil.sim.frame_faults import FrameFaults
@@ -79,7 +79,7 @@ class MemoryBus:
 class BusListener:
     """The daemon's end: what the bus carried since it was opened, in blocks."""
 
-    stamps = "kernel"
+    stamps: Stamps = "kernel"
 
     def __init__(self, bus: MemoryBus, filters: Sequence[Filter]) -> None:
         self.blocks: list[Frames] = []

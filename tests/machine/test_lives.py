@@ -42,7 +42,7 @@ def comes_to_zero(machine: Machine, within_s: float) -> None:
 def rows(machine: Machine) -> list[tuple[object, ...]]:
     """Return all rows of the history."""
     with closing(sqlite3.connect(machine.config.store.directory / "history.sqlite")) as db:
-        return [row for table in TABLES for row in db.execute(f"SELECT * FROM {table} ORDER BY id")]  # noqa: S608
+        return [row for table in TABLES for row in db.execute(f"SELECT * FROM {table} ORDER BY id")]
 
 
 def eventful(machine: Machine) -> Iterable[object]:
@@ -144,7 +144,7 @@ def test_a_new_guard_takes_over_what_a_killed_one_left(begin: Begin) -> None:
 @pytest.mark.fault("F16")
 def test_a_restarted_guard_ramps_to_zero_before_it_ends(begin: Begin) -> None:
     machine = begin()
-    judge = Judge(machine)
+    Judge(machine)
     for seconds in (0.0, 0.9):
         into_the_cut(machine, seconds)
         machine.stop("guard")

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import concurrent.futures
 import selectors
 import signal
 import socket
 from collections.abc import Callable, Coroutine
 from typing import Any
 
-from fdhil.clock import Clock
+from fdhil.system_clock import Clock
 
 FIRST_WALL_S = 1_790_000_000.0
 
@@ -82,17 +81,14 @@ class VirtualLoop(asyncio.SelectorEventLoop):
             done.set_exception(error)
         return done
 
-    def set_default_executor(self, executor: concurrent.futures.ThreadPoolExecutor) -> None:
-        raise RuntimeError("there are no threads on virtual time")
-
     async def subprocess_exec(self, *arguments: Any, **named: Any) -> Any:
         raise OSError(11, "there are no processes on virtual time")
 
-    def add_signal_handler(self, number: int, call: Callable[..., object], *given: Any) -> None:
-        self._handlers[number] = lambda: call(*given)
+    def add_signal_handler(self, sig: int, callback: Callable[..., Any], *args: Any) -> None:  # type: ignore[override]
+        self._handlers[sig] = lambda: callback(*args)
 
-    def remove_signal_handler(self, number: int) -> bool:
-        return self._handlers.pop(number, None) is not None
+    def remove_signal_handler(self, sig: int) -> bool:
+        return self._handlers.pop(sig, None) is not None
 
     def send_signal(self, number: int = signal.SIGTERM) -> None:
         """Call the handler of a signal."""

@@ -36,7 +36,7 @@ from fdhil.sim.frame import BusFrame
 from fdhil.sim.machine import Machine as Plant
 from tests.bench import bench_axis
 from tests.machine.memory_bus import GuardPoll, GuardSocket, MemoryBus
-from tests.machine.virtual_time import Killed, VirtualClock, VirtualLoop
+from tests.machine.virtual_time import VirtualClock, VirtualLoop
 
 WALL_CLOCK_S = 0.05  # between two looks of the simulated drives at their own clock
 BOOT_S = 10.0
@@ -66,7 +66,12 @@ class Machine:
     """
 
     def __init__(
-        self, seed: int = 1, config: Mapping[str, Any] | None = None, *, folder: Path | None = None, store: Path | None = None
+        self,
+        seed: int = 1,
+        config: Mapping[str, Any] | None = None,
+        *,
+        folder: Path | None = None,
+        store: Path | None = None,
     ) -> None:
         self._temporary = tempfile.TemporaryDirectory(prefix="fdhil-machine-") if folder is None else None
         self.folder = Path(self._temporary.name) if self._temporary is not None else folder or Path()
@@ -265,9 +270,9 @@ class Machine:
         loop.close()
         service._store.close()
         self.bus.listener = None
-        for each in set(os.listdir(store)) - self._not_of_daemon(str(store), os.listdir(store)):
-            path = store / each
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        for path in store.iterdir():
+            if path != self.config.run_directory:
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
         shutil.copytree(kept / "store", store, symlinks=True, dirs_exist_ok=True)
         shutil.rmtree(kept)
         assert serving is not None
@@ -294,7 +299,10 @@ class Machine:
         wake.setblocking(False)
         self._wake_near = wake
         self.bus.guard = can
-        poll = functools.partial(GuardPoll, can, self._guard_rests, self._pass_for_failed_guard)
+
+        def poll() -> Any:
+            return GuardPoll(can, self._guard_rests, self._pass_for_failed_guard)
+
         journal = Journal(journal_far, self.clock.now_s, self.clock.wall_s)
         self.guard_exit = None
         self.guard = Guard(settings, can, journal, Notifier(None), wake, self.clock.now_s, poll)
@@ -333,21 +341,16 @@ class Machine:
         assert self._serving is not None
         with contextlib.redirect_stderr(self.log):
             result = self._loop.run_until_complete(work)
-        if self._serving.done() and self._loop is not None and not self._stopped_itself():
+        if self._serving.done() and self._serving.exception() is not None:
             self._end_daemon()
         return result
-
-    def _stopped_itself(self) -> bool:
-        return self._serving is not None and not self._serving.cancelled() and self._serving.exception() is None
 
     async def _converse(self, request: Mapping[str, Any]) -> dict[str, Any]:
         path = str(self.config.run_directory / SOCKET_NAME)
         reader, writer = await asyncio.open_unix_connection(path)
         try:
             writer.write(json.dumps(request).encode() + b"\n")
-            while not (line := await reader.readline()):
-                raise ConnectionError("the daemon closed the connection without an answer")
-            answer: dict[str, Any] = json.loads(line)
+            answer: dict[str, Any] = json.loads(await reader.readline())
             return answer
         finally:
             writer.close()
@@ -455,6 +458,11 @@ class Machine:
             if answers := self.plant.receive("can0", frame):
                 self.bus.put(answers)
 
+    @property
+    def guard_state(self) -> str:
+        """The guard's state, ``gone`` where none runs."""
+        return "gone" if self.guard is None else self.guard.state.mode.value
+
     def held_um(self) -> dict[str, float]:
         """Return the offset that each drive has in force, um."""
         return {name: unit.drive.offset_mm * 1e3 for name, unit in self.plant.units.items()}
@@ -466,9 +474,13 @@ class Machine:
             keys = (0x6007, 0x605A, 0x605E, 0x6065, 0x6085, 0x1017)
             entries = unit.drive.dictionary.entries
             options = {f"{index:04X}": number(index, 0) for index in keys if index << 8 in entries}
+            vendor, product, revision, serial = (number(0x1018, sub) for sub in (1, 2, 3, 4))
             record = CommissioningRecord(
-                name,
-                *(number(0x1018, sub) for sub in (1, 2, 3, 4)),
+                axis=name,
+                vendor_id=vendor,
+                product_code=product,
+                revision=revision,
+                serial=serial,
                 config_digest=axis_digest(self.config, name),
                 mapping_fingerprint="as delivered",
                 options=options,

@@ -24,10 +24,13 @@ HOLD_BACK_S = 0.001
 
 
 class ListenedBus(Protocol):
-    """A bus as its reader needs it: frames in blocks; ``ended`` tells why no more come, None while they may."""
+    """A bus as its reader needs it: frames in blocks."""
 
-    ended: str | None
     last_frame_ns: int
+
+    @property
+    def ended(self) -> str | None:
+        """Why no more frames come; None while they may."""
 
     @property
     def stamps(self) -> Stamps:
