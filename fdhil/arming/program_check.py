@@ -294,6 +294,11 @@ def main() -> None:
         sys.stdout.write(json.dumps(answer) + "\n")
         sys.stdout.flush()
 
+    answer_request(request, say)
+
+
+def answer_request(request: Mapping[str, Any], say: Tell) -> None:
+    """Check what is asked for, and report progress, blocks and the answer to ``say``."""
     config = MachineConfig.model_validate(request["config"])
     models = {axis: Parameters.of(values) for axis, values in request["models"].items()}
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import selectors
 import signal
 import socket
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Mapping
 from typing import Any
 
+from fdhil.arming import program_check
 from fdhil.system_clock import Clock
 
+NO_PROCESS = 2**30  # more than any process has
 FIRST_WALL_S = 1_790_000_000.0
 
 
@@ -81,8 +84,14 @@ class VirtualLoop(asyncio.SelectorEventLoop):
             done.set_exception(error)
         return done
 
-    async def subprocess_exec(self, *arguments: Any, **named: Any) -> Any:
-        raise OSError(11, "there are no processes on virtual time")
+    async def subprocess_exec(self, protocol_factory: Any, *arguments: Any, **_named: Any) -> Any:
+        """Run the one module that is started as a process, the check of a program, in this process."""
+        if self.dead or arguments[1:] != ("-m", program_check.__name__):
+            raise OSError(11, f"{arguments} cannot be started on virtual time")
+        protocol = protocol_factory()
+        transport = _CheckInProcess(self, protocol)
+        protocol.connection_made(transport)
+        return transport, protocol
 
     def add_signal_handler(self, sig: int, callback: Callable[..., Any], *args: Any) -> None:  # type: ignore[override]
         self._handlers[sig] = lambda: callback(*args)
@@ -93,6 +102,51 @@ class VirtualLoop(asyncio.SelectorEventLoop):
     def send_signal(self, number: int = signal.SIGTERM) -> None:
         """Call the handler of a signal."""
         self._handlers[number]()
+
+
+class _CheckInProcess(asyncio.SubprocessTransport):
+    """The check of a program as a process that answers at once; it is its own pipe to stdin."""
+
+    def __init__(self, loop: VirtualLoop, protocol: asyncio.SubprocessProtocol) -> None:
+        super().__init__()
+        self._loop, self._protocol, self._code = loop, protocol, None
+
+    def get_pid(self) -> int:
+        return NO_PROCESS
+
+    def get_returncode(self) -> int | None:
+        return self._code
+
+    def get_pipe_transport(self, fd: int) -> Any:
+        return self
+
+    def write(self, data: bytes) -> None:
+        """Take the request, and answer it."""
+
+        def say(answer: Mapping[str, Any]) -> None:
+            line = json.dumps(answer).encode() + b"\n"
+            self._loop.call_soon(self._protocol.pipe_data_received, 1, line)
+
+        program_check.answer_request(json.loads(data), say)
+        self._loop.call_soon(self._end)
+
+    def _end(self) -> None:
+        self._code = 0
+        self._protocol.pipe_connection_lost(1, None)
+        self._protocol.process_exited()
+
+    async def _wait(self) -> int:
+        while self._code is None:
+            await asyncio.sleep(0)
+        return self._code
+
+    def pause_reading(self) -> None:
+        """Nothing is held back: what was said is in memory."""
+
+    resume_reading = close = pause_reading
+
+    def is_closing(self) -> bool:
+        return self._code is not None
 
 
 class _Advancing(selectors.DefaultSelector):
