@@ -134,7 +134,8 @@ class Life:
             machine.run(FIRST_S)
             if not any(machine.held_um().values()):
                 break
-            machine.adopt()
+            for axis in machine.plant.units:  # what may not be adopted is gone with the drive's power
+                machine.fault("reboot", axis=axis)
         self.judge.status()
         machine.stop("daemon")
         machine.stop("guard")

@@ -95,7 +95,8 @@ def test_offsets_ramp_to_zero_when_the_daemon_is_killed(begin: Begin, seconds: f
     comes_to_zero(machine, bound_s(machine) + 0.005)
     machine.start("daemon")
     machine.run(0.7)
-    assert judge.status()["state"] == "OFF"
+    status = judge.status()
+    assert (status["state"], status["guard"]["cause"]["code"]) == ("OFF", "MainLost")
     machine.stop("daemon")
     judge.end()
     assert machine.wrong == []
@@ -124,10 +125,12 @@ def test_a_hung_guard_sends_nothing_and_ramps_down_when_it_goes_on(begin: Begin)
     assert judge.counted["offset frames"] <= sent + 4
     assert machine.held_um() == pytest.approx(held, abs=25.0)
     comes_to_zero(machine, bound_s(machine) + 0.02)
+    machine.run(0.6)
+    assert judge.status()["guard"]["cause"]["code"] == "LoopOverrun"
     assert machine.wrong == []
 
 
-@pytest.mark.fault("F15", "F16")
+@pytest.mark.fault("E13", "F16")
 def test_a_new_guard_takes_over_what_a_killed_one_left(begin: Begin) -> None:
     machine = begin()
     judge = Judge(machine)
@@ -137,7 +140,9 @@ def test_a_new_guard_takes_over_what_a_killed_one_left(begin: Begin) -> None:
     assert any(machine.held_um().values())  # a drive keeps what it was told last
     machine.start("guard")
     comes_to_zero(machine, 1.5)
-    assert judge.status()["may_stand"]["nothing"]
+    status = judge.status()
+    assert status["may_stand"]["nothing"]
+    assert status["guard"]["cause"]["code"] == "StaleOffset"
     assert machine.wrong == []
 
 
