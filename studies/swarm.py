@@ -97,7 +97,7 @@ class Life:
         for _ in range(rng.randint(1, 5)):
             words = " ".join(f"{axis}{rng.uniform(-ROOM_MM, ROOM_MM):.3f}" for axis in axes if rng.random() < 0.7)
             if words and rng.random() < 0.8:
-                lines.append(f"G1 {words} F{rng.uniform(1500, 9000):.0f}")
+                lines.append(f"G1 {words} F{rng.uniform(4000, 9000):.0f}")
             elif words:
                 lines.append(f"G0 {words}")
             if rng.random() < 0.3:
@@ -118,7 +118,7 @@ class Life:
             with contextlib.suppress(RuntimeError):
                 machine.nc(on=True)
         machine.plant.nc.stop()
-        machine.run(1.5)
+        machine.run(0.8)
         if machine.guard_state == "FROZEN":
             answer = machine.adopt()
             self.happened["adopted" if answer["ok"] else "adoption refused"] += 1
@@ -288,6 +288,12 @@ def judged(seed: int, seconds: float) -> tuple[int, list[str], dict[str, int], f
     return seed, wrong, dict(counted), time.process_time() - begun_s
 
 
+def _quiet() -> None:
+    """Do without the garbage collector, as the guard's process does: a worker ends after a few lives."""
+    gc.freeze()
+    gc.disable()
+
+
 def replay(seed: int, seconds: float) -> str:
     """Return the command that repeats a life."""
     return f"make swarm N=1 SEED={seed} SECONDS={seconds:g}"
@@ -297,7 +303,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     """Let all machines live."""
     seeds = range(options.seed, options.seed + options.machines)
     counted, failures, used_s = Counter[str](), [], 0.0
-    with ProcessPoolExecutor(options.processes, initializer=gc.freeze, max_tasks_per_child=50) as pool:
+    with ProcessPoolExecutor(options.processes, initializer=_quiet, max_tasks_per_child=10) as pool:
         for seed, wrong, found, seconds in pool.map(judged, seeds, [options.seconds] * len(seeds)):
             counted.update(found)
             used_s += seconds
