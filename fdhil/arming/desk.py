@@ -251,6 +251,8 @@ class ArmingDesk:
             return self._without_guard(error)
         if not answer["ok"]:
             return answer
+        if self.guard.state in REST:
+            self._release()
         return verdict(self.guard.status)
 
     def _without_guard(self, error: DeviceError) -> Answer:

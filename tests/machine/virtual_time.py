@@ -47,6 +47,13 @@ class VirtualClock(Clock):
         raise RuntimeError("nothing in this program can make the connection readable")
 
 
+class HastyClock(VirtualClock):
+    """A clock on which nobody sleeps: time passes at once; answers of other threads are waited for as they are."""
+
+    def wait_readable(self, connection: socket.socket, seconds: float) -> bool:
+        return Clock.wait_readable(self, connection, seconds)
+
+
 class Killed(BaseException):
     """What a call meets that a killed process would have made."""
 
@@ -109,7 +116,8 @@ class _CheckInProcess(asyncio.SubprocessTransport):
 
     def __init__(self, loop: VirtualLoop, protocol: asyncio.SubprocessProtocol) -> None:
         super().__init__()
-        self._loop, self._protocol, self._code = loop, protocol, None
+        self._loop, self._protocol, self._ended = loop, protocol, asyncio.Event()
+        self._code: int | None = None
 
     def get_pid(self) -> int:
         return NO_PROCESS
@@ -132,13 +140,13 @@ class _CheckInProcess(asyncio.SubprocessTransport):
 
     def _end(self) -> None:
         self._code = 0
+        self._ended.set()
         self._protocol.pipe_connection_lost(1, None)
         self._protocol.process_exited()
 
     async def _wait(self) -> int:
-        while self._code is None:
-            await asyncio.sleep(0)
-        return self._code
+        await self._ended.wait()
+        return self._code or 0
 
     def pause_reading(self) -> None:
         """Nothing is held back: what was said is in memory."""
