@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import select
 import socket
-import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,20 +39,13 @@ DECIDED = ("arm", "feedforward", "disarm", "adopt", "compared")
 class Guard:
     """The process; ``run`` returns its exit code: 0 when it is known that nothing is applied, 3 otherwise.
 
-    ``wake`` becomes readable when a signal asks to stop.
+    ``wake`` becomes readable when a signal asks to stop. The journal's clock is that of the loop, too.
     """
 
     def __init__(
-        self,
-        settings: Settings,
-        can: CanSocket,
-        journal: Journal,
-        notifier: Notifier,
-        wake: socket.socket,
-        now_s: Callable[[], float] = time.monotonic,
-        new_poll: Callable[[], select.poll] = select.poll,
+        self, settings: Settings, can: CanSocket, journal: Journal, notifier: Notifier, wake: socket.socket
     ) -> None:
-        self._now_s, self._new_poll = now_s, new_poll
+        self._now_s = journal.clock.now_s
         self.settings = settings
         self.state = initial(settings)
         access = Access(settings.daemon_uid, settings.watching)
@@ -117,8 +109,8 @@ class Guard:
         text = f"{cause.cause}; {effect}; {cause.action}"
         self._journal.write("failed", code=cause.code, state=self.state.mode.value, text=text)
         self._notifier.tell("STOPPING=1")
-        sending, waiting = self.state.sending, (self._now_s, self._new_poll)
-        sent = land(self.state, self._unsent, self.settings, self._can, *waiting)
+        sending, clock = self.state.sending, self._journal.clock
+        sent = land(self.state, self._unsent, self.settings, self._can, clock)
         standing_um = status.may_stand_um(self.state, self.settings)
         if sending:  # nothing was read back on the way
             standing_um = dict.fromkeys(standing_um)
@@ -160,7 +152,7 @@ class Guard:
 
     def _wait(self, rest_s: float) -> set[int]:
         """Wait for the bus and for signals; for the clients too, unless they rest."""
-        poll = self._new_poll()
+        poll = self._journal.clock.new_poll()
         poll.register(self._wake, select.POLLIN)
         if self._listener.bus_state != "down":
             poll.register(self._can, select.POLLIN)
@@ -244,7 +236,7 @@ class Guard:
         """Whether it was this process that slept, and not the bus: then its frames are waiting."""
         if self._listener.bus_state == "down":
             return False
-        poll = self._new_poll()
+        poll = self._journal.clock.new_poll()
         poll.register(self._can, select.POLLIN)
         return bool(poll.poll(0))
 

@@ -28,6 +28,7 @@ from fdhil.daemon.control import SOCKET_NAME
 from fdhil.daemon.service import Service
 from fdhil.drivers import open_machine
 from fdhil.guard.frames import Listener
+from fdhil.guard.journal import Clock as GuardClock
 from fdhil.guard.journal import Journal, Notifier
 from fdhil.guard.process import Guard
 from fdhil.program import load_trajectory
@@ -303,9 +304,9 @@ class Machine:
         def poll() -> Any:
             return GuardPoll(can, self._guard_rests, self._pass_for_failed_guard)
 
-        journal = Journal(journal_far, self.clock.now_s, self.clock.wall_s)
+        journal = Journal(journal_far, GuardClock(self.clock.now_s, self.clock.wall_s, poll))
         self.guard_exit = None
-        self.guard = Guard(settings, can, journal, Notifier(None), wake, self.clock.now_s, poll)
+        self.guard = Guard(settings, can, journal, Notifier(None), wake)
         self.guard.begin()
         self._guard_due_s = self.clock.now_s()
 
