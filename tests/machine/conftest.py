@@ -12,9 +12,9 @@ from tests.machine.whole_machine import Machine, shuttle
 
 
 @pytest.fixture(scope="session")
-def taught(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def identified(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Return the folder of a machine that has validated models of both axes, and a copy of its store."""
-    folder, kept = tmp_path_factory.mktemp("taught"), tmp_path_factory.mktemp("kept") / "store"
+    folder, kept = tmp_path_factory.mktemp("identified"), tmp_path_factory.mktemp("kept") / "store"
     with Machine(folder=folder) as machine:
         machine.start("daemon")
         machine.nc(on=True)
@@ -27,9 +27,9 @@ def taught(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 @pytest.fixture
-def begin(taught: tuple[Path, Path]) -> Iterator[Callable[[], Machine]]:
+def begin(identified: tuple[Path, Path]) -> Iterator[Callable[[], Machine]]:
     """Begin the life of that machine again: guard and daemon run, and the NC leads the drives."""
-    folder, kept = taught
+    folder, kept = identified
     begun: list[Machine] = []
 
     def start() -> Machine:

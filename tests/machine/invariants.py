@@ -91,22 +91,22 @@ class Judge:
         if guard is None or guard.state.mode not in AT_REST or guard._silent:
             self._untrue.clear()
             return
-        for (unit, _), said in zip(self._wires.values(), may_stand(guard.state), strict=True):
+        for (unit, _), reported in zip(self._wires.values(), may_stand(guard.state), strict=True):
             held = self._held(unit)
-            is_true = said in (None, held) or held == 0  # more than there is may be feared
+            is_true = reported in (None, held) or held == 0  # more than there is may be feared
             self._untrue[unit.axis] = 0 if is_true else self._untrue[unit.axis] + 1
             if self._untrue[unit.axis] == LAG_SYNC:
-                self.wrong(f"the guard says that axis {unit.axis} holds {said}, it holds {held}")
+                self.wrong(f"the guard reports that axis {unit.axis} holds {reported}, it holds {held}")
 
     def status(self) -> dict[str, Any]:
-        """Ask for the daemon's status; what it says of offsets that may be applied must be true."""
-        told = self._machine.ask("status")
+        """Ask for the daemon's status; what it reports of offsets that may be applied must be true."""
+        status = self._machine.ask("status")
         self.counted["statuses"] += 1
         now_s = self._machine.clock.now_s()
         since_s = now_s if self._held_since_s is None else self._held_since_s
-        if told["may_stand"]["nothing"] and now_s - since_s > STATUS_LAG_S:
-            self.wrong(f"the daemon says that nothing is applied, the drives hold {self._machine.held_um()} um")
-        return told
+        if status["may_stand"]["nothing"] and now_s - since_s > STATUS_LAG_S:
+            self.wrong(f"the daemon reports that nothing is applied, the drives hold {self._machine.held_um()} um")
+        return status
 
     def end(self) -> None:
         """Judge what is left: the drives at zero, no record lost or doubled, no line of a crash."""

@@ -36,8 +36,8 @@ def cut(machine: Machine, program: str, name: str) -> float:
 def passed(machine: Machine) -> dict[str, Any]:
     """Return what the daemon measured of the last pass."""
     machine.run(1.0)
-    told: dict[str, Any] = machine.ask("status")["passes"][-1]
-    return told
+    measured: dict[str, Any] = machine.ask("status")["passes"][-1]
+    return measured
 
 
 def test_a_cut_is_corrected_as_predicted_and_measured_by_the_daemon(begin: Begin) -> None:
@@ -47,9 +47,9 @@ def test_a_cut_is_corrected_as_predicted_and_measured_by_the_daemon(begin: Begin
     answer = machine.arm(machine.write(part(1), "part.ngc"))
     assert answer["ok"], answer
     assert cut(machine, part(1), "part.ngc") < 0.1 * plain
-    told = passed(machine)
-    assert told["ended_by"] == "Finished"
-    assert told["measured"]["rms_um"] < answer["after"]["rms_um"] + answer["after"]["uncertainty_um"]
+    last = passed(machine)
+    assert last["ended_by"] == "Finished"
+    assert last["measured"]["rms_um"] < answer["after"]["rms_um"] + answer["after"]["uncertainty_um"]
     assert judge.status()["state"] == "OFF"
     assert machine.wrong == []
 

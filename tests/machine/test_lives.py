@@ -137,7 +137,7 @@ def test_a_new_guard_takes_over_what_a_killed_one_left(begin: Begin) -> None:
     into_the_cut(machine)
     machine.kill("guard")
     machine.run(0.3)
-    assert any(machine.held_um().values())  # a drive keeps what it was told last
+    assert any(machine.held_um().values())  # a drive keeps the last offset that it received
     machine.start("guard")
     comes_to_zero(machine, 1.5)
     status = judge.status()

@@ -149,7 +149,7 @@ class _CheckInProcess(asyncio.SubprocessTransport):
         return self._code or 0
 
     def pause_reading(self) -> None:
-        """Nothing is held back: what was said is in memory."""
+        """Do nothing: all output is in memory already."""
 
     resume_reading = close = pause_reading
 

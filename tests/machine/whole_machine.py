@@ -41,7 +41,7 @@ from tests.machine.virtual_time import VirtualClock, VirtualLoop
 
 WALL_CLOCK_S = 0.05  # between two looks of the simulated drives at their own clock
 BOOT_S = 10.0
-LATER_S = 1000.0  # a machine begins after the end of that whose store it has
+LATER_S = 1000.0  # a machine begins later than the one whose store it takes over
 
 
 def shuttle(axes: Iterable[str] = "XY", times: int = 2) -> str:
