@@ -16,7 +16,7 @@ SECONDS ?= 100000
 # a child process need not translate fdhil anew
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup docs demo test test-system test-full test-vcan near nightly faults fuzz guard mutants audit loaded lint bench study lock clean
+.PHONY: help setup docs demo test test-system test-full test-vcan near nightly swarm faults fuzz guard mutants audit loaded lint bench study lock clean
 
 help:            ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -82,6 +82,12 @@ faults: setup    ## the fault matrix, row by row, and the goals R1 to R20: to do
 fuzz: setup      ## any bytes at every way in, N for each (make fuzz N=1000000); what hurts is kept in out/fuzz/found
 	@mkdir -p out/fuzz
 	@$(BIN)/python -m studies.fuzz --out out/fuzz --inputs $(N) --seconds $(SECONDS)
+
+swarm: N = 200
+swarm: SECONDS = 60
+swarm: SEED = 1
+swarm: setup     ## N random machines, each from one seed and for SECONDS of virtual time; the page is out/swarm/swarm.md
+	@$(BIN)/python -m studies.swarm --machines $(N) --seconds $(SECONDS) --seed $(SEED) --out out/swarm
 
 guard: setup     ## the guard's own tests, in its processes too; a branch of it that none of them takes is an error
 	@$(BIN)/python -m coverage erase

@@ -24,6 +24,7 @@ STUDIES = (
     "wires",
     "crash",
     "kills",
+    "swarm",
     "fuzz",
     "soak",
     "fleet",

@@ -13,6 +13,7 @@ import numpy as np
 from fdhil.guard.can_socket import CanSocket
 from fdhil.guard.frames import Listener
 from fdhil.guard.interlocks import FACTS, Alarm
+from fdhil.guard.journal import SYSTEM
 from fdhil.guard.landing import land
 from fdhil.guard.path import CorrectedPath
 from fdhil.guard.protocol import Mode
@@ -184,7 +185,7 @@ class EverySync:
 def _land(cut: Cut) -> None:
     """What the guard's supervisor does when the loop itself has failed."""
     bus = EverySync()
-    land(cut.state, (), cut.settings, cast(CanSocket, bus))
+    land(cut.state, (), cut.settings, cast(CanSocket, bus), SYSTEM)
     bus.close()
     values = [int.from_bytes(data, "little", signed=True) for _, data in bus.sent]
     for offsets in batched(values, len(cut.wires)):

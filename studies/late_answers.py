@@ -26,8 +26,8 @@ from fdhil.errors import DeviceError
 from fdhil.sim.frame_faults import FrameFault, FrameFaults
 from fdhil.sim.wire.modbus_answers import answer, spoilt
 from fdhil.sim.wire.sensor_faults import SensorFaults
-from studies.virtual_time import VirtualLoop, run
 from tests.drivers.serial_peer import framed
+from tests.machine.virtual_time import VirtualLoop, run
 
 TIMEOUT_S = 0.2
 PROMPT_S = 0.005

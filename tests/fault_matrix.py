@@ -174,5 +174,5 @@ def marked() -> dict[str, tuple[Path, ...]]:
 
 def _rows_of(tree: ast.Module) -> set[str]:
     calls = (node for node in ast.walk(tree) if isinstance(node, ast.Call))
-    marks = (call for call in calls if isinstance(call.func, ast.Attribute) and call.func.attr == "fault")
+    marks = (call for call in calls if ast.unparse(call.func) == "pytest.mark.fault")
     return {str(arg.value) for mark in marks for arg in mark.args if isinstance(arg, ast.Constant)}

@@ -37,6 +37,7 @@ from fdhil.errors import DeviceError
 from fdhil.guard.protocol import LANDING
 from fdhil.records import AxisSamples, NcState, Notice, Skill
 from fdhil.store.rows import Revision
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 STREAM_S = 0.05
 ALIVE_S = 0.1  # the guard calls us lost after 0.5 s
@@ -57,23 +58,23 @@ class Storing(Protocol):
 class ArmingDesk:
     """Knows when a correction may be armed, and withdraws what it no longer vouches for."""
 
-    def __init__(self, config: MachineConfig, store: Storing, run_directory: Path) -> None:
-        self._config = config
+    def __init__(self, config: MachineConfig, store: Storing, run_directory: Path, clock: Clock = SYSTEM_CLOCK) -> None:
+        self._config, self._clock = config, clock
         self._store = store
         self._run_directory = run_directory
         self._token = ""
-        self.knowledge = Knowledge(config.axis)
+        self.knowledge = Knowledge(config.axis, clock)
         self._arming = asyncio.Lock()
         self._armed: tuple[Armament | Feeding, Mapping[str, Any]] | None = None
         self._check = BackgroundCheck(config)
-        self._passes = Passes(config)
+        self._passes = Passes(config, clock)
         self._standstill = Standstill(config)
         self._feeder: StreamFeeder | None = None
         self._given_up = False
         self._hung_up: Callable[[], bool] = lambda: False
         self._disarms: int | None = None
         self._disarming: asyncio.Future[Answer] | None = None
-        self.guard = GuardLink(config.guard.run_directory or run_directory, config.store.directory)
+        self.guard = GuardLink(config.guard.run_directory or run_directory, config.store.directory, clock)
 
     def begin(self, newest: Mapping[str, Revision], skills: Sequence[Skill]) -> None:
         """Start from what the history knows; the token is made where there is none. DeviceError when it cannot be."""
@@ -137,7 +138,7 @@ class ArmingDesk:
 
     async def _landed(self) -> bool:
         """Wait a moment for the end of what ramps down; return whether the guard is at rest, or absent."""
-        await in_own_thread(landed, self.guard.look, LANDING_S, LANDING)
+        await in_own_thread(landed, self.guard.look, LANDING_S, LANDING, self._clock)
         if self.guard.state in REST:
             self._release()
         return self.guard.state in REST
@@ -248,6 +249,8 @@ class ArmingDesk:
             return self._without_guard(error)
         if not answer["ok"]:
             return answer
+        if self.guard.state in REST:
+            self._release()
         return verdict(self.guard.status)
 
     def _without_guard(self, error: DeviceError) -> Answer:

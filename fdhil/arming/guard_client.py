@@ -7,7 +7,6 @@ own: a daemon that hangs must look dead. The connection that armed is the one wh
 import os
 import socket
 import threading
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -16,6 +15,7 @@ from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
 from fdhil.guard import table
 from fdhil.guard.protocol import SOCKET_NAME
 from fdhil.json_lines import decode_line, encode_line
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 ANSWER_S = 13.0  # the guard answers a request at a SYNC, or when it has missed it for up to 10 s
 
@@ -32,8 +32,8 @@ class GuardClient:
     no answer comes. Safe to use from two threads: ``alive`` may be called while another waits for an answer.
     """
 
-    def __init__(self, run_directory: Path, timeout_s: float = ANSWER_S) -> None:
-        self._timeout_s = timeout_s
+    def __init__(self, run_directory: Path, timeout_s: float = ANSWER_S, clock: Clock = SYSTEM_CLOCK) -> None:
+        self._timeout_s, self._clock = timeout_s, clock
         self._asking, self._sending = threading.Lock(), threading.Lock()
         self._number = 0
         self._inbox = b""
@@ -134,7 +134,7 @@ class GuardClient:
             self._number += 1
             number = self._number
             self._send({**request, "id": number}, descriptor)
-            deadline_s = time.monotonic() + (timeout_s or self._timeout_s)
+            deadline_s = self._clock.now_s() + (timeout_s or self._timeout_s)
             while True:
                 answer = self._line(deadline_s)
                 if answer.pop("id", None) == number:
@@ -152,14 +152,10 @@ class GuardClient:
 
     def _line(self, deadline_s: float) -> dict[str, Any]:
         while b"\n" not in self._inbox:
-            left_s = deadline_s - time.monotonic()
-            if left_s <= 0:
-                raise DeviceTimeout("guard", "gave no answer; look at its journal, then restart it")
-            self._socket.settimeout(left_s)
             try:
+                if not self._clock.wait_readable(self._socket, max(0.0, deadline_s - self._clock.now_s())):
+                    raise DeviceTimeout("guard", "gave no answer; look at its journal, then restart it")
                 chunk = self._socket.recv(1 << 16)
-            except TimeoutError:
-                continue
             except OSError as error:
                 raise self._lost(error.strerror or str(error)) from None
             if not chunk:

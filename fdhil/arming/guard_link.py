@@ -2,7 +2,6 @@
 
 import contextlib
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +15,7 @@ from fdhil.arming.standing_mark import StandingMark
 from fdhil.errors import ConnectError, DeviceError
 from fdhil.guard.protocol import AT_REST, CHARGED
 from fdhil.records import Notice
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 SETTLING_TRIES = 25
 SETTLING_S = 0.2
@@ -32,8 +32,8 @@ class GuardLink:
     what a daemon before this one left in the store.
     """
 
-    def __init__(self, run_directory: Path, store_directory: Path) -> None:
-        self._run_directory = run_directory
+    def __init__(self, run_directory: Path, store_directory: Path, clock: Clock = SYSTEM_CLOCK) -> None:
+        self._run_directory, self._clock = run_directory, clock
         self._lock = threading.Lock()
         self._client: GuardClient | None = None
         self._mark = StandingMark(store_directory)
@@ -51,7 +51,7 @@ class GuardLink:
     @property
     def status(self) -> Mapping[str, Any]:
         """What the guard said last, and how long ago; None: it never did."""
-        age_s = None if self._heard_s is None else round(time.monotonic() - self._heard_s, 3)
+        age_s = None if self._heard_s is None else round(self._clock.now_s() - self._heard_s, 3)
         return {**self._status, "heard_s_ago": age_s}
 
     @property
@@ -99,11 +99,11 @@ class GuardLink:
             before = self._status
             try:
                 if self._client is None:
-                    self._client = GuardClient(self._run_directory)
+                    self._client = GuardClient(self._run_directory, clock=self._clock)
                 if arming:
                     self._mark.keep(standing(lost(before, arming)))
                 yield self._client
-                self._status, self._heard_s = self._client.status(), time.monotonic()
+                self._status, self._heard_s = self._client.status(), self._clock.now_s()
                 self._keep()
                 self._untold += _changes(before, self._status)
             except DeviceError as error:
@@ -176,9 +176,8 @@ class GuardLink:
             laws, facts = feeding.laws, feeding.facts
             return self._ask(client, lambda: client.feed_forward(token, laws, facts, disarms), given_up)
 
-    @staticmethod
     def _ask(
-        client: GuardClient, arm: Callable[[], Mapping[str, Any]], given_up: Callable[[], bool]
+        self, client: GuardClient, arm: Callable[[], Mapping[str, Any]], given_up: Callable[[], bool]
     ) -> Mapping[str, Any]:
         """Ask until the interlocks have been good for long enough, for a few seconds; any other no is final."""
         answer: Mapping[str, Any] = ABANDONED
@@ -189,7 +188,7 @@ class GuardLink:
             answer = arm()
             if answer["ok"] or [told["code"] for told in answer.get("refused", [])] != ["NotSettled"]:
                 break
-            time.sleep(SETTLING_S)
+            self._clock.sleep(SETTLING_S)
         return answer
 
     def disarm(self) -> Mapping[str, Any]:
@@ -197,7 +196,7 @@ class GuardLink:
         with self._asked() as client:
             answer = client.disarm()
             if answer["ok"]:
-                landed(client.status)
+                landed(client.status, clock=self._clock)
             return answer
 
     def close(self) -> None:

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 
 from fdhil.identification.loops import better_loops
 from fdhil.records import LoopEstimate, Notice, Outcome, ParameterSet, Skill, Temperature
-from fdhil.store.rows import Revision, since_boot_ns
+from fdhil.store.rows import Revision
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 SKILL_MOVES = 3  # FAULTS E19: the last three recorded moves
 
@@ -39,14 +40,15 @@ class _Axis:
 class Knowledge:
     """The newest of every axis."""
 
-    def __init__(self, axes: Iterable[str]) -> None:
+    def __init__(self, axes: Iterable[str], clock: Clock = SYSTEM_CLOCK) -> None:
+        self._clock = clock
         self._axes = {axis: _Axis() for axis in axes}
 
     def begin(self, newest: Mapping[str, Revision], skills: Sequence[Skill]) -> None:
         """Start from what the history knows."""
         for name, revision in newest.items():
             axis = self._axes[name]
-            axis.published, axis.published_s = revision.set, since_boot_ns() * 1e-9 - revision.stamp.age_s()
+            axis.published, axis.published_s = revision.set, self._now_s() - revision.stamp.age_s(self._clock)
         self.note(skills)
 
     def note(self, outcomes: Sequence[Outcome | LoopEstimate]) -> None:
@@ -54,7 +56,7 @@ class Knowledge:
         for outcome in outcomes:
             if isinstance(outcome, ParameterSet):
                 axis = self._axes[outcome.axis]
-                axis.published, axis.published_s, axis.load_changed = outcome, since_boot_ns() * 1e-9, False
+                axis.published, axis.published_s, axis.load_changed = outcome, self._now_s(), False
             elif isinstance(outcome, Skill):
                 self._axes[outcome.axis].skills.append(outcome)
             elif isinstance(outcome, LoopEstimate):
@@ -71,9 +73,12 @@ class Knowledge:
         """The newest temperature of each axis that has one."""
         return {name: axis.temperature_c for name, axis in self._axes.items() if axis.temperature_c is not None}
 
+    def _now_s(self) -> float:
+        return self._clock.since_boot_ns() * 1e-9
+
     def now(self) -> dict[str, AxisKnowledge]:
         """Return what is known of every axis now."""
-        now_s = since_boot_ns() * 1e-9
+        now_s = self._now_s()
         return {
             name: AxisKnowledge(
                 axis.published,

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import sys
-import time
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,6 +24,7 @@ from fdhil.prediction import contour_error_um
 from fdhil.prediction.contour import WINDOW_S
 from fdhil.prediction.gain import plus_minus
 from fdhil.records import AxisSamples, Float, Int, MoveKind, NcState, Notice, Parameters, Reason
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 Rows = tuple[Int, Float, Float]
 """Tick, demand and position (n,) of an axis."""
@@ -53,8 +53,8 @@ class _Ended(NamedTuple):
 class Passes:
     """The pass that runs, and what the last ones measured."""
 
-    def __init__(self, config: MachineConfig) -> None:
-        self._config = config
+    def __init__(self, config: MachineConfig, clock: Clock = SYSTEM_CLOCK) -> None:
+        self._config, self._clock = config, clock
         self._count = Counter[str]()
         self._running: Pass | None = None
         self._models: Mapping[str, Parameters] = {}
@@ -100,7 +100,8 @@ class Passes:
     def end(self, cause: str, summary: Mapping[str, Any]) -> None:
         """The guard has ended the correction."""
         if self._running is not None:
-            self._ended.append(_Ended(self._running, self._models, time.monotonic() + LATE_S, cause, summary))
+            due_s = self._clock.now_s() + LATE_S
+            self._ended.append(_Ended(self._running, self._models, due_s, cause, summary))
             self._running = None
 
     def digest(self) -> list[Notice]:
@@ -113,7 +114,7 @@ class Passes:
             for each in hearing:
                 each.take(samples)
         notices = []
-        while self._ended and time.monotonic() >= self._ended[0].due_s:
+        while self._ended and self._clock.now_s() >= self._ended[0].due_s:
             ended = self._ended.popleft()
             measured = ended.running.measured()
             notices += [] if measured is None else self._tell(ended, measured)

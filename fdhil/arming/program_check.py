@@ -275,21 +275,25 @@ def keep(folder: Path, key: str, request: Callable[[BinaryIO], dict[str, Any]]) 
 def main() -> None:
     """Answer the one request; each line that is written is a JSON object, the last one is the answer."""
     limit_process(NICENESS, {})
-    request = receive_request()
+    answer_request(receive_request(), report)
+
+
+def answer_request(request: Mapping[str, Any], say: Tell) -> None:
+    """Check what is asked for, and report progress, blocks and the answer to ``say``."""
     config = MachineConfig.model_validate(request["config"])
     models = {axis: Parameters.of(values) for axis, values in request["models"].items()}
 
     def run(body: BinaryIO) -> dict[str, Any]:
-        return check(Path(request["program"]), request["program_digest"], models, config, body, report)
+        return check(Path(request["program"]), request["program_digest"], models, config, body, say)
 
     try:
         header = keep(Path(request["folder"]), request["key"], run)
-        report({"header": {name: value for name, value in header.items() if name != "blocks"}})  # they were told
+        say({"header": {name: value for name, value in header.items() if name != "blocks"}})  # they were told
     except StoreError as error:
-        report({"error": {"code": error.code, "text": str(error), "advice": "free the disk, then arm again"}})
+        say({"error": {"code": error.code, "text": str(error), "advice": "free the disk, then arm again"}})
     except FdhilError as error:
         advice = "mend the program, then arm again"
-        report({"error": {"code": type(error).__name__, "text": str(error), "advice": advice}})
+        say({"error": {"code": type(error).__name__, "text": str(error), "advice": advice}})
 
 
 if __name__ == "__main__":

@@ -2,12 +2,12 @@
 
 import contextlib
 import math
-import time
 from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass
 from typing import Any
 
 from fdhil.guard.protocol import AT_REST
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 GONE = frozenset({"absent", "lost"})
 REST: frozenset[str] = AT_REST | GONE
@@ -104,17 +104,20 @@ def lost(before: Mapping[str, Any], arming: bool) -> Mapping[str, Any]:
 
 
 def landed(
-    look: Callable[[], Mapping[str, Any]], patience_s: float = LANDING_S, landing: Set[str] | None = None
+    look: Callable[[], Mapping[str, Any]],
+    patience_s: float = LANDING_S,
+    landing: Set[str] | None = None,
+    clock: Clock = SYSTEM_CLOCK,
 ) -> Mapping[str, Any]:
     """Wait until the guard is at rest, or gone, as long as SYNC moves it on, and return its status (blocking).
 
     ``look`` gives the status; in states that are no ``landing`` its SYNC does not count. What ``look`` raises goes on.
     """
-    status, tick, moved_s = look(), None, time.monotonic()
-    while status["state"] not in REST and time.monotonic() - moved_s < patience_s:
+    status, tick, moved_s = look(), None, clock.now_s()
+    while status["state"] not in REST and clock.now_s() - moved_s < patience_s:
         if status.get("tick") != tick and (landing is None or status["state"] in landing):
-            tick, moved_s = status.get("tick"), time.monotonic()
-        time.sleep(LOOK_S)
+            tick, moved_s = status.get("tick"), clock.now_s()
+        clock.sleep(LOOK_S)
         status = look()
     return status
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import Any, Protocol
@@ -63,7 +62,7 @@ class Acquisition:
                     raise
                 cause = str(error)
             self.source = None
-            self._hearing.source_lost(time.monotonic())
+            self._hearing.source_lost(asyncio.get_running_loop().time())
             text = f"{cause}; it is opened again in {self._delay_s:.1f} s, what was learnt is kept."
             self._tell([Notice("SourceLost", "MAJOR", text)])
             await asyncio.sleep(self._delay_s)
@@ -72,7 +71,7 @@ class Acquisition:
     async def _run_source(self, take: Take) -> None:
         async with self._open_source(self._config) as source:
             self.source = source
-            self._hearing.source_opened(time.monotonic())
+            self._hearing.source_opened(asyncio.get_running_loop().time())
             self.opened.set()
             await source.run(take)
 

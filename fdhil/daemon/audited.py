@@ -8,7 +8,6 @@ lines; the last of those that were held back is written a moment later, with how
 from __future__ import annotations
 
 import asyncio
-import time
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +19,7 @@ from fdhil.daemon.peers import NEEDS, Peer
 from fdhil.errors import StoreError
 from fdhil.guard.peers import Role
 from fdhil.store import audit
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 LOOKING = ("status", "live")
 DONE_FIRST = ("disarm", "stop")
@@ -40,8 +40,10 @@ class _Held(NamedTuple):
 class Audited:
     """Hands requests on to ``handle``, those that change something by way of the audit of ``folder``."""
 
-    def __init__(self, handle: Callable[[Mapping[str, Any]], Awaitable[Answer]], folder: Path) -> None:
-        self._handle, self._folder = handle, folder
+    def __init__(
+        self, handle: Callable[[Mapping[str, Any]], Awaitable[Answer]], folder: Path, clock: Clock = SYSTEM_CLOCK
+    ) -> None:
+        self._handle, self._folder, self._clock = handle, folder, clock
         self._gate = journal.FloodGate()
         self._writing: set[asyncio.Task[Answer | None]] = set()
         self._held: dict[str, _Held] = {}
@@ -101,7 +103,7 @@ class Audited:
         return busy
 
     def _admits(self, key: str, allowed: bool) -> bool:
-        now_s = time.monotonic()
+        now_s = self._clock.now_s()
         if allowed:
             return self._gate.admit(key, now_s) is not None
         if now_s < self._quiet_until_s.get(key, now_s):
@@ -124,7 +126,7 @@ class Audited:
             journal.write_line(f"{_asker(entry)} asked to {what}: {entry['result']}")
         try:
             async with self._disk:  # in the order of what was asked
-                await in_own_thread(audit.append, self._folder, entry)
+                await in_own_thread(audit.append, self._folder, entry, self._clock)
         except StoreError as error:
             text = f"{what} of {entry['who']['user']} is not in the audit: {error}"
             journal.write_line(text, "MAJOR")

@@ -16,6 +16,7 @@ from pathlib import Path
 from fdhil.errors import StoreError
 from fdhil.records import Notice
 from fdhil.store.atomic import make_folder, store_error, write_file
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 FOLDER = "blackbox"
 KEPT_FILES = 8
@@ -48,7 +49,7 @@ def kept(store: Path) -> list[BlackBox]:
     return sorted(found, key=lambda box: box.number)
 
 
-def dump(store: Path, code: str, frames: Callable[[], Mapping[str, str]]) -> Notice:
+def dump(store: Path, code: str, frames: Callable[[], Mapping[str, str]], clock: Clock = SYSTEM_CLOCK) -> Notice:
     """Write what ``frames`` gives, each bus' candump log, to ``blackbox/`` in the store; the oldest files go.
 
     Returns what is to be told, also when the disk refuses: the correction is off already.
@@ -58,7 +59,7 @@ def dump(store: Path, code: str, frames: Callable[[], Mapping[str, str]]) -> Not
         make_folder(folder)
         before = kept(store)
         number = max((box.number for box in before), default=0) + 1
-        file = folder / f"{number:06d}-{datetime.now(UTC).strftime(_TIME)}-{code}.log"
+        file = folder / f"{number:06d}-{datetime.fromtimestamp(clock.wall_s(), UTC).strftime(_TIME)}-{code}.log"
         write_file(file, _in_order(logs.values()).encode("ascii"))
         for old in before[: max(0, len(before) + 1 - KEPT_FILES)]:
             old.path.unlink()

@@ -23,6 +23,7 @@ from fdhil.records import (
     WindowOutcome,
     unit_of,
 )
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 Severity = Literal["info", "minor", "MAJOR"]
 # syslog priorities, see sd-daemon(3)
@@ -31,6 +32,7 @@ BURST = 20  # lines of one class that are written before a flood of it is only c
 REFILL_PER_S = 1.0
 
 _for_programs = threading.Event()  # whether lines are JSON
+_clocks = [SYSTEM_CLOCK]  # the last one dates the lines
 _dropped = {"lines": 0}  # that nobody took, since the last that somebody did
 
 
@@ -50,6 +52,16 @@ def lines_as_json(wanted: bool) -> Iterator[None]:
         _for_programs.clear()
 
 
+@contextmanager
+def lines_dated_by(clock: Clock) -> Iterator[None]:
+    """Date each line by this clock meanwhile."""
+    _clocks.append(clock)
+    try:
+        yield
+    finally:
+        _clocks.remove(clock)
+
+
 def write_line(text: str, severity: Severity = "info") -> None:
     """Write one line to stderr with the local time; to the journal, which has the time, with its priority.
 
@@ -65,7 +77,7 @@ def write_line(text: str, severity: Severity = "info") -> None:
 
 def _line(text: str, severity: Severity) -> tuple[TextIO, str]:
     """Where a line goes, and how it reads there."""
-    now = datetime.now().astimezone()
+    now = datetime.fromtimestamp(_clocks[-1].wall_s()).astimezone()
     if _for_programs.is_set():
         line = {"time": now.isoformat(timespec="milliseconds"), "severity": severity, "text": text}
         return sys.stdout, json.dumps(line) + "\n"

@@ -103,7 +103,9 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int) and not isinstance(value, bool)
 
 
-def acknowledgement_of(request: Mapping[str, Any], numbers: Sequence[int]) -> Acknowledgement:
+def acknowledgement_of(
+    request: Mapping[str, Any], numbers: Sequence[int], stamp: Stamp | None = None
+) -> Acknowledgement:
     """Return who acknowledges what, now; NotAcknowledged where nobody answers for it."""
     who, note = request.get("by"), request.get("note", "")
     if not isinstance(who, str) or not who.strip() or len(who) > MOST_WHO:
@@ -112,7 +114,7 @@ def acknowledgement_of(request: Mapping[str, Any], numbers: Sequence[int]) -> Ac
     if not isinstance(note, str) or len(note) > MOST_NOTE:
         text = "the note is no text, or too long"
         raise NotAcknowledged("BadRequest", text, f"give a text of at most {MOST_NOTE} characters as 'note'")
-    return Acknowledgement(tuple(numbers), printable(who.strip()), printable(note.strip()), Stamp.now())
+    return Acknowledgement(tuple(numbers), printable(who.strip()), printable(note.strip()), stamp or Stamp.now())
 
 
 def counted(numbers: Sequence[int]) -> str:

@@ -37,6 +37,7 @@ from fdhil.store.newest_sets import newest_loops, newest_sets
 from fdhil.store.outbox import Outbox
 from fdhil.store.rows import Revision, Stamp, StoredWindow
 from fdhil.store.windows import RawScale, Scales, WindowStore
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 SKILLS = 3
 # of the history: its newest rows may be in the log alone, which goes aside first; beside no file SQLite removes it
@@ -87,8 +88,8 @@ class OutcomeStore:
     outcome stays in memory only, and each next one is tried again (a window always as a new file).
     """
 
-    def __init__(self, config: MachineConfig) -> None:
-        self._config = config
+    def __init__(self, config: MachineConfig, clock: Clock = SYSTEM_CLOCK) -> None:
+        self._config, self._clock = config, clock
         self._directory = config.store.directory
         self._lock = threading.Lock()
         self._outbox = Outbox(config.uplink, config.uplink_directory) if config.uplink else None
@@ -242,7 +243,7 @@ class OutcomeStore:
         """Store who has seen which notices, so that they are open no more; StoreError when the disk refuses."""
         with self._lock:
             try:
-                given = acknowledgement_of(request, self.notices.chosen(request))
+                given = acknowledgement_of(request, self.notices.chosen(request), Stamp.now(self._clock))
             except NotAcknowledged as refused:
                 return refused.answer
             if self._history is None:
@@ -266,7 +267,7 @@ class OutcomeStore:
     def _keep(self, outcome: Outcome) -> None:
         assert self._history is not None
         assert self._windows is not None
-        stamp = Stamp.now()
+        stamp = Stamp.now(self._clock)
         if isinstance(outcome, WindowOutcome):
             axis = outcome.window.axis
             last = self._history.last_window_number()

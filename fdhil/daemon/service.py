@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -39,6 +38,7 @@ from fdhil.daemon.status import Watch
 from fdhil.errors import FdhilError, StoreError
 from fdhil.pipeline import AxisPipeline, Record
 from fdhil.records import AxisSamples, NcState, Notice, Outcome, Temperature, TickTimes
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 NOTICE_QUEUE = 200
 WATCHDOG_S = 2.0
@@ -62,13 +62,14 @@ class Service:
         method: str | None = None,
         budgets: Budgets | None = None,
         leave: Callable[[int], object] | None = None,
+        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
-        self._config = config
+        self._config, self._clock = config, clock
         self._method = method
         self._run_directory = config.run_directory
-        self._store = OutcomeStore(config)
-        self._desk = ArmingDesk(config, self._store, self._run_directory)
-        self._watch = Watch(config, time.monotonic())
+        self._store = OutcomeStore(config, clock)
+        self._desk = ArmingDesk(config, self._store, self._run_directory, clock)
+        self._watch = Watch(config, self._clock.now_s())
         self._live = LiveStream(config)
         self._pipelines: dict[str, AxisPipeline] = {}
         self._queues = {axis: RecordQueue() for axis in config.axis}
@@ -77,7 +78,7 @@ class Service:
         self._void_axes = asyncio.Queue[str]()  # each once at most: ``_void_by`` has the newest that speaks against it
         self._void_by: dict[str, str] = {}
         self._gate = journal.FloodGate()
-        self._audit = Audited(self._handle, config.store.directory)
+        self._audit = Audited(self._handle, config.store.directory, clock)
         desk, access = self._desk, config.access
         self._control = ControlServer(
             self._audit.of, lambda: desk.checking, desk.abandon, access, self._live.serve, self._socket_lost
@@ -92,7 +93,7 @@ class Service:
     async def run(self) -> Standing:
         """Serve until a signal asks to stop; return what may still be applied. BusLocked when another one serves it."""
         loop = asyncio.get_running_loop()
-        with sole_owner(self._run_directory, self._config.store.directory):
+        with sole_owner(self._run_directory, self._config.store.directory), journal.lines_dated_by(self._clock):
             stopping = [number for number in STOPPING if signal.getsignal(number) is not signal.SIG_IGN]  # as by nohup
             for number in stopping:
                 loop.add_signal_handler(number, self._begin_to_stop)
@@ -188,9 +189,9 @@ class Service:
         self._acquisition.received()
         if isinstance(record, NcState):
             self._desk.hear_nc(record)
-            self._tell(self._watch.nc.note(record, time.monotonic()))
+            self._tell(self._watch.nc.note(record, self._clock.now_s()))
             return
-        self._watch.hearing.record_came(record, time.monotonic())
+        self._watch.hearing.record_came(record, self._clock.now_s())
         if isinstance(record, Notice):
             self._tell([record])
             return
@@ -208,7 +209,7 @@ class Service:
         queue = self._queues[axis]
         while True:
             batch = await queue.batch()
-            self._busy_since_s[axis] = time.monotonic()
+            self._busy_since_s[axis] = self._clock.now_s()
             outcomes, notices = await asyncio.to_thread(self._digest, axis, batch)
             del self._busy_since_s[axis]
             self._desk.knowledge.note(outcomes)
@@ -227,7 +228,7 @@ class Service:
 
         What voids a record does so whatever a flood holds back.
         """
-        now_s = time.monotonic()
+        now_s = self._clock.now_s()
         for notice in notices:
             if notice.code in VOIDING:
                 if notice.axis not in self._void_by:
@@ -242,8 +243,9 @@ class Service:
             notice = await self._notices.get()
             self._say(await asyncio.to_thread(self._store.keep, [notice]))
             if notice.code == TRIPPED and self._acquisition.source is not None:
-                code, store = notice.text.partition(":")[0], self._config.store.directory
-                self._tell([await asyncio.to_thread(blackbox.dump, store, code, self._acquisition.source.black_box)])
+                code, frames = notice.text.partition(":")[0], self._acquisition.source.black_box
+                store = self._config.store.directory
+                self._tell([await asyncio.to_thread(blackbox.dump, store, code, frames, self._clock)])
             self._notices.task_done()
 
     async def _void_records(self) -> None:
@@ -258,7 +260,7 @@ class Service:
 
     def _say(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
         """Show outcomes: one log line each (a flood becomes a count), the newest in the status. Return those shown."""
-        now_s, shown = time.monotonic(), []
+        now_s, shown = self._clock.now_s(), []
         for outcome in outcomes:
             self._watch.outcome_came(outcome, now_s)
             text, severity = journal.line_of(outcome)
@@ -277,7 +279,7 @@ class Service:
             await asyncio.sleep(min(period_s, WATCHDOG_S))
 
     def _alive(self, period_s: float) -> bool:
-        now_s = time.monotonic()
+        now_s = self._clock.now_s()
         if any(now_s - since_s > STUCK_S for since_s in self._busy_since_s.values()):
             return False
         counters = self._acquisition.source.counters() if self._acquisition.source is not None else {}
@@ -289,7 +291,7 @@ class Service:
         """Look a few times a second whether the machine is heard, and tell what is not as the config says."""
         while True:
             await asyncio.sleep(LISTEN_S)
-            now_s = time.monotonic()
+            now_s = self._clock.now_s()
             if self._acquisition.source is not None:
                 self._watch.hearing.counted(self._acquisition.source.counters(), now_s)
             self._tell(self._watch.troubles(now_s))
@@ -300,7 +302,7 @@ class Service:
         while True:
             await asyncio.to_thread(heap.give_back)
             self._resources = uses()
-            self._tell([*watch.look(self._resources), *clock.look(time.time(), time.monotonic())])
+            self._tell([*watch.look(self._resources), *clock.look(self._clock.wall_s(), self._clock.now_s())])
             self._tell(await asyncio.to_thread(offers.look))
             self._tell(await asyncio.to_thread(self._store.keep, ()))  # tells whether the history still stands there
             await asyncio.sleep(RESOURCES_S)
@@ -340,7 +342,7 @@ class Service:
             "fault": self._store.fault,
             "strays": list(self._store.strays),
         }
-        status = self._watch.status(time.monotonic(), self._store.notices.told)
+        status = self._watch.status(self._clock.now_s(), self._store.notices.told)
         guard = self._desk.guard
         for axis, celsius in self._desk.knowledge.temperatures.items():
             status["axes"][axis]["slideway_c"] = celsius

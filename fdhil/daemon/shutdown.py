@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import threading
-import time
 from collections.abc import Callable, Coroutine
 from dataclasses import astuple, dataclass
 from typing import Any
@@ -58,10 +57,11 @@ class Shutdown:
 
     async def step(self, what: str, work: Coroutine[Any, Any, Any], within_s: float, effect: str) -> None:
         """Do one step within its time, which counts from its first begin; else report it with its ``effect``."""
-        deadline_s = self._deadlines_s.setdefault(what, time.monotonic() + within_s)
+        now_s = asyncio.get_running_loop().time()
+        deadline_s = self._deadlines_s.setdefault(what, now_s + within_s)
         task = asyncio.create_task(work, name=what)
         try:
-            done, _ = await asyncio.wait([task], timeout=max(0.0, deadline_s - time.monotonic()))
+            done, _ = await asyncio.wait([task], timeout=max(0.0, deadline_s - now_s))
         finally:
             task.cancel()
         if done:

@@ -1,12 +1,11 @@
 """Drains one bus, decodes it, and opens it again when it ended."""
 
 import asyncio
-import time
 from collections import Counter
 from collections.abc import Mapping
 
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.bus import CanBus
+from fdhil.drivers.can.bus import CanBus, ListenedBus, OpenBus
 from fdhil.drivers.can.frame_history import FrameHistory
 from fdhil.drivers.can.port import Stamps
 from fdhil.drivers.can.tick_clock import TickClock
@@ -28,10 +27,10 @@ STAMPS_COST: Mapping[Stamps, str] = {
 class BusSource:
     """One bus: drains the ring, decodes, and opens it again when it ended."""
 
-    def __init__(self, name: str, config: MachineConfig) -> None:
+    def __init__(self, name: str, config: MachineConfig, open_bus: OpenBus = CanBus) -> None:
         self.name = name
-        self._config = config
-        self._bus: CanBus | None = None
+        self._config, self._open_bus = config, open_bus
+        self._bus: ListenedBus | None = None
         self.decoder = BusDecoder(name, config)
         self.ticks = TickClock(config.machine.sync_period_s)
         event_source = load_event_source(config.g0.source)
@@ -46,7 +45,7 @@ class BusSource:
         """Open the bus; ConnectError when it cannot be reached."""
         settings = self._config.bus[self.name]
         filters = self.decoder.filters() if settings.frames == "drives" else ()
-        self._bus = CanBus(self.name, settings, filters=filters)
+        self._bus = self._open_bus(self.name, settings, filters=filters)
 
     def step(self, now_ns: int) -> list[Record]:
         """Drain and decode once."""
@@ -70,7 +69,7 @@ class BusSource:
         """Take what the NC says; return the moves that are known by now."""
         return [event for source in self._events for event in source.feed(state)]
 
-    def _stamping(self, bus: CanBus) -> list[Notice]:
+    def _stamping(self, bus: ListenedBus) -> list[Notice]:
         """Say once what the time stamps of this way onto the bus are worth, where that is less than the kernel's."""
         cost = STAMPS_COST.get(bus.stamps)
         if cost is None or self._stamping_told or not bus.counters()["frames"]:
@@ -81,7 +80,7 @@ class BusSource:
         )
         return [Notice("CoarseStamps", "info", f"{text} of its own is placed no better, so that L is less certain.")]
 
-    def _overflow(self, bus: CanBus) -> list[Notice]:
+    def _overflow(self, bus: ListenedBus) -> list[Notice]:
         lost = bus.counters()["lost"]
         if lost <= self._overflow_told:
             return []
@@ -89,7 +88,7 @@ class BusSource:
         text = f"{new} frames of bus {self.name} were not read in time; the computer is overloaded."
         return [Notice("RxOverflow", "minor", text)]
 
-    def _silence(self, bus: CanBus, now_ns: int) -> list[Notice]:
+    def _silence(self, bus: ListenedBus, now_ns: int) -> list[Notice]:
         silent = now_ns - bus.last_frame_ns > SILENCE_S * 1e9
         was, self._silent = self._silent, silent
         if silent and not was:
@@ -105,7 +104,7 @@ class BusSource:
         pause = BACK_OFF_S[0]
         while True:
             await asyncio.sleep(DRAIN_S)
-            for record in self.step(time.monotonic_ns()):
+            for record in self.step(round(asyncio.get_running_loop().time() * 1e9)):
                 take(record)
             if self._bus is None or self._bus.ended is None:
                 pause = BACK_OFF_S[0]

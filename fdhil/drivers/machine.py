@@ -15,6 +15,7 @@ from contextlib import asynccontextmanager
 from fdhil import tables
 from fdhil.config import MachineConfig
 from fdhil.drivers.bus_source import BusSource
+from fdhil.drivers.can.bus import CanBus, OpenBus
 from fdhil.drivers.can.frame_history import candump
 from fdhil.drivers.nc.listener import NcListener
 from fdhil.drivers.sensor_source import Record, SensorSource, Take, sensors_of
@@ -27,9 +28,9 @@ __all__ = ["MachineSource", "Record", "open_machine"]
 class MachineSource:
     """All sources of a machine; ``run`` hands over what they say, ``counters`` tells what they counted."""
 
-    def __init__(self, config: MachineConfig) -> None:
+    def __init__(self, config: MachineConfig, open_bus: OpenBus = CanBus) -> None:
         used = dict.fromkeys(axis.drive.bus for axis in config.axis.values())
-        self._buses = {name: BusSource(name, config) for name in used}
+        self._buses = {name: BusSource(name, config, open_bus) for name in used}
         self._sensors = {
             axis if what == "voltage" else f"{axis}.{what}": SensorSource(sensor, self._buses[settings.drive.bus].ticks)
             for axis, settings in config.axis.items()
@@ -97,9 +98,9 @@ class MachineSource:
 
 
 @asynccontextmanager
-async def open_machine(config: MachineConfig) -> AsyncIterator[MachineSource]:
+async def open_machine(config: MachineConfig, open_bus: OpenBus = CanBus) -> AsyncIterator[MachineSource]:
     """Open all that the configuration names; ConnectError (exit code 3) when something is not there."""
-    source = MachineSource(config)
+    source = MachineSource(config, open_bus)
     try:
         await source.open()
         yield source

@@ -8,18 +8,30 @@ import select
 import socket
 import time
 from collections import deque
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 KEPT_EVENTS = 32
 WATCHDOG = "WATCHDOG=1"
 MOST_CHARACTERS = 500  # of a text, so that a line is never longer than the pipe takes at once
 
 
-class Journal:
-    """One JSON line per event; a reader that is slow costs lines, never time: ``dropped`` counts them."""
+class Clock(NamedTuple):
+    """The monotonic and the wall clock of the guard, and what it waits with."""
 
-    def __init__(self, descriptor: int = 1) -> None:
-        self._descriptor = descriptor
+    now_s: Callable[[], float] = time.monotonic
+    wall_s: Callable[[], float] = time.time
+    new_poll: Callable[[], select.poll] = select.poll
+
+
+SYSTEM = Clock()
+
+
+class Journal:
+    """One JSON line per event, dated by ``clock``; a slow reader costs lines, never time: ``dropped`` counts them."""
+
+    def __init__(self, descriptor: int = 1, clock: Clock = SYSTEM) -> None:
+        self._descriptor, self.clock = descriptor, clock
         self._writable = select.poll()
         self._writable.register(descriptor, select.POLLOUT)
         self.recent: deque[dict[str, Any]] = deque(maxlen=KEPT_EVENTS)
@@ -27,7 +39,7 @@ class Journal:
 
     def write(self, event: str, **fields: Any) -> None:
         """Write an event with its monotonic and wall time."""
-        stamps = {"mono_s": round(time.monotonic(), 6), "wall_s": round(time.time(), 6)}
+        stamps = {"mono_s": round(self.clock.now_s(), 6), "wall_s": round(self.clock.wall_s(), 6)}
         short = {key: value[:MOST_CHARACTERS] if isinstance(value, str) else value for key, value in fields.items()}
         record = {"event": event, **stamps, **short}
         self.recent.append(record)

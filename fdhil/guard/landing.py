@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import select
-import time
 from collections.abc import Sequence
 
 from fdhil.cia402 import COB_SYNC, pack
 from fdhil.guard.can_socket import BusDown, CanSocket
+from fdhil.guard.journal import Clock
 from fdhil.guard.limits import follow
 from fdhil.guard.protocol import SENDING, FeedMode
 from fdhil.guard.settings import Settings
@@ -16,7 +16,7 @@ from fdhil.guard.state import State
 ZEROS = 5
 
 
-def land(state: State, unsent: Sequence[int], settings: Settings, can: CanSocket) -> tuple[int, ...]:
+def land(state: State, unsent: Sequence[int], settings: Settings, can: CanSocket, clock: Clock) -> tuple[int, ...]:
     """Ramp the offsets to zero and return what was sent last, in increments per axis; it stops when SYNC or bus stop.
 
     ``unsent`` are the axes whose last offset did not leave. Speed and torque offsets are set to zero at once. Nothing
@@ -26,7 +26,7 @@ def land(state: State, unsent: Sequence[int], settings: Settings, can: CanSocket
     feeds = () if state.feed.mode is FeedMode.OFF else settings.feeds
     zeros = 0 if state.sending else ZEROS
     try:
-        while zeros < ZEROS and _sync(can, settings.silence_s):
+        while zeros < ZEROS and _sync(can, settings.silence_s, clock):
             if state.mode in SENDING:
                 moving = _step(settings, can, moving)
             for feed in feeds:
@@ -47,12 +47,12 @@ def _step(settings: Settings, can: CanSocket, moving: list[tuple[int, int]]) -> 
     return stepped
 
 
-def _sync(can: CanSocket, silence_s: float) -> bool:
+def _sync(can: CanSocket, silence_s: float, clock: Clock) -> bool:
     """Wait for the next SYNC; False when none comes for too long."""
-    poll = select.poll()
+    poll = clock.new_poll()
     poll.register(can, select.POLLIN)
-    end_s = time.monotonic() + silence_s
-    while (left_s := end_s - time.monotonic()) > 0:
+    end_s = clock.now_s() + silence_s
+    while (left_s := end_s - clock.now_s()) > 0:
         if poll.poll(left_s * 1000) and any(cob_id == COB_SYNC for cob_id, _, _ in can.receive()):
             return True
     return False

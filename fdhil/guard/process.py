@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import select
 import socket
-import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -40,12 +39,13 @@ DECIDED = ("arm", "feedforward", "disarm", "adopt", "compared")
 class Guard:
     """The process; ``run`` returns its exit code: 0 when it is known that nothing is applied, 3 otherwise.
 
-    ``wake`` becomes readable when a signal asks to stop.
+    ``wake`` becomes readable when a signal asks to stop. The journal's clock is that of the loop, too.
     """
 
     def __init__(
         self, settings: Settings, can: CanSocket, journal: Journal, notifier: Notifier, wake: socket.socket
     ) -> None:
+        self._now_s = journal.clock.now_s
         self.settings = settings
         self.state = initial(settings)
         access = Access(settings.daemon_uid, settings.watching)
@@ -64,7 +64,7 @@ class Guard:
         self._unfed: tuple[int, ...] = ()
         self._inputs: Inputs | None = None
         self._shadow = Shadow()
-        self._last_sync_s = time.monotonic()
+        self._last_sync_s = self._now_s()
         self._stepped_s = 0.0
         self._rested_s = 0.0
         self._silent, self._put_off = True, False
@@ -79,11 +79,22 @@ class Guard:
 
     def run(self) -> int:
         """Serve until a signal asks to stop and the offset is at zero, or cannot be brought there."""
+        self.begin()
+        while (code := self.turn()) is None:
+            pass
+        return code
+
+    def begin(self) -> None:
+        """Report that the loop is about to turn."""
         self._notifier.tell("READY=1")
         self._journal.write("ready", bus=self.settings.bus, axes=[axis.name for axis in self.settings.axes])
+
+    def turn(self) -> int | None:
+        """Run one turn of the loop; return the exit code when it was the last one, None otherwise."""
         try:
-            while not (self._stopping and not self.state.sending and not self._requests):
+            if self.state.sending or self._requests or not self._stopping:
                 self._turn()
+                return None
         except Exception as error:  # noqa: BLE001 - the guard's supervisor: whatever has failed, the offset is taken away
             self._failed(error)
             return 3
@@ -98,7 +109,8 @@ class Guard:
         text = f"{cause.cause}; {effect}; {cause.action}"
         self._journal.write("failed", code=cause.code, state=self.state.mode.value, text=text)
         self._notifier.tell("STOPPING=1")
-        sending, sent = self.state.sending, land(self.state, self._unsent, self.settings, self._can)
+        sending, clock = self.state.sending, self._journal.clock
+        sent = land(self.state, self._unsent, self.settings, self._can, clock)
         standing_um = status.may_stand_um(self.state, self.settings)
         if sending:  # nothing was read back on the way
             standing_um = dict.fromkeys(standing_um)
@@ -114,7 +126,7 @@ class Guard:
         self._can.close()
 
     def _turn(self) -> None:
-        now_s = time.monotonic()
+        now_s = self._now_s()
         self._notifier.alive(now_s)
         rest_s = self._rested_s - now_s
         ready = self._wait(rest_s)
@@ -140,7 +152,7 @@ class Guard:
 
     def _wait(self, rest_s: float) -> set[int]:
         """Wait for the bus and for signals; for the clients too, unless they rest."""
-        poll = select.poll()
+        poll = self._journal.clock.new_poll()
         poll.register(self._wake, select.POLLIN)
         if self._listener.bus_state != "down":
             poll.register(self._can, select.POLLIN)
@@ -172,11 +184,11 @@ class Guard:
             frames = self._can.receive()
         except BusDown as error:
             self._bus_down(error)
-            self._in_silence(time.monotonic())
+            self._in_silence(self._now_s())
             return
         self._listener.lost_frames += self._can.lost_frames - self._lost_seen
         self._lost_seen = self._can.lost_frames
-        now_s = time.monotonic()
+        now_s = self._now_s()
         last_sync = max([k for k, frame in enumerate(frames) if frame[0] == COB_SYNC], default=-1)
         for k, (cob_id, data, stamp_s) in enumerate(frames):
             if cob_id == COB_SYNC:
@@ -207,7 +219,7 @@ class Guard:
 
     def _local_timer(self) -> None:
         """Without SYNC for too long the core steps on the wall clock: it freezes, or ramps an event-driven RPDO."""
-        now_s = time.monotonic()
+        now_s = self._now_s()
         if now_s - self._last_sync_s <= self.settings.silence_s:
             return
         if not self._put_off and self._frames_wait():
@@ -224,7 +236,7 @@ class Guard:
         """Whether it was this process that slept, and not the bus: then its frames are waiting."""
         if self._listener.bus_state == "down":
             return False
-        poll = select.poll()
+        poll = self._journal.clock.new_poll()
         poll.register(self._can, select.POLLIN)
         return bool(poll.poll(0))
 
@@ -325,13 +337,13 @@ class Guard:
         """Serve one client and check some rows of a table; then both rest, and the loop waits for the bus alone."""
         if not (asked or self.control.pending or self.intake.busy):
             return
-        served = self.control.serve(asked, time.monotonic())
+        served = self.control.serve(asked, self._now_s())
         if served is not None:
             self._request(*served)
             served[0].settle()
         self.control.drop_gone()
         self.intake.check(self.state)
-        self._rested_s = time.monotonic() + REST_S
+        self._rested_s = self._now_s() + REST_S
 
     def _request(self, client: Client, document: Document) -> None:
         kind = document.get("request")
@@ -398,7 +410,7 @@ class Guard:
 
     def _tell_refused(self, peer: Peer, kind: object) -> None:
         """Write down who asked for what he may not; ``times`` counts all that were refused since the line before."""
-        self._refused, now_s = self._refused + 1, time.monotonic()
+        self._refused, now_s = self._refused + 1, self._now_s()
         if now_s - self._refused_s >= REFUSED_S:
             told = str(kind)[:40] if kind else "to talk"
             self._journal.write(

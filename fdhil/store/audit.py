@@ -20,6 +20,7 @@ from typing import Any
 from fdhil.errors import StoreError
 from fdhil.store.atomic import store_error, sync_folder, write_all
 from fdhil.store.rows import Stamp
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 FILE_NAME = "audit.jsonl"
 TAIL_BYTES = 16 * 1024
@@ -28,7 +29,7 @@ BEGIN = "0" * 64  # what stands before the first line
 BROKEN = "is no line of the audit, or not the one that stood here: it was changed, left out or moved"
 
 
-def append(folder: Path, entry: Mapping[str, Any]) -> None:
+def append(folder: Path, entry: Mapping[str, Any], clock: Clock = SYSTEM_CLOCK) -> None:
     """Write one entry at the end and wait until it is on the disk. StoreError.
 
     A line that a power cut left half is closed first: it stays and is told by ``entries``.
@@ -37,7 +38,7 @@ def append(folder: Path, entry: Mapping[str, Any]) -> None:
     try:
         with _opened(path) as descriptor:
             before, whole = _last_seal(descriptor)
-            stamp = Stamp.now()
+            stamp = Stamp.now(clock)
             told = datetime.fromtimestamp(stamp.wall_s, UTC).isoformat(timespec="milliseconds")
             body = {"time": told, "boot": stamp.boot, "monotonic_ns": stamp.monotonic_ns, **entry}
             line = json.dumps({**body, "seal": _seal(before, body)}).encode() + b"\n"

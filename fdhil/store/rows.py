@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +22,7 @@ from fdhil.records import (
     Verdict,
     frozen,
 )
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,13 +34,13 @@ class Stamp:
     monotonic_ns: int
 
     @staticmethod
-    def now() -> Stamp:
+    def now(clock: Clock = SYSTEM_CLOCK) -> Stamp:
         """Return the stamp of this moment."""
-        return Stamp(time.time(), _boot_id(), since_boot_ns())
+        return Stamp(clock.wall_s(), clock.boot_id(), clock.since_boot_ns())
 
-    def age_s(self) -> float:
+    def age_s(self, clock: Clock = SYSTEM_CLOCK) -> float:
         """Return how long ago that was; below 0 where a wall clock was set back, which is not to be believed."""
-        now = Stamp.now()
+        now = Stamp.now(clock)
         if now.boot and self.boot == now.boot:
             return (now.monotonic_ns - self.monotonic_ns) * 1e-9
         return now.wall_s - self.wall_s
@@ -51,19 +50,6 @@ class Stamp:
         if self.boot and self.boot == other.boot:
             return self.monotonic_ns > other.monotonic_ns
         return self.wall_s > other.wall_s
-
-
-def since_boot_ns() -> int:
-    """Return the time since the computer was started; the time in which it was suspended counts, a machine may age."""
-    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
-
-
-def _boot_id() -> str:
-    """Return the kernel's identifier of this boot; times since the boot compare only within one."""
-    try:
-        return Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
-    except OSError:
-        return ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -94,13 +94,18 @@ def test_a_connection_that_breaks_is_lost(far: Far, monkeypatch: pytest.MonkeyPa
         def settimeout(self, seconds: float) -> None: ...
         def sendall(self, line: bytes) -> None: ...
         def close(self) -> None: ...
+        def fileno(self) -> int:
+            return ready
+
         def recv(self, size: int) -> bytes:
             raise OSError(104, "Connection reset by peer")
 
     client._socket.close()
     monkeypatch.setattr(client, "_socket", Broken())
+    ready = os.open(os.devnull, os.O_RDONLY)
     with pytest.raises(GuardLost, match="reset"):
         client.feed_forward("token", {"X": {}}, {})
+    os.close(ready)
 
 
 def test_a_table_goes_with_its_descriptor(far: Far) -> None:

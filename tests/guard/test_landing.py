@@ -10,6 +10,7 @@ import pytest
 
 from fdhil.guard.can_socket import Frame
 from fdhil.guard.feedforward import armed
+from fdhil.guard.journal import SYSTEM
 from fdhil.guard.landing import land
 from fdhil.guard.limits import follow
 from fdhil.guard.protocol import Mode
@@ -67,7 +68,7 @@ def test_each_axis_goes_to_zero_by_its_limits_and_five_zeros_end_it(rate: int, f
     made = machine.settings()
     wire = Ticking(made, fulls)
     try:
-        assert land(sending(made, 600, -200, rate=rate), (), made, wire) == (0, 0)
+        assert land(sending(made, 600, -200, rate=rate), (), made, wire, SYSTEM) == (0, 0)
     finally:
         wire.close()
     for node, offset in ((1, 600), (2, -200)):
@@ -83,7 +84,7 @@ def test_an_axis_whose_last_offset_did_not_leave_goes_on_from_the_one_before() -
     axes = (state.axes[0]._replace(sent=(600, 560, 520, 480)), state.axes[1])
     wire = Ticking(made)
     try:
-        assert land(state._replace(axes=axes), (0,), made, wire) == (0, 0)
+        assert land(state._replace(axes=axes), (0,), made, wire, SYSTEM) == (0, 0)
     finally:
         wire.close()
     for node, offset, rate in ((1, 560, 0), (2, -200, 40)):
@@ -96,7 +97,7 @@ def test_it_waits_a_moment_for_each_sync_in_the_time_of_the_wall_too() -> None:
     assert 0.5 < made.silence_s < 1
     wire = Ticking(made)
     try:
-        assert land(sending(made, 0, 0), (), made, wire) == (0, 0)
+        assert land(sending(made, 0, 0), (), made, wire, SYSTEM) == (0, 0)
     finally:
         wire.close()
     assert wire.offsets(1) == [0] * LAST_ZEROS
@@ -106,7 +107,7 @@ def test_where_nothing_was_sent_nothing_is_and_no_sync_is_awaited() -> None:
     made = fed_settings()
     wire = Ticking(made)
     try:
-        assert land(sending(made, 0, 0, mode=Mode.OFF), (), made, wire) == (0, 0)
+        assert land(sending(made, 0, 0, mode=Mode.OFF), (), made, wire, SYSTEM) == (0, 0)
     finally:
         wire.close()
     assert (wire.syncs, wire.sent) == (0, [])
@@ -119,7 +120,7 @@ def test_only_what_was_sent_gets_zeros(mode: Mode, fed: bool) -> None:
     state = sending(made, 0, 0, mode=mode)
     wire = Ticking(made)
     try:
-        land(state._replace(feed=armed((LAW, LAW))) if fed else state, (), made, wire)
+        land(state._replace(feed=armed((LAW, LAW))) if fed else state, (), made, wire, SYSTEM)
     finally:
         wire.close()
     wanted = [*([0x301, 0x302] if mode is Mode.ACTIVE else []), *([0x401, 0x402] if fed else [])]

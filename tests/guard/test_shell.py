@@ -20,7 +20,7 @@ from fdhil.errors import DeviceError
 from fdhil.guard import intake, process, table
 from fdhil.guard.can_socket import Frame
 from fdhil.guard.control import MAX_CLIENTS, MAX_LINE_BYTES, Client, Closer, Control
-from fdhil.guard.journal import Journal, Notifier
+from fdhil.guard.journal import SYSTEM, Journal, Notifier
 from fdhil.guard.landing import land
 from fdhil.guard.peers import Access, Peer
 from tests.guard import shop as shop_module
@@ -144,15 +144,15 @@ def test_landing_stops_where_bus_or_sync_stop_and_waits_where_the_queue_is_full(
     shop.into_the_cut()
     offset = shop.offsets()[-1]
     state, quick = shop.guard.state, replace(shop.settings, clock="monotonic", sync_period_s=1e-5)
-    assert land(state, (), quick, shop.wire)[0] == offset  # no SYNC comes
+    assert land(state, (), quick, shop.wire, SYSTEM)[0] == offset  # no SYNC comes
     shop.wire.feed([(0x181, b"", 0.0)])
-    assert land(state, (), quick, shop.wire)[0] == offset  # nor any that counts
+    assert land(state, (), quick, shop.wire, SYSTEM)[0] == offset  # nor any that counts
     shop.wire.feed([(0x080, b"", 0.0)])
     shop.wire.full = True
-    assert land(state, (), quick, shop.wire)[0] == offset
+    assert land(state, (), quick, shop.wire, SYSTEM)[0] == offset
     shop.wire.down = True
     shop.wire.feed([])
-    assert land(state, (), shop.settings, shop.wire)[0] == offset
+    assert land(state, (), shop.settings, shop.wire, SYSTEM)[0] == offset
 
 
 def test_the_feed_forward_is_told_sent_and_set_to_zero_by_a_fault(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ There is nothing here that sends: what does is in ``fdhil.commissioning.transmit
 import threading
 import time
 from collections.abc import Sequence
-from typing import Self
+from typing import Protocol, Self
 
 from fdhil import config
 from fdhil.drivers.can.filters import passing
@@ -19,6 +19,36 @@ POLL_S = 0.05
 # stamps come from the kernel or the hub, and even a receive buffer that may not be enlarged holds three times as many
 BATCH_S = 0.010
 HOLD_BACK_S = 0.001
+
+
+class ListenedBus(Protocol):
+    """A bus as its reader needs it: frames in blocks."""
+
+    last_frame_ns: int
+
+    @property
+    def ended(self) -> str | None:
+        """Why no more frames come; None while they may."""
+
+    @property
+    def stamps(self) -> Stamps:
+        """Who stamped the newest frames."""
+
+    def drain(self) -> Frames:
+        """Return all frames received since the last call that pass the filters, in order of arrival."""
+
+    def counters(self) -> dict[str, int]:
+        """Return frames received, and lost in the ring and in the kernel."""
+
+    def close(self) -> None:
+        """Release the bus."""
+
+
+class OpenBus(Protocol):
+    """Opens a bus for listening; ConnectError with cause and next action."""
+
+    def __call__(self, name: str, settings: config.CanBus, *, filters: Sequence[Filter] = ()) -> ListenedBus:
+        """Return the open bus, which receives."""
 
 
 class CanBus:

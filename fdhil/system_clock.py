@@ -1,0 +1,47 @@
+"""Reads this computer's clocks and waits by them; a class that takes a ``Clock`` also runs on simulated time.
+
+Coroutines need none: the time of their event loop is the same monotonic clock.
+"""
+
+from __future__ import annotations
+
+import select
+import socket
+import time
+from pathlib import Path
+
+
+class Clock:
+    """The clocks of this computer, and the two ways in which a thread waits."""
+
+    def now_s(self) -> float:
+        """Return the monotonic time, s."""
+        return time.monotonic()
+
+    def wall_s(self) -> float:
+        """Return the wall clock, s since 1970; it may be wrong, and may be set."""
+        return time.time()
+
+    def since_boot_ns(self) -> int:
+        """Return the time since the computer was started; the time in which it was suspended counts, a machine ages."""
+        return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+    def boot_id(self) -> str:
+        """Return the kernel's identifier of this boot; times since the boot compare only within one."""
+        try:
+            return Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
+        except OSError:
+            return ""
+
+    def sleep(self, seconds: float) -> None:
+        """Block this thread for so long."""
+        time.sleep(seconds)
+
+    def wait_readable(self, connection: socket.socket, seconds: float) -> bool:
+        """Block until ``connection`` can be read, at most for so long; return whether it can."""
+        poll = select.poll()
+        poll.register(connection, select.POLLIN)
+        return bool(poll.poll(seconds * 1000))
+
+
+SYSTEM_CLOCK = Clock()

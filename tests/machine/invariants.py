@@ -1,0 +1,146 @@
+"""What must hold on a machine at every SYNC, whatever happens to it; knows nothing of the guard's decisions."""
+
+from __future__ import annotations
+
+import json
+import re
+import sqlite3
+from collections import Counter
+from contextlib import closing
+from typing import Any
+
+from fdhil.guard.adoption import may_stand
+from fdhil.guard.protocol import AT_REST
+from fdhil.store.audit import entries
+from tests.guard.wire import Wire
+from tests.machine.whole_machine import Machine
+
+LAG_SYNC = 150  # ten read-backs and more: by then the guard has seen what a drive holds
+STATUS_LAG_S = 1.5  # the daemon asks the guard twice a second
+WINDOW_LINE = re.compile(r" ([A-Z]): G0 [+-] at ")
+TABLES = ("windows", "revisions", "notices", "skills", "loops")
+
+
+class Judge:
+    """Watches one machine and appends to its ``wrong``; ``counted`` is how much it has judged."""
+
+    def __init__(self, machine: Machine) -> None:
+        self._machine = machine
+        self.counted = Counter[str]()
+        self._units = list(machine.plant.units.values())
+        self._wires: dict[int, tuple[Any, Wire]] = {}
+        self._sent: set[int] = set()
+        self._guard: object = None
+        self._untrue = Counter[str]()
+        self._held_since_s: float | None = None
+        machine.at_sync = self._at_sync
+        machine.at_guard_frame = self._guard_frame
+        machine.at_foreign_frame = self._foreign_frame
+
+    def wrong(self, text: str) -> None:
+        """Report a broken invariant, with the time."""
+        self._machine.wrong.append(f"{self._machine.clock.now_s():.3f} s: {text}")
+
+    def _follow(self) -> None:
+        """Judge a new guard from what the drives hold."""
+        guard = self._machine.guard
+        if guard is self._guard or guard is None:
+            return
+        self._guard, self._wires = guard, {}
+        for axis in guard.settings.axes:
+            unit = self._machine.plant.units[axis.name]
+            self._wires[axis.offset.cob_id] = unit, Wire(axis.limits, self._held(unit))
+
+    @staticmethod
+    def _held(unit: Any) -> int:
+        """The offset that the drive has in force, increments."""
+        return int(unit.drive.dictionary.number(0x60B0, 0))
+
+    def _guard_frame(self, cob_id: int, data: bytes) -> None:
+        self._follow()
+        if cob_id not in self._wires:
+            return
+        unit, wire = self._wires[cob_id]
+        self.counted["offset frames"] += 1
+        self._sent.add(cob_id)
+        value = int.from_bytes(data, "little", signed=True)
+        if (wrong := wire.ours(value, self._held(unit))) is not None:
+            self.wrong(f"axis {unit.axis}: {wrong}")
+
+    def _foreign_frame(self, cob_id: int, data: bytes) -> None:
+        if cob_id in self._wires and len(data) >= 4:
+            self._wires[cob_id][1].foreign(int.from_bytes(data[:4], "little", signed=True))
+
+    def _at_sync(self) -> None:
+        self.counted["SYNC"] += 1
+        self._follow()
+        for cob_id, (_, wire) in self._wires.items():
+            if cob_id not in self._sent:
+                wire.nothing()
+        self._sent.clear()
+        self._true_guard()
+        now_s = self._machine.clock.time_s
+        if any(map(self._held, self._units)):
+            self._held_since_s = now_s if self._held_since_s is None else self._held_since_s
+        else:
+            self._held_since_s = None
+
+    def _true_guard(self) -> None:
+        """A guard at rest reports no offset of a drive as less than it is, or as another, once it has read it back."""
+        guard = self._machine.guard
+        if guard is None or guard.state.mode not in AT_REST or guard._silent:
+            self._untrue.clear()
+            return
+        for (unit, _), reported in zip(self._wires.values(), may_stand(guard.state), strict=True):
+            held = self._held(unit)
+            is_true = reported in (None, held) or held == 0  # more than there is may be feared
+            self._untrue[unit.axis] = 0 if is_true else self._untrue[unit.axis] + 1
+            if self._untrue[unit.axis] == LAG_SYNC:
+                self.wrong(f"the guard reports that axis {unit.axis} holds {reported}, it holds {held}")
+
+    def status(self) -> dict[str, Any]:
+        """Ask for the daemon's status; what it reports of offsets that may be applied must be true."""
+        status = self._machine.ask("status")
+        self.counted["statuses"] += 1
+        now_s = self._machine.clock.now_s()
+        since_s = now_s if self._held_since_s is None else self._held_since_s
+        if status["may_stand"]["nothing"] and now_s - since_s > STATUS_LAG_S:
+            self.wrong(f"the daemon reports that nothing is applied, the drives hold {self._machine.held_um()} um")
+        return status
+
+    def end(self) -> None:
+        """Judge what is left: the drives at zero, no record lost or doubled, no line of a crash."""
+        machine = self._machine
+        if any(map(self._held, self._units)):
+            self.wrong(f"in the end the drives hold {machine.held_um()} um")
+        log = machine.log.getvalue()
+        for word in ("Traceback", "InternalError"):
+            if word in log:
+                self.wrong(f"the log has {word}: {log[log.index(word) - 200 : log.index(word) + 400]}")
+        for line in machine.journal.splitlines():
+            event = json.loads(line)
+            if event["event"] == "failed":
+                self.wrong(f"the guard's loop failed: {event['text']}")
+        self._records(log)
+
+    def _records(self, log: str) -> None:
+        logged = Counter(WINDOW_LINE.findall(log))
+        history = self._machine.config.store.directory / "history.sqlite"
+        key = "axis, start_tick, monotonic_ns"
+        with closing(sqlite3.connect(history)) as db:
+            rows = {table: db.execute(f"SELECT * FROM {table}").fetchall() for table in TABLES}
+            kept = Counter(axis for (axis,) in db.execute("SELECT axis FROM windows"))
+            doubled = db.execute(f"SELECT {key} FROM windows GROUP BY {key} HAVING count(*) > 1").fetchall()
+            (sound,) = db.execute("PRAGMA integrity_check").fetchone()
+        self.counted["records"] += sum(map(len, rows.values()))
+        for axis, count in logged.items():
+            if kept[axis] < count:
+                self.wrong(f"axis {axis}: {count} windows were acknowledged, {kept[axis]} are in the history")
+        if doubled:
+            self.wrong(f"doubled windows: {doubled}")
+        if sound != "ok":
+            self.wrong(f"the history is damaged: {sound}")
+        for entry, trouble in entries(self._machine.config.store.directory):
+            self.counted["audit lines"] += 1
+            if trouble is not None:
+                self.wrong(f"the audit: {trouble}: {entry}")

@@ -1,0 +1,172 @@
+"""One CAN bus in memory: the simulated machine, the guard's socket and the daemon's listener are joined by it."""
+
+from __future__ import annotations
+
+import hashlib
+import select
+import socket
+from collections.abc import Callable, Iterable, Sequence
+from typing import IO
+
+import numpy as np
+
+from fdhil import config
+from fdhil.drivers.can.filters import passing
+from fdhil.drivers.can.frames import Frames, frames_of
+from fdhil.drivers.can.port import Filter, Stamps
+from fdhil.errors import ConnectError
+from fdhil.guard.can_socket import MOST_FRAMES, BusDown, CanSocket, Frame
+from fdhil.sim.frame_faults import FrameFaults
+
+Row = tuple[int, int, bytes]
+MOST_ROWS = 20_000
+
+
+class MemoryBus:
+    """Every frame that was on the bus, in order; ``digest`` is over all of them, ``trace`` is where they are written.
+
+    ``from_guard`` is called with each frame that the guard sends.
+    """
+
+    def __init__(self, name: str, now_s: Callable[[], float], faults: FrameFaults) -> None:
+        self.name, self.now_s, self.faults = name, now_s, faults
+        self.digest = hashlib.sha256()
+        self.frames = 0
+        self.trace: IO[bytes] | None = None
+        self.listener: BusListener | None = None
+        self.guard: GuardSocket | None = None
+        self.from_guard: Callable[[int, bytes], bool] = lambda _cob_id, _data: True
+        self._rows: list[Row] = []
+
+    @property
+    def is_down(self) -> bool:
+        """Whether a fault has switched the bus off."""
+        return self.faults.down
+
+    def put(self, frames: Iterable[tuple[int, bytes]], *, of_guard: bool = False) -> None:
+        """Carry frames to all who listen; the guard does not receive its own."""
+        now_s = self.now_s()
+        t_ns = round(now_s * 1e9)
+        rows = [(t_ns, can_id, data) for can_id, data in frames]
+        self._rows += rows
+        if self.guard is not None and not of_guard:
+            self.guard.inbox += [(can_id, data, now_s) for _, can_id, data in rows if can_id in self.guard.wanted]
+        if len(self._rows) >= MOST_ROWS:
+            self.flush()
+
+    def flush(self) -> None:
+        """Hand over to the listener what came since the last time."""
+        if not self._rows:
+            return
+        frames = frames_of(self._rows)
+        self._rows.clear()
+        self.frames += frames.size
+        self.digest.update(frames.tobytes())
+        if self.trace is not None:
+            self.trace.write(frames.tobytes())
+        if self.listener is not None:
+            self.listener.blocks.append(frames)
+
+    def open(self, name: str, settings: config.CanBus, *, filters: Sequence[Filter] = ()) -> BusListener:
+        """Open the bus for listening, as ``CanBus`` does; ConnectError while it is down."""
+        if self.is_down:
+            raise ConnectError(name, "the interface is down; switch it on")
+        self.flush()
+        self.listener = BusListener(self, filters)
+        return self.listener
+
+
+class BusListener:
+    """The daemon's end: what the bus carried since it was opened, in blocks."""
+
+    stamps: Stamps = "kernel"
+
+    def __init__(self, bus: MemoryBus, filters: Sequence[Filter]) -> None:
+        self.blocks: list[Frames] = []
+        self.last_frame_ns = round(bus.now_s() * 1e9)
+        self._bus, self._filters, self._count = bus, filters, 0
+
+    @property
+    def ended(self) -> str | None:
+        """Why no more frames come."""
+        return "the interface is down" if self._bus.is_down else None
+
+    def drain(self) -> Frames:
+        """Return what came since the last call."""
+        self._bus.flush()
+        blocks, self.blocks = self.blocks, []
+        frames = passing(np.concatenate(blocks), self._filters) if blocks else frames_of(())
+        self._count += frames.size
+        if frames.size:
+            self.last_frame_ns = int(frames["t_ns"][-1])
+        return frames
+
+    def counters(self) -> dict[str, int]:
+        """Return frames received and lost."""
+        return {"frames": self._count, "ring_overflow": 0, "kernel_drops": 0, "lost": 0}
+
+    def close(self) -> None:
+        """Listen no more."""
+        if self._bus.listener is self:
+            self._bus.listener = None
+
+
+class GuardSocket(CanSocket):
+    """The guard's end: ``inbox`` is what it has not read yet, ``wanted`` are the COB-IDs of its filter."""
+
+    def __init__(self, bus: MemoryBus, allowed: Iterable[int], wanted: Iterable[int]) -> None:
+        super().__init__(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM), allowed)
+        self.inbox: list[Frame] = []
+        self.wanted = frozenset(wanted)
+        self._bus = bus
+
+    @property
+    def is_readable(self) -> bool:
+        """Whether a frame waits, or the end of the bus."""
+        return bool(self.inbox) or self._bus.is_down
+
+    def receive(self) -> list[Frame]:
+        if self._bus.is_down:
+            self.inbox.clear()
+            raise BusDown("Network is down")
+        frames, self.inbox = self.inbox[:MOST_FRAMES], self.inbox[MOST_FRAMES:]
+        return frames
+
+    def restored(self) -> bool:
+        self.inbox.clear()
+        return not self._bus.is_down
+
+    def _send(self, cob_id: int, data: bytes) -> bool:
+        if self._bus.is_down:
+            raise OSError(100, "Network is down")
+        return self._bus.from_guard(cob_id, data)
+
+
+class GuardPoll:
+    """Stands in for ``select.poll`` in the guard: never waits, but tells ``rest`` for how long it would have.
+
+    Where the bus alone is waited for, by a guard whose loop has failed, ``wait`` lets time pass until a frame comes.
+    """
+
+    def __init__(self, can: GuardSocket, rest: Callable[[float], None], wait: Callable[[float], None]) -> None:
+        self._can, self._rest, self._wait = can, rest, wait
+        self._clients = select.poll()
+        self._can_asked = self._clients_asked = False
+
+    def register(self, what: object, events: int) -> None:
+        """Look at the bus, or at what has a descriptor."""
+        if what is self._can:
+            self._can_asked = True
+        else:
+            self._clients_asked = True
+            self._clients.register(what, events)  # type: ignore[arg-type] # has fileno()
+
+    def poll(self, wait_ms: float) -> list[tuple[int, int]]:
+        """Return who is ready now."""
+        if wait_ms > 0 and not self._clients_asked and not self._can.is_readable:
+            self._wait(wait_ms * 1e-3)
+        ready = self._clients.poll(0) if self._clients_asked else []
+        if self._can_asked and self._can.is_readable:
+            ready.append((self._can.fileno(), select.POLLIN))
+        self._rest(0.0 if ready else wait_ms * 1e-3)
+        return ready
