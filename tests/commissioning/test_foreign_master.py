@@ -7,6 +7,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ from tests.commissioning.foreign_nc import (
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
 from tests.integration.conftest import sign_off
+from tests.tiers import sampled
 
 pytestmark = pytest.mark.usefixtures("quick_commissioning")
 
@@ -142,8 +144,7 @@ def led_through(config: MachineConfig, step: Callable[[Master], None]) -> None:
         step(master)
 
 
-@pytest.mark.parametrize("what", FOREIGN)
-@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize(("step", "what"), sampled(product(STEPS, FOREIGN), every=5))
 def test_another_master_ends_a_step_within_a_few_sync(step: str, what: str, rig: Rig) -> None:
     done, when, braking = STEPS[step]
     with rig.nc(what, when) as nc:
