@@ -115,7 +115,7 @@ def rapid(master: Master) -> None:
 
 def held_while_asked(master: Master) -> None:
     """The operator looks at the axis, and thinks about it."""
-    time.sleep(0.3)
+    master.loop._landed.wait(60)
     steps.ramp(master, 33, 1)
 
 

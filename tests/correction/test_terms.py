@@ -73,7 +73,7 @@ EFFECTS: Mapping[str, tuple[dict[str, Any], float]] = {
 }
 
 
-@pytest.mark.parametrize("effect", sampled(reversed(EFFECTS), every=4))
+@pytest.mark.parametrize("effect", sampled([*EFFECTS][::-1], every=4))
 def test_what_the_model_knows_is_predicted_and_corrected(effect: str) -> None:
     """Predicted to a tenth of a micrometre, as much smaller as the least gain says, and nowhere worse."""
     changes, least = EFFECTS[effect]

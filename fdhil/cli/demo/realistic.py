@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 from fdhil.child import end_with, stopping_in_order
-from fdhil.cli.demo.loop import Say, Stage, cut, play_shuttle, published_of, running, true_plants
+from fdhil.cli.demo.loop import Say, Stage, cut, make_folder, play_shuttle, published_of, running, true_plants
 from fdhil.cli.demo.machines import REAL, machine_document
 from fdhil.cli.demo.report import Cut, Published
 from fdhil.config import MachineConfig
@@ -55,6 +55,7 @@ def running_realistic(out: Path, realtime: bool, say: Say) -> Iterator[Callable[
 
     FdhilError when a step fails. The process, and its machine, end with the block.
     """
+    make_folder(out)
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
     arguments = (sender, os.getpid(), out, realtime, lambda text: say(f"realistic machine: {text}"))
