@@ -52,7 +52,7 @@ class AuditTrail:
         self.slept_s = 0.0
 
     def _record(self, event: str, arguments: tuple[object, ...]) -> None:
-        if event in STARTS_PROCESS and arguments[0] not in LISTS_FONTS:
+        if event in STARTS_PROCESS and not LISTS_FONTS.intersection(arguments[:1]):
             self.processes.append(f"{event}{arguments[:2]}"[:120])
         elif event == "time.sleep":
             self.slept_s += float(arguments[0])  # type: ignore[arg-type] # a number, by Python's table of audit events

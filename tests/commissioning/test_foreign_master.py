@@ -244,8 +244,9 @@ def test_a_drive_that_an_nc_stops_for_good_may_hold_an_offset_and_that_is_report
         assert nc.count(SYNC) <= A_FEW
 
 
-def test_no_frame_leaves_before_the_bus_was_listened_to(rig: Rig) -> None:
-    """Where a connection is opened beside an NC nothing has been heard yet."""
+def test_no_frame_leaves_before_the_bus_was_listened_to(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a connection is opened next to an NC nothing has been received yet."""
+    monkeypatch.setattr("fdhil.commissioning.transmit.LOOK_S", 0.5)  # time for the NC's thread on a busy host
     with rig.nc("SYNC", lambda _frame: True) as nc:
         nc.on = True
         with Master(rig.config, "X") as master, pytest.raises(ForeignMaster):
