@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
-KERNELS := $(shell grep -rlE --include='*.py' 'njit|^@(compiled|inlined)' fdhil)
+KERNELS := $(shell grep -rlE --include='*.py' 'njit|^@(compiled|inlined)' fdhil studies)
 # the tests marked socketcan stand in these folders; the machine in which they run has little memory for others
 VCAN   := bash tests/integration/vcan-vm.sh -t 1800 -M 2048
 
@@ -40,8 +40,9 @@ $(VENV)/.ok: pyproject.toml requirements.lock
 
 $(VENV)/.kernels: $(VENV)/.ok $(KERNELS)
 	@echo "compiling the kernels (once, about a minute)"
-	@find fdhil -name '*.nb[ic]' -delete # a kernel that was compiled into another one is not looked at again
+	@find fdhil studies -name '*.nb[ic]' -delete # a kernel that was compiled into another one is not looked at again
 	@$(BIN)/python -m fdhil.cli.kernels
+	@$(BIN)/python -m studies.kernels
 	@touch $@
 
 setup: $(VENV)/.kernels ## make .venv with everything in it, kernels compiled

@@ -114,7 +114,6 @@ def test_what_the_way_to_the_start_leaves_is_expected(tmp_path: Path) -> None:
     assert first.renew(resting(amperes)) is None  # as it was expected
 
 
-@pytest.mark.usefixtures("long_computation")
 def test_a_load_shifts_what_the_axes_hold(tmp_path: Path) -> None:
     """On a plant that shares nothing with the model: each axis stands at an edge of a band that its load has moved."""
     plant = replace(Mechanics(), load_nm=4.0, static=0.2)
