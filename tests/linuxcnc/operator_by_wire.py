@@ -105,16 +105,14 @@ class Operator:
             raise Failed(self._words())
 
     def run(self, program: str) -> None:
-        """Start a program from its first line; return when it runs, has moved the machine or was refused."""
+        """Start a program from its first line; return when it runs, or is over already."""
         self.order(self.command.program_open, program)
-        self.status.poll()
-        begin = tuple(self.status.position)
         self.command.auto(linuxcnc.AUTO_RUN, 0)  # whose completion is the program's
-        self.wait(
-            lambda status: (
-                status.interp_state != linuxcnc.INTERP_IDLE or tuple(status.position) != begin or self._has_failed()
-            )
-        )
+        self.wait(lambda status: status.interp_state != linuxcnc.INTERP_IDLE or self._is_complete(status))
+
+    def _is_complete(self, status: Any) -> bool:
+        """Return whether LinuxCNC has done the last order, or failed to."""
+        return bool(status.echo_serial_number == self.command.serial and status.state != linuxcnc.RCS_EXEC)
 
     def rest(self) -> None:
         """Wait until the program is over and the machine stands."""
