@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
-KERNELS := $(shell grep -rlE --include='*.py' 'njit|^@(compiled|inlined)' fdhil)
+KERNELS := $(shell grep -rlE --include='*.py' 'njit|^@(compiled|inlined)' fdhil studies)
 # the tests marked socketcan stand in these folders; the machine in which they run has little memory for others
 VCAN   := bash tests/integration/vcan-vm.sh -t 1800 -M 2048
 
@@ -16,7 +16,10 @@ SECONDS ?= 100000
 # a child process need not translate fdhil anew
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup docs demo test test-system test-full test-vcan near nightly swarm faults fuzz guard mutants audit loaded lint bench study lock clean
+# folders that make test and make test-processes leave out, as .ci/run does for the guard's, which make guard tests
+EXCEPT  ?=
+
+.PHONY: help setup foreign docs demo test test-system test-linuxcnc test-processes test-full test-vcan near nightly swarm faults fuzz guard mutants audit loaded lint bench study lock clean
 
 help:            ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -37,29 +40,36 @@ $(VENV)/.ok: pyproject.toml requirements.lock
 
 $(VENV)/.kernels: $(VENV)/.ok $(KERNELS)
 	@echo "compiling the kernels (once, about a minute)"
-	@find fdhil -name '*.nb[ic]' -delete # a kernel that was compiled into another one is not looked at again
+	@find fdhil studies -name '*.nb[ic]' -delete # a kernel that was compiled into another one is not looked at again
 	@$(BIN)/python -m fdhil.cli.kernels
+	@$(BIN)/python -m studies.kernels
 	@touch $@
 
 setup: $(VENV)/.kernels ## make .venv with everything in it, kernels compiled
+
+foreign: setup   ## the CANopen stack of node.js that some tests talk to
+	@command -v npm >/dev/null || { echo "make test-system needs npm: apt-get install nodejs npm" >&2; exit 1; }
+	@npm ci --prefix tests/foreign --ignore-scripts --no-audit --no-fund --silent
 
 demo: setup      ## the whole loop on the simulated machine; the report is out/report.html
 	@$(BIN)/fdhil demo --out out
 
 test: setup      ## the fast tests: no processes, no Debian packages
-	@$(BIN)/python -m pytest -q -m "not system" -n 2 --dist loadfile
+	@$(BIN)/python -m pytest -q -m "not system" $(EXCEPT:%=--ignore %) -n 2 --dist loadfile
 
-test-system: setup ## the tests with processes, terminals, browsers, brokers and other people's programs; needs Debian packages
+test-system: test-linuxcnc test-processes ## the tests with processes, terminals, browsers, brokers and other people's programs; needs Debian packages
+
+test-linuxcnc: setup ## those against LinuxCNC, which wait for it most of the time
 	@command -v rs274 >/dev/null || { echo "make test-system needs rs274: apt-get install linuxcnc-uspace" >&2; exit 1; }
-	@command -v npm >/dev/null || { echo "make test-system needs npm: apt-get install nodejs npm" >&2; exit 1; }
+	@$(BIN)/python -m pytest -q -m "system and not socketcan" $(LINUXCNC)
+
+test-processes: foreign ## the other ones
 	@command -v chromium >/dev/null || { echo "make test-system needs chromium: apt-get install chromium" >&2; exit 1; }
 	@PATH="$$PATH:/usr/sbin"; command -v mosquitto >/dev/null || { echo "make test-system needs mosquitto: apt-get install mosquitto" >&2; exit 1; }
 	@command -v promtool >/dev/null || { echo "make test-system needs promtool: apt-get install prometheus" >&2; exit 1; }
 	@command -v strace >/dev/null && command -v faketime >/dev/null || { echo "make test-system needs strace and faketime: apt-get install strace faketime" >&2; exit 1; }
 	@PATH="$$PATH:/usr/sbin"; command -v nats-server >/dev/null && ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 || { echo "make test-system needs nats-server and PostgreSQL: apt-get install nats-server postgresql" >&2; exit 1; }
-	@npm ci --prefix tests/foreign --ignore-scripts --no-audit --no-fund --silent
-	@$(BIN)/python -m pytest -q -m "system and not socketcan" $(LINUXCNC)
-	@$(BIN)/python -m pytest -q -m "system and not socketcan" $(LINUXCNC:%=--ignore %) -n 2 --dist loadfile
+	@$(BIN)/python -m pytest -q -m "system and not socketcan" $(LINUXCNC:%=--ignore %) $(EXCEPT:%=--ignore %) -n 2 --dist loadfile
 
 test-full: test test-system ## both tiers
 
@@ -102,8 +112,8 @@ mutants: setup   ## what the guard's tests notice of mistakes put into it, one a
 audit: setup     ## the bill of materials in out/sbom.json, and what is known against the packages of requirements.lock
 	@$(BIN)/python .ci/audit out/sbom.json
 
-loaded: setup    ## make demo and make test, five times each beside four busy loops
-	@.ci/loaded "$(MAKE) -s demo" "$(MAKE) -s test"
+loaded: setup    ## both tiers and the demonstration again and again, idle and next to four busy loops
+	@.ci/loaded --run 15 5 "$(MAKE) -s test" --run 5 5 "$(MAKE) -s test-system" --run 0 5 "$(MAKE) -s demo"
 
 lint: setup      ## ruff, mypy, import-linter, deptry, codespell, and the house rules
 	@$(BIN)/ruff check .

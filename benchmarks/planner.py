@@ -20,14 +20,13 @@ from fdhil.program.motions import Corner
 from fdhil.program.planner import stream
 from fdhil.records import Float
 from tests.bench import bench_config, bench_document
-from tests.program.linuxcnc_machine import demand
+from tests.linuxcnc.machine import DemandRecorder
 from tests.program.test_linuxcnc_demand import ACCELERATION_MM_S2, EXACT_SHARE, apart_mm, ours, program
 
 BENCH = "G21 G90 G17 {mode}\nF{feed:g}\nG1 Y55\nX100\nG3 X200 I50\nG1 X250\nY0\nM2\n"
 BESIDE = ("contour", "zigzag", "helix", "wave")
 MODES = ("G61", "G64 P0.05", "G64")
 PROFILES = {"fir": 100_000, "trapezoidal": 100_000, "jerk_limited": 100_000, "linuxcnc": 10_000}  # motions of each
-HAVE_LINUXCNC = shutil.which("linuxcnc") is not None
 
 
 def machine(profile: str, acceleration_mm_s2: float = ACCELERATION_MM_S2) -> configuration.MachineConfig:
@@ -61,13 +60,13 @@ def speeds() -> None:
         print(f"{profile}: {moves / took:.0f} motions/s, {rows * 0.001 / took:.0f} x real time on one core")
 
 
-def beside_linuxcnc() -> None:
+def beside_linuxcnc(nc: DemandRecorder) -> None:
     """Difference of time, and the largest distance at the same millisecond, of two profiles beside LinuxCNC."""
     print("path, mode, feed: rows of LinuxCNC; difference of time, largest distance at the same millisecond")
     for path in BESIDE:
         for mode, feed in product(("G61", "G64 P0.05", "G64 P0.2 Q0.02"), (6000.0, 20000.0)):
             text = program(path, mode, feed)
-            b = demand(text, acceleration_mm_s2=ACCELERATION_MM_S2)
+            b = nc.record(text)
             told = []
             for profile in ("linuxcnc", "trapezoidal"):
                 share = EXACT_SHARE if mode == "G61" and profile == "trapezoidal" else 1.0
@@ -76,7 +75,7 @@ def beside_linuxcnc() -> None:
             print(f"{path}, {mode}, {feed / 1000:g} m/min: {len(b)}; {'; '.join(told)}")
 
 
-def jerky() -> Iterator[tuple[str, Float]]:
+def jerky(nc: DemandRecorder | None) -> Iterator[tuple[str, Float]]:
     """Demands of the bench path with steps of acceleration of 2 m/s2, by name."""
     for feed in (10_000.0, 20_000.0):
         for mode in MODES:
@@ -84,16 +83,16 @@ def jerky() -> Iterator[tuple[str, Float]]:
             reference = plan(interpret(text.splitlines()), machine("trapezoidal"))
             name = f"{mode}, {feed / 1000:g} m/min"
             yield f"trapezoidal, {name}", np.column_stack(list(reference.position_mm.values()))
-            if HAVE_LINUXCNC:
-                rows = demand(text, acceleration_mm_s2=ACCELERATION_MM_S2)[:, :2]
+            if nc is not None:
+                rows = nc.record(text)[:, :2]
                 yield f"LinuxCNC, {name}", np.concatenate([rows, np.repeat(rows[-1:], 500, axis=0)])
 
 
-def corrections() -> None:
+def corrections(nc: DemandRecorder | None) -> None:
     """Gains of the inverse correction on jerky demands as the drives get them, rounded to increments."""
     print("least gain over uncorrected (wanted: 14) and over mirror (2) on 40 scattered plants; RMS on the nominal one")
     per_mm = next(iter(bench_config().axis.values())).scaling.increments_per_mm
-    for name, rows in jerky():
+    for name, rows in jerky(nc):
         rounded = np.round(rows * per_mm) / per_mm
         found, (before, after) = gains(rounded)
         least = found.min(axis=0)
@@ -106,11 +105,13 @@ def corrections() -> None:
 def main() -> None:
     """Print the figures."""
     speeds()
-    if HAVE_LINUXCNC:
-        beside_linuxcnc()
-    else:
+    if shutil.which("linuxcnc") is None:
         print("LinuxCNC is not installed: apt-get install linuxcnc-uspace")
-    corrections()
+        corrections(None)
+        return
+    with DemandRecorder(acceleration_mm_s2=ACCELERATION_MM_S2) as nc:
+        beside_linuxcnc(nc)
+        corrections(nc)
 
 
 if __name__ == "__main__":

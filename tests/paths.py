@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -37,6 +38,11 @@ def bench_demand(
     feed_m_min: float, smoothing_s: tuple[float, ...] = (0.060, 0.030), hold_s: float = 0.5, dt_s: float = 0.001
 ) -> Float:
     """Return the demand (n, 2) in mm: the bench path at constant feed, smoothed per axis, held at its end."""
+    return _bench_demand(feed_m_min, smoothing_s, hold_s, dt_s).copy()
+
+
+@cache
+def _bench_demand(feed_m_min: float, smoothing_s: tuple[float, ...], hold_s: float, dt_s: float) -> Float:
     return _demand(_geometry(), feed_m_min, smoothing_s, hold_s, dt_s)
 
 
@@ -61,6 +67,7 @@ def trajectory(demand: Float, axes: str = "XY", dt_s: float = 0.001) -> Trajecto
     )
 
 
+@cache
 def bench_trajectory(feed_m_min: float, smoothing_s: tuple[float, ...] = (0.060, 0.030)) -> Trajectory:
     """The bench path as a reference of X and Y."""
     return trajectory(bench_demand(feed_m_min, smoothing_s))

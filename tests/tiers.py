@@ -11,19 +11,31 @@ from __future__ import annotations
 import re
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
+from _pytest.mark import ParameterSet
 
 SYSTEM_FIXTURES = frozenset({"processes", "long_computation", "real_time"})
 SYSTEM_MARKS = ("debian", "socketcan")
 MOST_SLEEP_S = 0.1
 MOST_PROCESSOR_S = 5.0  # a guard against what grew by a factor: the slowest test needs a third of it
 STARTS_PROCESS = frozenset({"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.exec"})
+LISTS_FONTS = frozenset({"fc-list"})  # matplotlib's, once on a computer
 WHOLE_MODULE = re.compile(
     r"^pytestmark = .*(\"(processes|long_computation|real_time)\"|mark\.(debian|socketcan))", re.MULTILINE
 )
+
+
+def sampled(cases: Iterable[object], every: int) -> list[ParameterSet]:
+    """Return the cases of a parametrised test; the fast tier takes each ``every``-th, the system tier the others.
+
+    A case that is a tuple has a value for each argument.
+    """
+    values = [case if isinstance(case, tuple) else (case,) for case in cases]
+    marks = [[pytest.mark.system] if number % every else [] for number in range(len(values))]
+    return [pytest.param(*each, marks=tier) for each, tier in zip(values, marks, strict=True)]
 
 
 class AuditTrail:
@@ -40,7 +52,7 @@ class AuditTrail:
         self.slept_s = 0.0
 
     def _record(self, event: str, arguments: tuple[object, ...]) -> None:
-        if event in STARTS_PROCESS:
+        if event in STARTS_PROCESS and not LISTS_FONTS.intersection(arguments[:1]):
             self.processes.append(f"{event}{arguments[:2]}"[:120])
         elif event == "time.sleep":
             self.slept_s += float(arguments[0])  # type: ignore[arg-type] # a number, by Python's table of audit events

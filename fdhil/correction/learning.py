@@ -13,7 +13,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
 
 from fdhil.config import MachineConfig
 from fdhil.correction import linear
@@ -80,6 +79,8 @@ def learn(
 
 def _low_passed(values: Float, period_s: float) -> Float:
     """Return the values (n,) without what lies above the corner, without delay, and at rest at both ends."""
+    from scipy.signal import butter, sosfiltfilt  # costs a third of a second, which the daemon's start can spare
+
     sections = butter(2, min(CORNER_HZ, 0.2 / period_s), fs=1 / period_s, output="sos")
     pad = round(PADDING_S / period_s)
     smooth: Float = sosfiltfilt(sections, np.pad(values, pad), padtype=None)[pad:-pad]

@@ -23,22 +23,18 @@ from tests.bench import bench_toml
 from tests.commissioning.foreign_nc import A_FEW, FOREIGN, NMT, OFFSET, SDO, SYNC, ForeignNc, LateOperator, is_offset
 from tests.drivers.peer import DrivePeer
 from tests.eds import write_eds
+from tests.short_waits import shorten_waits
+from tests.tiers import sampled
 
-WAITS: tuple[tuple[str, str, float], ...] = (
-    ("commissioning.survey", "LISTEN_S", 0.15),
-    ("commissioning.transmit", "LOOK_S", 0.05),
-    ("cli.consent", "LOOK_S", 0.05),
-    ("commissioning.steps", "SETTLE_CYCLES", 120),
-    ("commissioning.steps", "AVERAGE_CYCLES", 60),
-    ("commissioning.watchdog", "STARVE_TIMEOUT_S", 1.0),
-    ("drivers.can.sdo", "RESPONSE_TIMEOUT_S", 0.2),
-    ("drivers.can.sdo", "QUIET_S", 0.1),
-    ("commissioning.strokes", "JOG_MM", 1.0),
-    ("commissioning.trial", "TIMING_CYCLES", 100),
-    ("commissioning.trial", "RAPIDS", 4),
-    ("commissioning.trial", "REST_S", 0.6),
-    ("commissioning.trial", "LAST_REST_S", 0.4),
-)
+WAITS = {
+    "commissioning.watchdog.STARVE_TIMEOUT_S": 1.0,
+    "drivers.can.sdo.RESPONSE_TIMEOUT_S": 0.2,
+    "commissioning.strokes.JOG_MM": 1.0,
+    "commissioning.trial.TIMING_CYCLES": 100,
+    "commissioning.trial.RAPIDS": 4,
+    "commissioning.trial.REST_S": 0.6,
+    "commissioning.trial.LAST_REST_S": 0.4,
+}
 TRUE = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075}
 
 
@@ -71,8 +67,7 @@ class Bench:
 
 @pytest.fixture
 def bench(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    for module, name, value in WAITS:
-        monkeypatch.setattr(f"fdhil.{module}.{name}", value)
+    shorten_waits(monkeypatch, WAITS)
     monkeypatch.setattr(sys, "argv", ["fdhil"])
     monkeypatch.setattr(sys, "stdin", io.StringIO())
     file = tmp_path / "machine.toml"
@@ -299,7 +294,7 @@ def test_a_wrong_set_up_is_refused(what: str, bench: Bench) -> None:
     assert load_record(bench.store, "X") is None
 
 
-@pytest.mark.parametrize("what", FOREIGN)
+@pytest.mark.parametrize("what", sampled(FOREIGN, every=3))
 def test_an_nc_that_is_switched_on_in_the_sign_test_leaves_no_record(what: str, bench: Bench) -> None:
     config = machine_config.load(bench.file)
     with ForeignNc(config.bus["can0"].channel, FOREIGN[what], is_offset) as nc:

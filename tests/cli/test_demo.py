@@ -7,17 +7,20 @@ import select
 import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fdhil import config as machine_config
-from fdhil.cli.demo import _realistic, realistic_page
+from fdhil.cli.demo import _realistic, realistic, realistic_page
 from fdhil.cli.demo.machines import REAL, machine_document
-from fdhil.cli.demo.realistic import AxisVerdict, Realistic
+from fdhil.cli.demo.realistic import AxisVerdict, Realistic, running_realistic
 from fdhil.cli.demo.report import Cut, Published
 from fdhil.config import Reality
+from fdhil.errors import ConnectError, DeviceTimeout, FdhilError
 from fdhil.records import PARAMETERS, Parameters
 from fdhil.report import Page, write
 
@@ -82,6 +85,62 @@ def test_what_was_believed_stands_beside_the_truth() -> None:
     told = _realistic(believed)
     assert told["axes"]["X"]["terms"] == {"load": 2.5}
     assert [cut["label"] for cut in told["cuts"]] == ["uncorrected", "inverse"]
+
+
+def silent(text: str) -> None:
+    """Print nothing."""
+
+
+@pytest.mark.usefixtures("processes")
+def test_result_of_the_realistic_machine_is_that_of_its_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = Realistic(machine(), {"X": TRUE}, {}, None, passes("uncorrected"), "refused")
+    monkeypatch.setattr(realistic, "run_realistic", lambda *_: found)
+    with running_realistic(tmp_path, False, silent) as result:
+        told = result()
+    assert (told.config, told.truth, told.refused) == (found.config, found.truth, found.refused)
+    np.testing.assert_array_equal(told.cuts[0].contour_um, found.cuts[0].contour_um)
+
+
+def time_out(*_: object) -> Realistic:
+    raise DeviceTimeout("simulated machine", "no event")
+
+
+def end_early(*_: object) -> Realistic:
+    os._exit(1)
+
+
+@pytest.mark.usefixtures("processes")
+@pytest.mark.parametrize(
+    ("run", "kind", "text"),
+    [(time_out, DeviceTimeout, "simulated machine: no event"), (end_early, ConnectError, "its process ended early")],
+)
+def test_failure_of_the_realistic_machine_is_that_of_the_demonstration(
+    run: Callable[..., Realistic], kind: type[FdhilError], text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(realistic, "run_realistic", run)
+    with running_realistic(tmp_path, False, silent) as result, pytest.raises(kind, match=text):
+        result()
+
+
+@pytest.mark.usefixtures("processes")
+def test_realistic_machine_stops_in_order_when_the_demonstration_ends_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(out: Path, *_: object) -> Realistic:
+        try:
+            (out / "runs").touch()
+            signal.pause()
+        finally:
+            (out / "stopped").touch()
+        raise AssertionError
+
+    monkeypatch.setattr(realistic, "run_realistic", run)
+    with running_realistic(tmp_path, False, silent):
+        while not (tmp_path / "runs").exists():
+            time.sleep(0.01)
+    assert (tmp_path / "stopped").exists()
 
 
 RUNNING = """

@@ -26,14 +26,13 @@ from fdhil.store.rows import Stamp
 from tests.bench import bench_document
 from tests.drivers.peer import DrivePeer
 from tests.heeding_modes import HEEDING_MODES
+from tests.short_waits import shorten_waits
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorter waits than on a real machine, and a PC that nobody else uses."""
-    monkeypatch.setattr("fdhil.commissioning.config_check.LISTEN_S", 0.2)
-    monkeypatch.setattr("fdhil.drivers.can.sdo.QUIET_S", 0.05)
-    monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.2)
+    shorten_waits(monkeypatch, {"drivers.can.sdo.RESPONSE_TIMEOUT_S": 0.2})
     monkeypatch.setattr("os.getloadavg", lambda: (0.1, 0.1, 0.1))
     monkeypatch.setattr("fdhil.cli.doctor.computer.GOVERNOR", Path("/none"))
 

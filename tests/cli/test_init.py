@@ -23,6 +23,7 @@ from tests.commissioning.test_linuxcnc_files import HAL_TEXT, INI
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
 from tests.eds import write_eds
+from tests.short_waits import shorten_waits
 
 Said = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).parents[2]
@@ -38,10 +39,7 @@ RAPID = {"screw_pitch_mm": 20.0, "rapid_speed_mm_s": 500.0, "max_acceleration_mm
 def fdhil(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Said:
     """Run a command in this process, ``said`` on its standard input: exit code, stdout and stderr."""
     monkeypatch.setattr("fdhil.cli.init.INTERFACES", Path("no interfaces"))
-    monkeypatch.setattr("fdhil.commissioning.scan.LISTEN_S", 0.2)
-    monkeypatch.setattr("fdhil.commissioning.scan.ANSWER_S", 1.0)
-    monkeypatch.setattr("fdhil.drivers.can.sdo.QUIET_S", 0.1)
-    monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.2)
+    shorten_waits(monkeypatch, {"commissioning.scan.ANSWER_S": 1.0, "drivers.can.sdo.RESPONSE_TIMEOUT_S": 0.2})
 
     def run(*arguments: object, said: str = "") -> tuple[int, str, str]:
         monkeypatch.setattr("sys.argv", ["fdhil", *map(str, arguments)])

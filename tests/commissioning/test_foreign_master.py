@@ -7,6 +7,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ from tests.commissioning.foreign_nc import (
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
 from tests.integration.conftest import sign_off
+from tests.tiers import sampled
 
 pytestmark = pytest.mark.usefixtures("quick_commissioning")
 
@@ -65,7 +67,7 @@ class Rig:
         assert nc.count(SDO) <= 1  # it was under way
         assert nc.count(HEARTBEAT) <= 2
         if what in LEFT_TO_IT:
-            assert nc.count(LEFT_TO_IT[what]) <= 5  # what left before it was heard
+            assert nc.count(LEFT_TO_IT[what]) <= A_FEW  # what left before it was heard
         if what != "offset":
             assert [offset_of(frame) for frame in nc.sent if frame[0] == OFFSET][-1:] in ([], [0])
             assert self.holds(lambda: self.peer.drive.dictionary.number(0x60B0) == 0)
@@ -113,7 +115,7 @@ def rapid(master: Master) -> None:
 
 def held_while_asked(master: Master) -> None:
     """The operator looks at the axis, and thinks about it."""
-    time.sleep(0.3)
+    master.loop._landed.wait(60)
     steps.ramp(master, 33, 1)
 
 
@@ -142,8 +144,7 @@ def led_through(config: MachineConfig, step: Callable[[Master], None]) -> None:
         step(master)
 
 
-@pytest.mark.parametrize("what", FOREIGN)
-@pytest.mark.parametrize("step", STEPS)
+@pytest.mark.parametrize(("step", "what"), sampled(product(STEPS, FOREIGN), every=5))
 def test_another_master_ends_a_step_within_a_few_sync(step: str, what: str, rig: Rig) -> None:
     done, when, braking = STEPS[step]
     with rig.nc(what, when) as nc:
@@ -182,7 +183,7 @@ def test_a_drive_is_asked_no_more_once_another_master_is_heard(
         with pytest.raises(ForeignMaster, match="nothing more was sent"):
             ask(rig.config)
         assert {can_id for can_id, _ in nc.sent} <= {SDO}
-        assert nc.count(SDO) <= 5  # those that were under way while it was switched on
+        assert nc.count(SDO) <= A_FEW  # of more than a hundred: those that left before its frame was received
 
 
 def test_a_record_holds_where_an_nc_comes_while_a_guard_starts(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -191,7 +192,7 @@ def test_a_record_holds_where_an_nc_comes_while_a_guard_starts(rig: Rig, monkeyp
     said: list[str] = []
     with rig.nc("SYNC", lambda frame: frame[0] == SDO) as nc:
         compare_again(rig.config, "can0", said.append)
-        assert nc.count(SDO) <= 5
+        assert nc.count(SDO) <= A_FEW
     assert said == []
 
 
@@ -243,8 +244,9 @@ def test_a_drive_that_an_nc_stops_for_good_may_hold_an_offset_and_that_is_report
         assert nc.count(SYNC) <= A_FEW
 
 
-def test_no_frame_leaves_before_the_bus_was_listened_to(rig: Rig) -> None:
-    """Where a connection is opened beside an NC nothing has been heard yet."""
+def test_no_frame_leaves_before_the_bus_was_listened_to(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a connection is opened next to an NC nothing has been received yet."""
+    monkeypatch.setattr("fdhil.commissioning.transmit.LOOK_S", 0.5)  # time for the NC's thread on a busy host
     with rig.nc("SYNC", lambda _frame: True) as nc:
         nc.on = True
         with Master(rig.config, "X") as master, pytest.raises(ForeignMaster):

@@ -19,6 +19,7 @@ from fdhil.errors import DriveFault
 from tests.dressed.wardrobe import OUTFITS, Outfit, dressed
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
+from tests.tiers import sampled
 
 pytestmark = pytest.mark.usefixtures("quick_commissioning")
 
@@ -72,7 +73,7 @@ def test_type_of_a_fixed_mapping_is_set(peer: tuple[DrivePeer, MachineConfig]) -
     assert drive.drive.dictionary.number(0x1800, 2) == 255
 
 
-@pytest.mark.parametrize("outfit", OUTFITS, ids=lambda outfit: outfit.name)
+@pytest.mark.parametrize("outfit", sampled(OUTFITS, every=3), ids=lambda outfit: outfit.name)
 def test_a_drive_of_every_make_is_set_up_as_it_comes(outfit: Outfit, tmp_path: Path) -> None:
     settings = dressed(outfit, tmp_path, bus={"can0": {"interface": "virtual", "channel": uuid.uuid4().hex}})
     with DrivePeer(settings), Master(settings, "X") as master:

@@ -246,6 +246,7 @@ def test_another_master_ends_what_is_played(what: str, floor: Floor) -> None:
     assert "0x1016 may be as fdhil wrote" in document["stopped"]
 
 
+@pytest.mark.usefixtures("real_time")
 def test_axes_that_are_held_at_the_start_are_switched_off_where_an_nc_comes(
     floor: Floor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -266,6 +267,7 @@ def test_axes_that_are_held_at_the_start_are_switched_off_where_an_nc_comes(
     assert all(peer.drive.power.state.name == "SWITCH_ON_DISABLED" for peer in floor.peers.values())
 
 
+@pytest.mark.usefixtures("real_time")
 def test_play_ends_where_an_nc_came_before_the_path_began(floor: Floor, monkeypatch: pytest.MonkeyPatch) -> None:
     """Between the way to the start and the demand: the drives are off before the path is made."""
     nc = ForeignNc(floor.config.bus["can0"].channel, FOREIGN["SYNC"], lambda _: False)

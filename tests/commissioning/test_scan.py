@@ -29,6 +29,7 @@ from fdhil.sim.drive.dictionary import AbortCode, TransferAbort
 from tests.dressed.test_set_up import until_it_answers
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import Row, Wire, machine
+from tests.short_waits import shorten_waits
 
 WHO = Identity(1, 2, 3, 4)
 
@@ -36,10 +37,7 @@ WHO = Identity(1, 2, 3, 4)
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorter waits than on a real machine."""
-    monkeypatch.setattr("fdhil.commissioning.scan.LISTEN_S", 0.25)
-    monkeypatch.setattr("fdhil.commissioning.config_check.LISTEN_S", 0.25)
-    monkeypatch.setattr("fdhil.drivers.can.sdo.QUIET_S", 0.1)
-    monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 5.0)  # it answers at once, on a host that has time
+    shorten_waits(monkeypatch)
 
 
 @pytest.fixture

@@ -33,6 +33,7 @@ from fdhil.config import CorrectionLimits, MachineConfig
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, DriveFault, ProtocolError
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
+from tests.tiers import sampled
 
 pytestmark = pytest.mark.usefixtures("quick_commissioning")
 
@@ -222,7 +223,7 @@ WRONG: dict[str, tuple[Callable[[DrivePeer], None], str]] = {
 }
 
 
-@pytest.mark.parametrize("what", WRONG)
+@pytest.mark.parametrize("what", sampled(WRONG, every=3))
 @pytest.mark.fault("A17", "E16")
 def test_a_wrong_set_up_is_refused_before_anything_moves(what: str, peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer

@@ -18,6 +18,7 @@ from studies import real_plant
 from studies.real_plant import Loops, Mechanics
 from tests.bench import bench_config
 from tests.paths import bench_trajectory, rms
+from tests.tiers import sampled
 
 CONFIG = bench_config()
 PATH = bench_trajectory(10)
@@ -72,7 +73,7 @@ EFFECTS: Mapping[str, tuple[dict[str, Any], float]] = {
 }
 
 
-@pytest.mark.parametrize("effect", EFFECTS)
+@pytest.mark.parametrize("effect", sampled([*EFFECTS][::-1], every=4))
 def test_what_the_model_knows_is_predicted_and_corrected(effect: str) -> None:
     """Predicted to a tenth of a micrometre, as much smaller as the least gain says, and nowhere worse."""
     changes, least = EFFECTS[effect]

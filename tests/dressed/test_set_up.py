@@ -19,6 +19,7 @@ from fdhil.errors import ConfigError, DriveFault
 from tests.dressed.wardrobe import OUTFITS, Outfit, dressed, set_up
 from tests.drivers.peer import DrivePeer
 from tests.eds import write_eds
+from tests.short_waits import shorten_waits
 
 EVERY = pytest.mark.parametrize("outfit", OUTFITS, ids=lambda outfit: outfit.name)
 
@@ -26,19 +27,15 @@ EVERY = pytest.mark.parametrize("outfit", OUTFITS, ids=lambda outfit: outfit.nam
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorter waits than on a real machine where nothing comes, longer ones for a drive that a thread here plays."""
-    monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 0.15)
-    monkeypatch.setattr("fdhil.commissioning.scan.LISTEN_S", 0.15)
-    monkeypatch.setattr("fdhil.commissioning.scan.ANSWER_S", 0.1)
     monkeypatch.setattr(BusScanner, "answering", until_it_answers)
-    monkeypatch.setattr("fdhil.commissioning.config_check.LISTEN_S", 0.15)
-    monkeypatch.setattr("fdhil.drivers.can.sdo.QUIET_S", 0.1)
-    monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 60.0)
-    monkeypatch.setattr("fdhil.drivers.can.sdo.DEADLINE_S", 60.0)
-    monkeypatch.setattr("fdhil.commissioning.cycle.LOCKSTEP_WAIT_S", 1.0)
-    monkeypatch.setattr("fdhil.commissioning.steps.ENABLE_TIMEOUT_S", 60.0)
-    monkeypatch.setattr("fdhil.commissioning.watchdog.STARVE_TIMEOUT_S", 60.0)
-    monkeypatch.setattr("fdhil.commissioning.steps.SETTLE_CYCLES", 120)
-    monkeypatch.setattr("fdhil.commissioning.steps.AVERAGE_CYCLES", 60)
+    longer = {
+        "drivers.can.sdo.RESPONSE_TIMEOUT_S": 60.0,
+        "drivers.can.sdo.DEADLINE_S": 60.0,
+        "commissioning.cycle.LOCKSTEP_WAIT_S": 1.0,
+        "commissioning.steps.ENABLE_TIMEOUT_S": 60.0,
+        "commissioning.watchdog.STARVE_TIMEOUT_S": 60.0,
+    }
+    shorten_waits(monkeypatch, {"commissioning.scan.ANSWER_S": 0.1, **longer})
 
 
 def until_it_answers(

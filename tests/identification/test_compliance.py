@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cache
+from itertools import product
 
 import numpy as np
 import pytest
@@ -19,9 +20,11 @@ from studies import real_plant
 from studies.bench import shuttle
 from studies.real_plant import Mechanics, Sensors
 from tests.bench import bench_config
+from tests.tiers import sampled
 
 DT_S = 1e-3
 TRUE = Parameters(0.5, 0.005, 0.8, 0.075, 0.05, 5.0)
+KINDS = ("constant", "nan", "huge", "infinite", "motor", "steps")
 DAMPING, SHARE = 0.02, 0.6  # of the plant
 
 
@@ -59,7 +62,7 @@ def within(found: Compliance | None, hertz: float, deviations: float = 3.0) -> N
     assert np.all(np.abs(found.values - np.array([hertz, DAMPING, SHARE])) < deviations * std), (found.values, std)
 
 
-@pytest.mark.parametrize("hertz", [50.0, 80.0, 120.0])
+@pytest.mark.parametrize("hertz", sampled([80.0, 50.0, 120.0], every=3))
 def test_an_encoder_tells_resonance_damping_and_share(hertz: float) -> None:
     found = seen(rapid(hertz), table_m_s2=None)
     within(found, hertz)
@@ -145,8 +148,7 @@ def test_the_table_s_true_error_is_told() -> None:
     assert analyse(replace(window, table_mm=None), Identification()).at_table is None
 
 
-@pytest.mark.parametrize("name", ["table_mm", "table_m_s2"])
-@pytest.mark.parametrize("kind", ["constant", "nan", "huge", "infinite", "motor", "steps"])
+@pytest.mark.parametrize(("kind", "name"), sampled(product(KINDS, ["table_mm", "table_m_s2"]), every=3))
 def test_whatever_a_sensor_tells_the_window_is_analysed(name: str, kind: str) -> None:
     window = rapid(80.0)
     values = {

@@ -12,11 +12,12 @@ from studies import kills
 from studies.fault_rows import RAMPED, Descent, descent
 from studies.live_guard import LiveGuard
 from tests.fault_matrix import ROWS
+from tests.tiers import sampled
 
 LIMITS = OffsetLimits(offset=819, rate=65, acceleration=6, variation=9830, window=1000)
 
 
-@pytest.mark.parametrize("row", RAMPED)
+@pytest.mark.parametrize("row", sampled(RAMPED, every=3))
 def test_a_fault_at_any_time_ends_at_zero_in_time(row: str) -> None:
     assert RAMPED[row].code in ROWS[row].classes or not ROWS[row].classes or row == "F3"
     found = kills.frame_part(row, 3, 7)

@@ -120,6 +120,7 @@ def test_the_model_with_it_knows_what_the_motors_encoder_does_not_see() -> None:
     assert all(o.at_table is None for o in recorded()["Y"])  # it has no encoder
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_each_sensor_s_signal_is_on_the_rows_of_the_drive() -> None:
     for axis, name in (("X", "table_mm"), ("Y", "table_m_s2")):
         for outcome in recorded()[axis]:

@@ -59,7 +59,8 @@ def record(config: Path, out: Path, cut: Callable[[], None]) -> None:
         ending_with_parent(command), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as recording:
         assert recording.stderr is not None
-        assert "waiting for a motion" in recording.stderr.readline()
+        first = recording.stderr.readline()
+        assert "waiting for a motion" in first, first + recording.stderr.read()
         cut()
         told, _ = recording.communicate(timeout=PATIENCE_S)
     assert json.loads(told)["complete"], told

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import queue
 import shutil
 import signal
 import socket
@@ -17,8 +18,10 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, Self
 
+import numpy as np
+
 from fdhil.child import ending_with_parent
-from tests.program.linuxcnc_machine import AXIS, MACHINE, NOBODY
+from fdhil.records import Float
 from tests.sim.twin_process import TwinProcess
 
 HERE = Path(__file__).parent
@@ -27,6 +30,61 @@ LEAVING_S = 30.0
 # what the how-to has: a row of the demand for each servo cycle of 1 ms
 ROWS = r"""stdbuf -oL halsampler -t | mawk -W interactive '
 BEGIN { print "time_s,X_mm,Y_mm" } NF >= 3 { printf "%.3f,%s,%s\n", $1 / 1000, $2, $3 }'"""
+
+NOBODY = 65534
+AXIS = """
+[AXIS_{letter}]
+MAX_VELOCITY = {speed}
+MAX_ACCELERATION = {acceleration}
+MIN_LIMIT = -1000
+MAX_LIMIT = 1000
+[JOINT_{number}]
+TYPE = LINEAR
+HOME = 0
+HOME_SEARCH_VEL = 0
+HOME_LATCH_VEL = 0
+MAX_VELOCITY = {speed}
+MAX_ACCELERATION = {acceleration}
+MIN_LIMIT = -1000
+MAX_LIMIT = 1000
+FERROR = 10
+MIN_FERROR = 10
+"""
+MACHINE = """
+[EMC]
+VERSION = 1.1
+MACHINE = bench
+[DISPLAY]
+DISPLAY = {folder}/nobody_at_the_panel.py
+PROGRAM_PREFIX = {folder}
+[TASK]
+TASK = milltask
+CYCLE_TIME = 0.001
+[RS274NGC]
+PARAMETER_FILE = {folder}/machine.var
+[EMCMOT]
+EMCMOT = motmod
+COMM_TIMEOUT = 1.0
+SERVO_PERIOD = 1000000
+[EMCIO]
+EMCIO = io
+CYCLE_TIME = 0.1
+TOOL_TABLE = {folder}/machine.tbl
+[HAL]
+HALFILE = machine.hal
+[KINS]
+KINEMATICS = trivkins coordinates={axes}
+JOINTS = {joints}
+[TRAJ]
+COORDINATES = {axes}
+LINEAR_UNITS = mm
+ANGULAR_UNITS = degree
+NO_FORCE_HOMING = 1
+DEFAULT_LINEAR_VELOCITY = {speed}
+MAX_LINEAR_VELOCITY = 2000
+DEFAULT_LINEAR_ACCELERATION = {acceleration}
+MAX_LINEAR_ACCELERATION = {acceleration}
+"""
 
 
 class LinuxCnc:
@@ -63,7 +121,7 @@ class LinuxCnc:
             )
 
     def _as_nobody(
-        self, *command: str, environment: Mapping[str, str], log: IO[bytes], out: int | None = None
+        self, *command: str, environment: Mapping[str, str] | None = None, log: IO[bytes], out: int | None = None
     ) -> subprocess.Popen[bytes]:
         """Start a command in a group of its own, as somebody else if this is root: LinuxCNC refuses to run as root."""
         if os.geteuid() == 0:
@@ -136,26 +194,28 @@ class LinuxCnc:
         What LinuxCNC had ordered when the block was left is all in it, however far behind a busy host is.
         """
         with (self.folder / "log").open("ab") as log:
-            sampling = self._as_nobody("sh", "-c", ROWS, environment=os.environ, log=log, out=subprocess.PIPE)
+            sampling = self._as_nobody("sh", "-c", ROWS, log=log, out=subprocess.PIPE)
         assert sampling.stdout is not None
-        poured = Poured()
-        pouring = threading.Thread(target=poured.run, args=(sampling.stdout, twin), name="demand")
+        pouring = threading.Thread(target=_pour, args=(sampling.stdout, twin), name="demand")
         pouring.start()
         try:
             yield
-            poured.wait_for(self._sampled())
+            self._wait_until_fetched()
         finally:
             _end(sampling)
             pouring.join()
             sampling.stdout.close()
             twin.close_panel()
 
-    def _sampled(self) -> int:
-        """Count the servo cycles that LinuxCNC has queued for whoever reads its demand."""
+    def _wait_until_fetched(self) -> None:
+        """Wait until no more samples are queued than come while one asks."""
+        end = time.monotonic() + PATIENCE_S
+        while (depth := self._queued()) > 100:
+            assert time.monotonic() < end, f"{depth} samples of the demand are still queued"
+
+    def _queued(self) -> int:
         with (self.folder / "log").open("ab") as log:
-            asking = self._as_nobody(
-                "halcmd", "-s", "getp", "sampler.0.sample-num", environment=os.environ, log=log, out=subprocess.PIPE
-            )
+            asking = self._as_nobody("halcmd", "-s", "getp", "sampler.0.curr-depth", log=log, out=subprocess.PIPE)
         told, _ = asking.communicate()
         assert asking.returncode == 0, self._log()
         return int(told)
@@ -179,16 +239,12 @@ class LinuxCnc:
 
 def write_machine(folder: Path, speed_mm_s: float, acceleration_mm_s2: float, hal: str, axes: str) -> None:
     """Write the files of a machine as its integrator has them: machine.ini, and the HAL file that it names."""
-    lines = (HERE / "machine.hal").read_text().splitlines()
-    if axes == "XY":
-        fewer = {
-            "=xyz": "=xy",
-            "joints=3": "joints=2",
-            ",fffssff": ",ffssff",
-        }  # the bridge's channel has its joints only
-        for many, few in fewer.items():
-            lines = [line.replace(many, few) for line in lines if "joint.2" not in line]
-    (folder / "machine.hal").write_text("\n".join([*lines, hal]))
+    text = (HERE / "machine.hal").read_text()
+    text = text.replace("=xyz", f"={axes.lower()}").replace("joints=3", f"joints={len(axes)}")
+    if axes == "XY":  # the bridge's channel has its joints only
+        lines = text.replace(",fffssff", ",ffssff").splitlines()
+        text = "\n".join(line for line in lines if "joint.2" not in line)
+    (folder / "machine.hal").write_text(f"{text}\n{hal}")
     shutil.copy(HERE / "operator_by_wire.py", folder / "nobody_at_the_panel.py")
     (folder / "nobody_at_the_panel.py").chmod(0o755)
     limits = {"speed": speed_mm_s, "acceleration": acceleration_mm_s2}
@@ -206,30 +262,62 @@ def _alone() -> IO[bytes]:
     return lock
 
 
-class Poured:
-    """Hands the rows of the demand to the simulated machine, and knows how far it is."""
+class DemandRecorder(LinuxCnc):
+    """A LinuxCNC that drives nothing: what its trajectory planner orders in each servo cycle is recorded."""
 
-    def __init__(self) -> None:
-        self._cycle = 0
-        self._news = threading.Condition()
+    def __init__(self, speed_mm_s: float = 500.0, acceleration_mm_s2: float = 2000.0, axes: str = "XYZ") -> None:
+        super().__init__(speed_mm_s, acceleration_mm_s2, axes=axes)
+        with (self.folder / "log").open("ab") as log:
+            self._sampling = self._as_nobody("stdbuf", "-oL", "halsampler", "-t", log=log, out=subprocess.PIPE)
+        self._samples: queue.Queue[list[float]] = queue.Queue()
+        self._thread = threading.Thread(target=self._keep, name="demand")
+        self._thread.start()
 
-    def run(self, rows: IO[bytes], twin: TwinProcess) -> None:
-        """Hand over each row until there are no more."""
-        for line in rows:
-            twin.send_line(line.decode().rstrip())
-            with self._news:
-                self._cycle = _cycle(line)
-                self._news.notify()
+    def _keep(self) -> None:
+        assert self._sampling.stdout is not None
+        for line in self._sampling.stdout:
+            words = line.split()
+            if len(words) == 5:  # the others report that samples were not fetched in time
+                self._samples.put([float(word) for word in words])
 
-    def wait_for(self, cycle: int) -> None:
-        """Wait until a servo cycle has been handed over."""
-        with self._news:
-            assert self._news.wait_for(lambda: self._cycle >= cycle, PATIENCE_S), (self._cycle, cycle)
+    def record(self, program: str) -> Float:
+        """Return the ordered X, Y, Z (n, 3) in mm of each servo cycle of a program, from its first motion to its last.
+
+        It begins at zero, in the state after power-up. AssertionError when a cycle was not recorded or nothing moved.
+        """
+        self.order("reset")
+        self.run(program)
+        self.order("mark")
+        samples = np.array(list(self._between_marks()))
+        assert (np.diff(samples[:, 0]) == 1).all(), "a cycle is missing in the recorded demand"
+        moving = np.flatnonzero(np.abs(np.diff(samples[:, 1:4], axis=0)).max(axis=1) > 0.0)
+        assert moving.size, f"nothing moved\n{self._log()}"
+        return np.asarray(samples[moving[0] : moving[-1] + 2, 1:4])
+
+    def _between_marks(self) -> Iterator[list[float]]:
+        """Yield the samples from the end of the mark that the reset sets to the beginning of that after the program."""
+        marks = 0
+        marked = False
+        while marks < 2:
+            sample = self._samples.get(timeout=PATIENCE_S)
+            marks += bool(sample[4]) and not marked
+            marked = bool(sample[4])
+            if marks == 1 and not marked:
+                yield sample
+
+    def close(self) -> None:
+        """End the recording, and LinuxCNC."""
+        _end(self._sampling)
+        self._thread.join()
+        assert self._sampling.stdout is not None
+        self._sampling.stdout.close()
+        super().close()
 
 
-def _cycle(row: bytes) -> int:
-    time_s = row.split(b",", 1)[0]
-    return 0 if time_s == b"time_s" else round(1000 * float(time_s))
+def _pour(rows: IO[bytes], twin: TwinProcess) -> None:
+    """Hand the rows of the demand to the simulated machine until there are no more."""
+    for line in rows:
+        twin.send_line(line.decode().rstrip())
 
 
 def _end(child: subprocess.Popen[bytes]) -> None:

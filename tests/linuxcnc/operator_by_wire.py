@@ -22,6 +22,9 @@ import linuxcnc  # type: ignore[import-not-found]  # the package's own module, f
 JOINTS = int(os.environ["JOINTS"])
 PATIENCE_S = 300.0
 LOOK_S = 1.0
+# what a program may have left changed; the axes go back to zero
+POWER_UP = ["M64 P0", "G54 G92.1 G49 G40 G80 G8", *(f"G10 L2 P{system} X0 Y0 Z0 R0" for system in range(1, 10))]
+POWER_UP += ["G53 G0 X0 Y0 Z0", "G64 G17 G21 G90 G91.1 G94 G97 G98", "M5 M9 M48", "M65 P0"]
 
 
 class Failed(Exception):
@@ -34,6 +37,7 @@ class Operator:
     def __init__(self, wire: socket.socket) -> None:
         self._wire = wire
         self.command, self.status, self.errors = linuxcnc.command(), linuxcnc.stat(), linuxcnc.error_channel()
+        self._said: list[str] = []
 
     def order(self, what: Callable[..., None], *arguments: Any) -> None:
         """Give an order and wait until it is done."""
@@ -66,11 +70,16 @@ class Operator:
             if not self._wire.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT):
                 sys.exit(1)
 
-    def _words(self) -> str:
-        said = []
+    def _has_failed(self) -> bool:
+        """Return whether LinuxCNC has reported an error since ``_words`` was asked for."""
         while (error := self.errors.poll()) is not None:
-            said.append(str(error[1]).strip())
-        return "LinuxCNC says: " + ("; ".join(said) or "nothing")
+            self._said.append(str(error[1]).strip())
+        return bool(self._said)
+
+    def _words(self) -> str:
+        text = "; ".join(self._said) if self._has_failed() else "nothing"
+        self._said.clear()
+        return f"LinuxCNC says: {text}"
 
     def prepare(self) -> None:
         """Switch the machine on and home it where it stands."""
@@ -82,23 +91,44 @@ class Operator:
         self.wait(lambda status: all(status.homed[:JOINTS]))
         self.order(self.command.mode, linuxcnc.MODE_AUTO)
 
+    def reset(self) -> None:
+        """Bring the machine to zero, and the interpreter to its state after power-up."""
+        self.enter(*POWER_UP)
+
+    def enter(self, *blocks: str) -> None:
+        """Have some blocks done one after another."""
+        self.order(self.command.mode, linuxcnc.MODE_MDI)
+        for block in blocks:
+            self.order(self.command.mdi, block)
+        self.order(self.command.mode, linuxcnc.MODE_AUTO)
+        if self._has_failed():
+            raise Failed(self._words())
+
     def run(self, program: str) -> None:
-        """Start a program from its first line."""
+        """Start a program from its first line; return when it runs, or is over already."""
         self.order(self.command.program_open, program)
         self.command.auto(linuxcnc.AUTO_RUN, 0)  # whose completion is the program's
-        self.wait(lambda status: status.interp_state != linuxcnc.INTERP_IDLE)
+        self.wait(lambda status: status.interp_state != linuxcnc.INTERP_IDLE or self._is_complete(status))
+
+    def _is_complete(self, status: Any) -> bool:
+        """Return whether LinuxCNC has done the last order, or failed to."""
+        return bool(status.echo_serial_number == self.command.serial and status.state != linuxcnc.RCS_EXEC)
 
     def rest(self) -> None:
         """Wait until the program is over and the machine stands."""
         self.wait(lambda status: status.interp_state == linuxcnc.INTERP_IDLE and bool(status.inpos))
-        if words := self._words().removeprefix("LinuxCNC says: nothing"):
-            raise Failed(words)
+        if self._has_failed():
+            raise Failed(self._words())
 
     def obey(self, order: dict[str, Any]) -> None:
         """Do one order."""
         match order["order"]:
             case "run":
                 self.run(order["program"])
+            case "reset":
+                self.reset()
+            case "mark":
+                self.enter("M64 P0")
             case "rest":
                 self.rest()
             case "override":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from studies import real_plant
 from tests.bench import bench_document
 from tests.model.slow_drive import EventDrive, SlowDrive, TwoMassDrive
 from tests.paths import smooth
+from tests.tiers import sampled
 
 PERIOD = 0.001
 PLAIN = Parameters(0.53, 0.0047, 0.82, 0.081, 0.04, 4.2)
@@ -65,8 +67,7 @@ def loaded(slow: SlowDrive, axis: Axis, demand: Float) -> SlowDrive:
     return slow
 
 
-@pytest.mark.parametrize("delay", [0, 3])
-@pytest.mark.parametrize("joined", TERMS)
+@pytest.mark.parametrize(("joined", "delay"), sampled(product(TERMS, [0, 3]), every=3))
 def test_agrees_with_independent_physics(joined: str, delay: int) -> None:
     """Move, reversal and rest, as a drive of other code makes them."""
     axis, parameters = bench(current_delay_cycles=delay), PLAIN.changed(**TERMS[joined])

@@ -8,7 +8,7 @@ where it blends by a parabola (measured on the package's version); that is why G
 from __future__ import annotations
 
 import math
-from functools import cache
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -22,12 +22,13 @@ from fdhil.prediction.models import nominal_models
 from fdhil.program import Dwell, interpret, plan
 from fdhil.records import Float
 from tests.bench import bench_config, bench_document
+from tests.linuxcnc.machine import DemandRecorder
 from tests.paths import rms, trajectory
-from tests.program.linuxcnc_machine import demand
 from tests.program.test_look_ahead import dense_path
 
 pytestmark = pytest.mark.debian
 
+Theirs = Callable[[str, float], Float]
 ACCELERATION_MM_S2 = 2000.0
 EXACT_SHARE = 0.9
 PATHS = {
@@ -56,22 +57,21 @@ def ours(text: str, acceleration_mm_s2: float = ACCELERATION_MM_S2, profile: str
     return np.asarray(rows[: moving[-1] + 2])
 
 
-@cache
-def recorded(text: str, attempt: int) -> Float:
-    del attempt
-    return demand(text, acceleration_mm_s2=ACCELERATION_MM_S2)
-
-
-def theirs(text: str, most_rows: float = math.inf) -> Float:
-    """LinuxCNC's rows; where they are more than ``most_rows`` they are recorded again, twice at most.
+@pytest.fixture(scope="module")
+def theirs() -> Iterator[Theirs]:
+    """LinuxCNC's rows for a program; where they are more than ``most_rows`` they are recorded again, twice at most.
 
     Where a busy computer holds its interpreter up, its planner has nothing to look ahead to and brakes.
     """
-    for attempt in range(3):
-        rows = recorded(text, attempt)
-        if len(rows) <= most_rows:
-            break
-    return rows
+    with DemandRecorder(acceleration_mm_s2=ACCELERATION_MM_S2) as nc:
+
+        def recorded(text: str, most_rows: float) -> Float:
+            for _ in range(3):
+                if len(rows := nc.record(text)) <= most_rows:
+                    break
+            return rows
+
+        yield recorded
 
 
 def apart_mm(a: Float, b: Float) -> float:
@@ -81,7 +81,7 @@ def apart_mm(a: Float, b: Float) -> float:
 
 
 @pytest.mark.parametrize("path", ["contour", "zigzag"])
-def test_g61_orders_the_same_positions_at_the_same_time(path: str) -> None:
+def test_g61_orders_the_same_positions_at_the_same_time(path: str, theirs: Theirs) -> None:
     text = program(path, "G61", 6000.0)
     a = ours(text, EXACT_SHARE * ACCELERATION_MM_S2)
     b = theirs(text, 1.006 * len(a))
@@ -96,7 +96,9 @@ def test_g61_orders_the_same_positions_at_the_same_time(path: str) -> None:
     ("path", "feed", "share"),
     [("helix", 6000.0, 0.015), ("contour", 20000.0, 0.012), ("zigzag", 20000.0, 0.012), ("helix", 20000.0, 0.055)],
 )
-def test_g61_takes_about_the_same_time_on_circles_and_at_high_feeds(path: str, feed: float, share: float) -> None:
+def test_g61_takes_about_the_same_time_on_circles_and_at_high_feeds(
+    path: str, feed: float, share: float, theirs: Theirs
+) -> None:
     text = program(path, "G61", feed)
     rows = len(ours(text, EXACT_SHARE * ACCELERATION_MM_S2))
     assert rows == pytest.approx(len(theirs(text, (1.0 + share) * rows)), rel=share)
@@ -107,7 +109,7 @@ def test_g61_takes_about_the_same_time_on_circles_and_at_high_feeds(path: str, f
     ("tolerance_mm", "feed", "share"), [(0.05, 3000.0, 0.02), (0.5, 3000.0, 0.02), (0.05, 1e4, 0.08)]
 )
 def test_g64_stays_within_p_and_takes_about_the_same_time(
-    path: str, tolerance_mm: float, feed: float, share: float
+    path: str, tolerance_mm: float, feed: float, share: float, theirs: Theirs
 ) -> None:
     text = program(path, f"G64 P{tolerance_mm:g}", feed)
     a = ours(text)
@@ -149,7 +151,7 @@ PATHS |= {
 
 @pytest.mark.parametrize(("mode", "feed"), [("G61", 2e4), ("G64 P0.05", 6e3), ("G64 P0.2 Q0.02", 2e4)])
 @pytest.mark.parametrize("path", PATHS)
-def test_the_profile_of_linuxcnc_orders_its_demand(path: str, mode: str, feed: float) -> None:
+def test_the_profile_of_linuxcnc_orders_its_demand(path: str, mode: str, feed: float, theirs: Theirs) -> None:
     """Within 2 % of its time, and on its path: beside what one cycle of the other's lies apart."""
     text = program(path, mode, feed)
     a = ours(text, profile="linuxcnc")
@@ -166,10 +168,10 @@ def beside_mm(places: Float, path: Float) -> float:
     return float(np.max(cKDTree(np.concatenate([fine, path[-1:]])).query(places)[0]))
 
 
-def test_the_correction_stands_the_jerky_demand() -> None:
+def test_the_correction_stands_the_jerky_demand(theirs: Theirs) -> None:
     """The bench path by G64 without P: steps of acceleration, rounded to the drives' increments."""
     text = "G21 G90 G17 G64\nF10000\nG1 Y55\nX100\nG3 X200 I50\nG1 X250\nY0\nM2\n"
-    rows = theirs(text)[:, :2]
+    rows = theirs(text, math.inf)[:, :2]
     reference = trajectory(np.round(np.concatenate([rows, np.repeat(rows[-1:], 500, axis=0)]) * 3276.8) / 3276.8)
     config = bench_config()
     models = nominal_models(config)

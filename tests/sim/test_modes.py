@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tests.sim.rig import Abort, Rig, machine
+from tests.tiers import sampled
 
 INC_PER_MM = 3276.8
 REV = 65536
@@ -253,10 +254,10 @@ SWITCHES: dict[str, Any] = {"limit_switches_mm": (-23.0, 64.0), "home_switch_mm"
 
 @pytest.mark.parametrize(
     ("method", "home_mm"),
-    [
+    sampled([
         (17, -23.0), (18, 64.0), (1, -20.0), (2, 60.0), (19, 33.0), (20, 33.0), (3, 20.0), (4, 40.0),
         (33, 0.0), (34, 20.0), (35, 7.0), (37, 7.0),
-    ],
+    ], every=2),
 )  # fmt: skip
 def test_home_is_where_the_method_says(method: int, home_mm: float) -> None:
     rig = enabled(6, **SWITCHES)

@@ -31,11 +31,11 @@ def demo(out: Path, realtime: bool, pdf: bool, as_json: bool) -> None:
 
     Starts the twin (drives, sensors, NC), the guard and the daemon; commissions the drives; shuttles the axes and
     identifies them; predicts the path of the paper, cuts it, arms, cuts it corrected; warms the slide-ways and cuts
-    again. Then it identifies and cuts once more on a machine with what real ones have.
+    again. At the same time it identifies and cuts on a machine with what real ones have.
     """
     from fdhil.cli.demo import realistic_page
     from fdhil.cli.demo.loop import run_loop
-    from fdhil.cli.demo.realistic import run_realistic
+    from fdhil.cli.demo.realistic import running_realistic
     from fdhil.cli.demo.report import page
     from fdhil.report import deliver, find_browser
 
@@ -45,9 +45,9 @@ def demo(out: Path, realtime: bool, pdf: bool, as_json: bool) -> None:
 
     if pdf:
         find_browser()  # said before the work, not after it
-    with stopping_in_order():
+    with stopping_in_order(), running_realistic(out / "realistic", realtime, say) as result:
         loop = run_loop(out, realtime, say)
-        realistic = run_realistic(out / "realistic", realtime, say)
+        realistic = result()
         report = out / "report.html"
         laid_out = page(loop, [realistic_page.headline(realistic)], [realistic_page.section(realistic)])
         deliver(laid_out, report, report.with_suffix(".pdf") if pdf else None)

@@ -72,13 +72,18 @@ def run_loop(out: Path, realtime: bool, say: Say) -> Loop:
         return _measure(stage)
 
 
-@contextmanager
-def running(out: Path, realtime: bool, say: Say, document: dict[str, Any]) -> Iterator[Stage]:
-    """Have a machine, commissioned, with guard and daemon, its NC on; all of it ends with the block."""
+def make_folder(out: Path) -> None:
+    """Make the folder of a machine; FdhilError when that is not possible."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise FdhilError(f"the folder {out} cannot be made: {error.strerror}; choose another --out") from None
+
+
+@contextmanager
+def running(out: Path, realtime: bool, say: Say, document: dict[str, Any]) -> Iterator[Stage]:
+    """Have a machine, commissioned, with guard and daemon, its NC on; all of it ends with the block."""
+    make_folder(out)
     with ExitStack() as stack:
         say("starting the simulated machine: two drives, two voltage sensors, an NC")
         stage = _start_twin(out, realtime, say, stack, document)

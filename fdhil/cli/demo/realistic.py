@@ -1,15 +1,20 @@
 """Runs the demonstration on a machine with what real ones have: what fdhil believes of it, and what that is worth."""
 
+import multiprocessing
+import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
 
-from fdhil.cli.demo.loop import Say, Stage, cut, play_shuttle, published_of, running, true_plants
+from fdhil.child import end_with, stopping_in_order
+from fdhil.cli.demo.loop import Say, Stage, cut, make_folder, play_shuttle, published_of, running, true_plants
 from fdhil.cli.demo.machines import REAL, machine_document
 from fdhil.cli.demo.report import Cut, Published
 from fdhil.config import MachineConfig
-from fdhil.errors import FdhilError
+from fdhil.errors import ConnectError, FdhilError
 from fdhil.prediction import predict
 from fdhil.prediction.models import models_for, validated_models
 from fdhil.program import load_trajectory
@@ -42,9 +47,52 @@ class Realistic:
     refused: str
 
 
+@contextmanager
+def running_realistic(out: Path, realtime: bool, say: Say) -> Iterator[Callable[[], Realistic]]:
+    """Run ``run_realistic`` in a process of its own during a with block; what it gives waits for the result.
+
+    FdhilError when a step fails. The process, and its machine, end with the block.
+    """
+    make_folder(out)
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+    arguments = (sender, os.getpid(), out, realtime, lambda text: say(f"realistic machine: {text}"))
+    child = context.Process(target=_send_realistic, args=arguments, name="realistic machine")
+    child.start()
+    sender.close()
+
+    def result() -> Realistic:
+        try:
+            outcome: Realistic | tuple[type[FdhilError], str] = receiver.recv()
+        except EOFError:
+            raise ConnectError("realistic machine", f"its process ended early; see the logs in {out}") from None
+        if isinstance(outcome, Realistic):
+            return outcome
+        kind, text = outcome
+        raise kind.__new__(kind, text)
+
+    try:
+        yield result
+    finally:
+        child.terminate()
+        child.join()
+        receiver.close()
+
+
+def _send_realistic(sender: Connection, parent: int, out: Path, realtime: bool, say: Say) -> None:
+    try:
+        with stopping_in_order():
+            end_with(parent)
+            sender.send(run_realistic(out, realtime, say))
+    except FdhilError as error:
+        sender.send((type(error), str(error)))
+    except KeyboardInterrupt:  # the demonstration ends
+        return
+
+
 def run_realistic(out: Path, realtime: bool, say: Say) -> Realistic:
     """Shuttle, identify and cut below ``out``; FdhilError when a step fails, while a refusal is an answer."""
-    say("once more on a machine with what real ones have: friction, weight, ripples, a soft screw, an inverter")
+    say("the same with what real ones have: friction, weight, ripples, a soft screw, an inverter")
     with running(out, realtime, say, machine_document(REAL)) as stage:
         say("shuttling both axes at rapid speed, listening")
         play_shuttle(stage)

@@ -1,17 +1,25 @@
 """Listens through python-can: to adapters that have no SocketCAN driver, and to the bus inside one process."""
 
 import logging
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any
-
-import can
 
 from fdhil import config
 from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, FrameRing
 from fdhil.drivers.can.host_clock import DistantClock, WallClock, monotonic_ns
 from fdhil.drivers.can.port import BusEnded, Filter, Stamps
 from fdhil.errors import ConnectError
+
+if "asammdf" in sys.modules:
+    import can
+else:  # python-can would import it for MF4 logs, which costs each process half a second and 100 MB
+    sys.modules["asammdf"] = None  # type: ignore[assignment] # so that its import fails
+    try:
+        import can
+    finally:
+        del sys.modules["asammdf"]
 
 FRAMES_PER_TURN = 4096
 CLOCK_WINDOW_S = 2.0

@@ -1,0 +1,28 @@
+"""Waits for what may come on a bus, shortened for drives that a thread of this process simulates.
+
+On a real bus commissioning listens for seconds before it sends; a simulated drive answers at once. How long it may take
+to answer is longer than on a real machine, because the host may be busy.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+SHORT_WAITS: dict[str, float] = {
+    "commissioning.scan.LISTEN_S": 0.05,
+    "commissioning.config_check.LISTEN_S": 0.05,
+    "commissioning.survey.LISTEN_S": 0.05,
+    "commissioning.transmit.LOOK_S": 0.01,
+    "cli.consent.LOOK_S": 0.01,
+    "drivers.can.bus.POLL_S": 0.01,
+    "drivers.can.sdo.QUIET_S": 0.05,
+    "drivers.can.sdo.RESPONSE_TIMEOUT_S": 5.0,
+    "commissioning.steps.SETTLE_CYCLES": 120,
+    "commissioning.steps.AVERAGE_CYCLES": 60,
+}
+
+
+def shorten_waits(monkeypatch: pytest.MonkeyPatch, others: dict[str, float] | None = None) -> None:
+    """Set ``SHORT_WAITS``, and ``others`` by the same names, for the time of a test."""
+    for name, value in {**SHORT_WAITS, **(others or {})}.items():
+        monkeypatch.setattr(f"fdhil.{name}", value)
