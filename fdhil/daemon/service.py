@@ -317,9 +317,8 @@ class Service:
         if request["request"] == "arm":
             answer = await self._desk.arm(request, lambda: self._control.hung_up)
             self._tell([_told(answer)])
-            if "config_digest" not in request:
-                return answer
-            return {**answer, "config_difference": self._watch.config_difference(request["config_digest"])}
+            difference = self._watch.config_difference(request.get("config_digest", self._config.digest))
+            return {**answer, "config_difference": difference} if difference else answer
         if request["request"] == "disarm":
             return await self._desk.disarm()
         if request["request"] == "acknowledge":

@@ -24,7 +24,7 @@ from fdhil.records import LoopEstimate, Notice, ParameterSet, Reason, Skill, Win
 from fdhil.store import HISTORY_FILE, schema
 from fdhil.store.atomic import make_folder
 from fdhil.store.rows import DECODED, Acknowledgement, Comparison, Revision, Stamp, StoredNotice, StoredWindow
-from fdhil.store.schema import Also, told
+from fdhil.store.schema import Also, stamp_of, told
 
 FILE_NAME = HISTORY_FILE
 CHECKED = 5_000  # newest rows of a table that are looked at whatever they say: a start must not last longer every year
@@ -50,7 +50,8 @@ class History:
         self._tell = tell
         self._damaged: dict[tuple[str, int], dict[str, Any]] = {}
         self._also = also
-        self._stamp, self._log = _stamp_of(path), _stamp_of(_log_of(path))[:2]
+        self._wal = path.with_name(path.name + "-wal")
+        self._stamp, self._log = stamp_of(path), stamp_of(self._wal)[:2]
 
     @classmethod
     def open(cls, directory: Path, also: Also | None = None, begin: Begin | None = None) -> History:
@@ -76,12 +77,7 @@ class History:
         return cls(db, path, schema.SCHEMA_VERSION, also=also)
 
     @classmethod
-    def read(
-        cls,
-        directory: Path,
-        tell: Tell | None = None,
-        checked: set[tuple[int, int]] | None = None,
-    ) -> History:
+    def read(cls, directory: Path, tell: Tell | None = None, checked: set[tuple[int, int]] | None = None) -> History:
         """Open for reading only, also from a read-only disk. StoreError when there is none or it is unusable.
 
         ``tell`` hears, when it is closed, of the rows that were damaged and left out. Who opens it again and again
@@ -95,19 +91,19 @@ class History:
         """Bring what was written from the log into the file, whose state is noted; what cannot be stays in the log."""
         with suppress(sqlite3.Error):
             self._db.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
-        self._stamp = self._stamp[:2] + _stamp_of(self._path)[2:]
+        self._stamp = self._stamp[:2] + stamp_of(self._path)[2:]
 
     def is_in_place(self) -> bool:
         """Whether the file of that name is the one that was opened, and nobody else has written to it."""
-        return self._stamp == _stamp_of(self._path)
+        return self._stamp == stamp_of(self._path)
 
     def abandon(self) -> None:
         """Close a file that has lost its name or its content; its log must not become that of another file."""
         with suppress(sqlite3.Error):
             self._db.close()
-        if self._log and _stamp_of(_log_of(self._path))[:2] == self._log:  # others were reading
-            for suffix in ("-wal", "-shm"):
-                self._path.with_name(self._path.name + suffix).unlink(missing_ok=True)
+        if self._log and stamp_of(self._wal)[:2] == self._log:  # others were reading
+            for log in (self._wal, self._wal.with_name(f"{self._path.name}-shm")):
+                log.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Close the database; tell what was left out."""
@@ -356,19 +352,6 @@ class History:
             row = self._db.execute("SELECT file FROM windows WHERE file != '' ORDER BY id DESC LIMIT 1").fetchone()
         digits = "".join(c for c in str(row[0]).partition("-")[0] if c in "0123456789") if row else ""
         return int(digits[:12] or 0)
-
-
-def _log_of(path: Path) -> Path:
-    return path.with_name(path.name + "-wal")
-
-
-def _stamp_of(path: Path) -> tuple[int, ...]:
-    """Return what tells a file from another one and its content from an earlier one; nothing where there is none."""
-    try:
-        found = path.stat()
-    except OSError:
-        return ()
-    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
 
 
 def _of(axis: str | None) -> dict[str, str]:

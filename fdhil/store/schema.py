@@ -112,6 +112,15 @@ def _damaged(path: Path, what: str) -> StoreError:
     return StoreError(text, "CorruptFile")
 
 
+def stamp_of(path: Path) -> tuple[int, ...]:
+    """Return what tells a file from another one and its content from an earlier one; nothing where there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return ()
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
+
+
 def version_of(db: sqlite3.Connection) -> int:
     """Return the schema of the file."""
     return int(db.execute("PRAGMA user_version").fetchone()[0])
