@@ -11,6 +11,7 @@ from pydantic import Field, PrivateAttr, field_validator
 
 from fdhil import tables
 from fdhil.cia402 import Scaling
+from fdhil.config.axis_tables import angular, mm_per_degree
 from fdhil.config.regulators import Regulators
 from fdhil.config.section import Finite, NotNegative, Positive, Section, one_of
 from fdhil.config.sensors import Thermometer, Voltage
@@ -137,8 +138,15 @@ class Drive(Section):
 
 
 class Axis(Section):
-    """[axis.X]"""
+    """[axis.X]; [axis.X2] is the second drive of a gantry axis and takes the keys of [axis.X] that it has not.
 
+    A rotary axis is written in degrees, as rapid_speed_deg_s for rapid_speed_mm_s; its um are those at radius_mm.
+    """
+
+    unit: Literal["mm", "deg"] = Field("mm", description="deg: a rotary axis, whose keys have deg in place of mm")
+    radius_mm: Positive | None = Field(
+        None, ge=10.0, le=1e4, description="of a rotary axis: the radius at which its angles count as path error"
+    )
     screw_pitch_mm: Positive = Field(ge=1e-3, le=1e4, description="table travel per motor revolution")
     rapid_speed_mm_s: Positive = Field(ge=1e-3, le=1e5, description="speed of G0")
     max_acceleration_mm_s2: Positive = Field(ge=1e-2, le=1e6, description="acceleration of G0")
@@ -166,6 +174,15 @@ class Axis(Section):
     temperature: Thermometer | None = None
     table: TableEncoder | None = None
     accelerometer: Accelerometer | None = None
+
+    @property
+    def mm_per_unit(self) -> float:
+        """Millimetres per unit of the axis: 1, or the length of arc of one degree at ``radius_mm``."""
+        return 1.0 if self.radius_mm is None or self.unit == "mm" else mm_per_degree(self.radius_mm)
+
+    def shown_key(self, key: str) -> str:
+        """Return the name of a key as it is written for this axis."""
+        return angular(key) if self.unit == "deg" else key
 
     @property
     def jerk_mm_s3(self) -> float:

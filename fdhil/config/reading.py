@@ -7,12 +7,14 @@ import logging
 import re
 import tomllib
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
+from fdhil.config.axis_tables import angular, complete, linear, rotary_axes
 from fdhil.config.machine import MachineConfig
 from fdhil.config.plausible import doubts
 from fdhil.config.section import LARGEST, Section
@@ -82,10 +84,16 @@ def parse(
 
     ``made_up``: its axes need not be those of a machine that can be.
     """
+    units: list[ConfigFault] = []
+    rotary = rotary_axes(document)
+    if not made_up:
+        document = complete(document, units)
     try:
         config = MachineConfig.model_validate(document, context={"made_up": made_up})
     except ValidationError as error:
-        raise ConfigError(source, _faults(error)) from None
+        raise ConfigError(source, [*units, *(_as_written(fault, rotary) for fault in _faults(error))]) from None
+    if units:
+        raise ConfigError(source, units)
     directory = folder / config.store.directory
     run, key = config.store.run_directory, config.store.commissioning_key
     store = config.store.model_copy(
@@ -109,6 +117,16 @@ def parse(
     placed |= {"offers": config.offers.placed(folder)}
     placed |= {"uplink": config.uplink.placed(folder)} if config.uplink else {}
     return config.model_copy(update=placed)
+
+
+def _as_written(fault: ConfigFault, rotary: Mapping[str, float]) -> ConfigFault:
+    """Return a fault of a rotary axis with the key that its file has; numbers in it are lengths at the radius."""
+    parts = fault.path.removeprefix("sim.").split(".")
+    key = angular(parts[-1])
+    if parts[0] != "axis" or len(parts) < 3 or parts[1] not in rotary or not (key != parts[-1] or "_um" in key):
+        return fault
+    at = "" if "missing" in fault.what else f" at its radius, where 1 deg is {rotary[parts[1]]:.4g} mm"
+    return replace(fault, path=f"{fault.path.removesuffix(parts[-1])}{key}", what=f"{fault.what}{at}")
 
 
 def load_as(whole: type[S], path: Path, what: str) -> S:
@@ -235,7 +253,8 @@ def _section(loc: tuple[int | str, ...], whole: type[Section] = MachineConfig) -
 def field_at(path: str) -> FieldInfo | None:
     """Return the field of a key, as ``axis.X.nominal.R``; None where there is none."""
     *outer, key = path.split(".")
-    return _section(tuple(outer)).model_fields.get(key)
+    fields = _section(tuple(outer)).model_fields
+    return fields.get(key) or (fields.get(linear(key)) if outer[:1] == ["axis"] else None)
 
 
 def _arguments(annotation: Any) -> list[Any]:
