@@ -21,7 +21,7 @@ MAX_ACCELERATION = {acceleration}
 MIN_LIMIT = -1000
 MAX_LIMIT = 1000
 [JOINT_{number}]
-TYPE = LINEAR
+TYPE = {kind}
 HOME = 0
 HOME_SEARCH_VEL = 0
 HOME_LATCH_VEL = 0
@@ -65,6 +65,8 @@ NO_FORCE_HOMING = 1
 DEFAULT_LINEAR_VELOCITY = {speed}
 MAX_LINEAR_VELOCITY = 2000
 DEFAULT_LINEAR_ACCELERATION = {acceleration}
+DEFAULT_ANGULAR_VELOCITY = {speed}
+MAX_ANGULAR_VELOCITY = 2000
 MAX_LINEAR_ACCELERATION = {acceleration}
 """
 
@@ -76,7 +78,7 @@ def demand(
     axes: str = "XYZ",
     limit_s: float = 60.0,
 ) -> Float:
-    """Return the commanded X, Y, Z (n, 3) in mm of each servo cycle of a program, from its first motion to its last.
+    """Return the commanded ``axes`` (n, 3), mm or degrees, of each servo cycle of a program while it moves.
 
     AssertionError with LinuxCNC's own words when it did not run, or a cycle was not recorded.
     """
@@ -115,7 +117,10 @@ def _write(folder: Path, program: str, speed_mm_s: float, acceleration_mm_s2: fl
     hal.write_text(hal.read_text().replace("=xyz", f"={axes}").replace("num_joints=3", f"num_joints={len(axes)}"))
     ini = MACHINE.format(folder=folder, speed=speed_mm_s, acceleration=acceleration_mm_s2, axes=axes, joints=len(axes))
     ini += "".join(
-        AXIS.format(letter=letter, number=number, speed=speed_mm_s, acceleration=acceleration_mm_s2)
+        AXIS.format(
+            letter=letter, number=number, speed=speed_mm_s, acceleration=acceleration_mm_s2,
+            kind="ANGULAR" if letter in "ABC" else "LINEAR",
+        )
         for number, letter in enumerate(axes)
     )
     (folder / "machine.ini").write_text(ini)

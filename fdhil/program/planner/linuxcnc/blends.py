@@ -43,8 +43,8 @@ def join(before: Segment, after: Segment, limits: AxisLimits) -> tuple[Segment, 
     """
     if before.rapid != after.rapid:
         before.ending = STOP
-    if before.ending == PARABOLA and (before.turns or after.turns):  # as LinuxCNC: where others move, always a parabola
-        after.after_parabola = True
+    if before.turns or after.turns:  # measured: no arc between, and no kink is passed
+        after.after_parabola = before.ending == PARABOLA
         return (before,)
     if before.ending == STOP or _passed(before, after, limits) or before.ending == EXACT:
         return (before,)
