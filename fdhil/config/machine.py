@@ -75,9 +75,11 @@ class MachineConfig(Section):
             if axis.unit == "deg" and axis.radius_mm is None:
                 faults.append(f"axis.{name}.radius_mm: is missing: angles count as path error at a radius; give it")
             if axis.unit == "mm" and axis.radius_mm is not None:
-                faults.append(f'axis.{name}.radius_mm: is that of a rotary axis; give unit = "deg" too, or leave it out')
+                faults.append(
+                    f'axis.{name}.radius_mm: is that of a rotary axis; give unit = "deg" too, or leave it out'
+                )
             if axis.unit == "deg" and name[0] in "XYZUVW":
-                faults.append(f'axis.{name}.unit: programs give {name[0]} in mm; name a rotary axis A, B or C')
+                faults.append(f"axis.{name}.unit: programs give {name[0]} in mm; name a rotary axis A, B or C")
         faults += self._gantry_faults()
         faults += line_faults(self._line_users())
         faults += self._node_faults()
@@ -140,6 +142,11 @@ class MachineConfig(Section):
     def node_id(self, axis: str) -> int:
         """Return the CANopen node-ID of an axis' drive."""
         return self.axis[axis].drive.node_id or list(self.axis).index(axis) + 1
+
+    @property
+    def mm_per_degree(self) -> dict[str, float]:
+        """The length of arc of one degree at the radius of each rotary axis."""
+        return {name: axis.mm_per_unit for name, axis in self.axis.items() if axis.unit == "deg"}
 
     @property
     def run_directory(self) -> Path:

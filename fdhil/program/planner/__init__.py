@@ -127,4 +127,5 @@ def _trajectory(rows: Float, first_row: int, config: MachineConfig) -> Trajector
         position_mm=position_mm,
         rapid=rapid,
         line=frozen_ints(rows[:, -2]),
+        mm_per_degree=config.mm_per_degree,
     )

@@ -118,7 +118,10 @@ def _write(folder: Path, program: str, speed_mm_s: float, acceleration_mm_s2: fl
     ini = MACHINE.format(folder=folder, speed=speed_mm_s, acceleration=acceleration_mm_s2, axes=axes, joints=len(axes))
     ini += "".join(
         AXIS.format(
-            letter=letter, number=number, speed=speed_mm_s, acceleration=acceleration_mm_s2,
+            letter=letter,
+            number=number,
+            speed=speed_mm_s,
+            acceleration=acceleration_mm_s2,
             kind="ANGULAR" if letter in "ABC" else "LINEAR",
         )
         for number, letter in enumerate(axes)

@@ -15,8 +15,8 @@ from fdhil.program.planner.limits import AxisLimits
 from fdhil.program.planner.linuxcnc.segments import (
     ALONG_SHARE,
     EXACT,
-    PARABOLA,
     NORMAL_SHARE,
+    PARABOLA,
     STOP,
     TANGENT,
     Segment,
