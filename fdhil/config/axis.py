@@ -164,6 +164,9 @@ class Axis(Section):
         "response has it; left out: sought where replays of rapids leave much, else the table is where the motor is",
     )
     resonance_damping: NotNegative = Field(0.03, le=0.7, description="damping ratio of that resonance")
+    max_difference_um: Positive | None = Field(
+        None, le=1e4, description="of a second drive, as [axis.X2]: how far the two may be apart; left out: 500"
+    )
     nominal: Nominal
     regulators: Regulators
     correction: CorrectionLimits | None = None
@@ -174,6 +177,11 @@ class Axis(Section):
     temperature: Thermometer | None = None
     table: TableEncoder | None = None
     accelerometer: Accelerometer | None = None
+
+    @property
+    def largest_difference_um(self) -> float:
+        """How far the two drives of a gantry axis may be apart."""
+        return self.max_difference_um or 500.0
 
     @property
     def mm_per_unit(self) -> float:

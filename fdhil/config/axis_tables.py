@@ -37,7 +37,7 @@ def rotary_axes(document: Mapping[str, Any]) -> dict[str, float]:
     """Return mm per degree of each rotary axis; 1 where its radius is no length, which the models refuse."""
     axes = _table(document.get("axis"))
     radii = {name: _table(axis).get("radius_mm") for name, axis in axes.items() if _table(axis).get("unit") == "deg"}
-    return {name: mm_per_degree(radius) if _is_length(radius) else 1.0 for name, radius in radii.items()}
+    return {name: mm_per_degree(float(r)) if r is not None and _is_length(r) else 1.0 for name, r in radii.items()}
 
 
 def _is_length(value: Any) -> bool:

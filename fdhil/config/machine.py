@@ -74,6 +74,8 @@ class MachineConfig(Section):
             faults += limits
             if axis.unit == "deg" and axis.radius_mm is None:
                 faults.append(f"axis.{name}.radius_mm: is missing: angles count as path error at a radius; give it")
+            if axis.max_difference_um is not None and not is_second_drive(name):
+                faults.append(f"axis.{name}.max_difference_um: is that of a second drive; move it to [axis.{name}2]")
             if axis.unit == "mm" and axis.radius_mm is not None:
                 faults.append(
                     f'axis.{name}.radius_mm: is that of a rotary axis; give unit = "deg" too, or leave it out'
@@ -97,6 +99,8 @@ class MachineConfig(Section):
             for key in ("unit", "radius_mm", "screw_pitch_mm", *_OF_A_MOVE):
                 if getattr(first, key) != getattr(second, key):
                     yield f"axis.{name}.{first.shown_key(key)}: differs from axis.{name[0]}, and both move one beam"
+            if first.drive.bus != second.drive.bus:
+                yield f"axis.{name}.drive.bus: both drives of axis {name[0]} are on one bus, whose SYNC they share"
             if (first.correction is None) != (second.correction is None):
                 yield f"axis.{name}.correction: both drives of axis {name[0]} are corrected, or neither; give both"
 
@@ -181,6 +185,7 @@ class MachineConfig(Section):
         """
         files = "".join(axis.drive.files_digest for axis in self.axis.values())
         # of a linear axis as before there were others, so that no record is void
-        linear = {name: {"unit", "radius_mm"} for name, axis in self.axis.items() if axis.unit == "mm"}
+        rotary = {"unit", "radius_mm"}
+        linear = {n: {"max_difference_um", *(rotary if axis.unit == "mm" else ())} for n, axis in self.axis.items()}
         told = self.model_dump_json(exclude={**dict.fromkeys(BESIDE_THE_MACHINE, True), "axis": linear})
         return hashlib.sha256(f"{told}{files}".encode()).hexdigest()[:16]

@@ -45,7 +45,7 @@ class Planner:
         self._count = 0
 
     def parts(self, motions: Iterable[Motion], block_rows: int) -> Iterator[Float]:
-        """Yield positions of ``ALL_AXES``, source line and rapid (0 or 1) in blocks (n, 11); the first row is the rest."""
+        """Yield positions of ``ALL_AXES``, source line and rapid (0 or 1) in blocks (n, 11), from the rest on."""
         rows: list[Row] = []
         past = np.zeros((2, len(ALL_AXES)))
         for row in self._rows(motions):

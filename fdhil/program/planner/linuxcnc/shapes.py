@@ -36,7 +36,7 @@ def unit(a: Point) -> Point:
 
 @dataclass(slots=True)
 class Line:
-    """A line of ``length`` mm from ``start`` along the unit vector ``way``, zero where other axes move alone."""
+    """A line of ``length`` mm from ``start`` along the unit vector ``way``; 0 where others move alone."""
 
     start: Point
     way: Point
