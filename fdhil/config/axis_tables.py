@@ -34,9 +34,10 @@ def linear(key: str) -> str:
 
 
 def rotary_axes(document: Mapping[str, Any]) -> dict[str, float]:
-    """Return mm per degree of each rotary axis; 1 where its radius is no length, which the models refuse."""
-    axes = _table(document.get("axis"))
-    radii = {name: _table(axis).get("radius_mm") for name, axis in axes.items() if _table(axis).get("unit") == "deg"}
+    """Return mm per degree of each axis that is written in degrees; 1 where its radius is invalid."""
+    axes = {name: _table(axis) for name, axis in _table(document.get("axis")).items()}
+    rotary = {name: axis for name, axis in axes.items() if axis.get("unit") == "deg" or any("_deg" in k for k in axis)}
+    radii = {name: axis.get("radius_mm") for name, axis in rotary.items()}
     return {name: mm_per_degree(float(r)) if r is not None and _is_length(r) else 1.0 for name, r in radii.items()}
 
 
@@ -60,6 +61,8 @@ def complete(document: Mapping[str, Any], faults: list[ConfigFault]) -> dict[str
     if axes:
         found["axis"] = axes
     for name, factor in rotary_axes(found).items():
+        if axes[name].get("unit", "mm") == "mm":
+            faults.append(ConfigFault(f"axis.{name}.unit", 'is "mm", and keys are in degrees', 'give unit = "deg"'))
         found["axis"][name] = _lengths(axes[name], factor, f"axis.{name}", faults)
         simulated = _table(_table(document.get("sim")).get("axis"))
         if name in simulated:
