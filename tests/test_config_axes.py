@@ -136,6 +136,10 @@ def test_digest_knows_the_unit_and_the_radius_but_not_the_watched_difference() -
         ),
         (lambda axis: axis["X"].update(max_difference_um=100.0), "axis.X.max_difference_um: is that of a second drive"),
         (lambda axis: axis.update({"Y3": {}}), "axis.Y3"),
+        (
+            lambda axis: axis["Y"].update(setpoints={"travel_mm": [0.0, 9.0]}),
+            "axis.Y.setpoints: fdhil sends set-points to no drive of a gantry axis: one alone would skew the beam",
+        ),
     ],
 )
 def test_what_cannot_be_is_refused_with_its_key(change: Change, expected: str) -> None:

@@ -188,6 +188,10 @@ class Axis(Section):
         """Millimetres per unit of the axis: 1, or the length of arc of one degree at ``radius_mm``."""
         return 1.0 if self.radius_mm is None or self.unit == "mm" else mm_per_degree(self.radius_mm)
 
+    def shown(self, mm: float, per: str = "", form: str = ".4g") -> str:
+        """Return a position, speed ("/s") or acceleration ("/s2") in the axis' unit."""
+        return f"{mm / self.mm_per_unit:{form}} {self.unit}{per}"
+
     def shown_key(self, key: str) -> str:
         """Return the name of a key as it is written for this axis."""
         return angular(key) if self.unit == "deg" else key

@@ -99,6 +99,9 @@ class MachineConfig(Section):
             for key in ("unit", "radius_mm", "screw_pitch_mm", *_OF_A_MOVE):
                 if getattr(first, key) != getattr(second, key):
                     yield f"axis.{name}.{first.shown_key(key)}: differs from axis.{name[0]}, and both move one beam"
+            if first.setpoints is not None or second.setpoints is not None:
+                text = "fdhil sends set-points to no drive of a gantry axis: one alone would skew the beam"
+                yield f"axis.{name[0]}.setpoints: {text}; leave the section out"
             if first.drive.bus != second.drive.bus:
                 yield f"axis.{name}.drive.bus: both drives of axis {name[0]} are on one bus, whose SYNC they share"
             if (first.correction is None) != (second.correction is None):

@@ -12,9 +12,11 @@ import pytest
 
 from fdhil.cli.demo import loop
 from fdhil.cli.demo.machines import machine_document
+from fdhil.cli.demo.report import Cut
 from fdhil.prediction import contour_error_um, predict
 from fdhil.program import load_trajectory
 from fdhil.records import Float, Parameters, rms, table_path
+from fdhil.store.history import History
 from tests.bench import rotary_axis
 
 pytestmark = pytest.mark.usefixtures("processes")
@@ -40,17 +42,19 @@ def run(out: Path, document: dict[str, Any], path: str, shuttle: str) -> Whole:
             program.write_text(text.replace("|", "\n") + "\nM2\n")
         axes = tuple(stage.config.axis)
         loop.play_shuttle(stage)
-        with loop.History.read(stage.config.store.directory) as history:
+        with History.read(stage.config.store.directory) as history:
             found = {axis: history.revisions(axis, limit=1)[0].set.parameters for axis in axes}
         predicted = predict(load_trajectory(stage.programs["10 m/min"], stage.config), found, stage.config)
         loop.cut(stage, "uncorrected", 20.0)
         loop.cut(stage, "corrected", 20.0, "inverse")
         measured = [_contour_um(cut, axes) for cut in stage.cuts]
         notices = tuple(notice["text"] for notice in stage.ask("status")["notices"])
-        return Whole(found, loop.true_plants(stage.config), predicted.rms_um, *map(rms, measured), notices)
+        return Whole(
+            found, loop.true_plants(stage.config), predicted.rms_um, rms(measured[0]), rms(measured[1]), notices
+        )
 
 
-def _contour_um(cut: loop.Cut, axes: tuple[str, ...]) -> Float:
+def _contour_um(cut: Cut, axes: tuple[str, ...]) -> Float:
     reference, table = (table_path(axes, rows) for rows in (cut.reference_mm, cut.table_mm))
     return contour_error_um(reference, table, 0.001)
 
