@@ -116,7 +116,6 @@ def test_digest_knows_the_unit_and_the_radius_but_not_the_watched_difference() -
             "axis.A.correction.max_offset_mdeg: is given as max_offset_um too (keep one of them)",
         ),
         (lambda axis: axis["A"].update(unit="mm"), 'axis.A.unit: is "mm", and keys are in degrees (give unit = "deg")'),
-        (lambda axis: axis["X"].update(radius_mm=80.0), "axis.X.radius_mm: is that of a rotary axis"),
         (lambda axis: axis["X"].update(unit="deg"), "axis.X.unit: programs give X in mm; name a rotary axis A, B or C"),
         (lambda axis: axis["X"].update(unit="inch"), "axis.X.unit: Input should be 'mm' or 'deg'"),
         (lambda axis: axis.pop("Y"), "axis.Y2: is the second drive of axis Y, which is missing (give [axis.Y]"),
@@ -134,7 +133,6 @@ def test_digest_knows_the_unit_and_the_radius_but_not_the_watched_difference() -
             lambda axis: axis["Y"].pop("correction") and axis["Y2"].update(correction={}),
             "axis.Y2.correction: both drives",
         ),
-        (lambda axis: axis["X"].update(max_difference_um=100.0), "axis.X.max_difference_um: is that of a second drive"),
         (lambda axis: axis.update({"Y3": {}}), "axis.Y3"),
         (
             lambda axis: axis["Y"].update(setpoints={"travel_mm": [0.0, 9.0]}),
@@ -148,6 +146,16 @@ def test_what_cannot_be_is_refused_with_its_key(change: Change, expected: str) -
     with pytest.raises(ConfigError) as caught:
         config.parse(document)
     assert expected in str(caught.value)
+
+
+def test_radius_of_a_linear_axis_is_questioned_and_not_used() -> None:
+    document = bench_document("X")
+    document["axis"]["X"]["radius_mm"] = 80.0
+    read = config.parse(document)
+    assert read.axis["X"].mm_per_unit == 1.0
+    assert read.digest == config.parse(bench_document("X")).digest
+    (sentence,) = config.unlikely(read)
+    assert sentence.startswith("axis.X.radius_mm is that of a rotary axis and not used")
 
 
 def test_both_drives_of_a_gantry_axis_share_a_bus() -> None:

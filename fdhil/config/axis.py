@@ -165,7 +165,7 @@ class Axis(Section):
     )
     resonance_damping: NotNegative = Field(0.03, le=0.7, description="damping ratio of that resonance")
     max_difference_um: Positive | None = Field(
-        None, le=1e4, description="of a second drive, as [axis.X2]: how far the two may be apart; left out: 500"
+        None, le=1e4, description="of a gantry axis: how far its two drives may be apart; left out: 500"
     )
     nominal: Nominal
     regulators: Regulators

@@ -74,12 +74,6 @@ class MachineConfig(Section):
             faults += limits
             if axis.unit == "deg" and axis.radius_mm is None:
                 faults.append(f"axis.{name}.radius_mm: is missing: angles count as path error at a radius; give it")
-            if axis.max_difference_um is not None and not is_second_drive(name):
-                faults.append(f"axis.{name}.max_difference_um: is that of a second drive; move it to [axis.{name}2]")
-            if axis.unit == "mm" and axis.radius_mm is not None:
-                faults.append(
-                    f'axis.{name}.radius_mm: is that of a rotary axis; give unit = "deg" too, or leave it out'
-                )
             if axis.unit == "deg" and name[0] in "XYZUVW":
                 faults.append(f"axis.{name}.unit: programs give {name[0]} in mm; name a rotary axis A, B or C")
         faults += self._gantry_faults()

@@ -146,6 +146,9 @@ def unlikely(config: MachineConfig) -> list[str]:
     """Return a sentence for everything about the axes that can be, but hardly is."""
     found = [(name, doubt) for name, axis in config.axis.items() for doubt in doubts(axis)]
     told = [f"axis.{name}.{doubt.key} is unlikely: {doubt.text}" for name, doubt in found]
+    text = 'is that of a rotary axis and not used; give unit = "deg" too, or leave it out'
+    flat = [name for name, axis in config.axis.items() if axis.unit == "mm" and axis.radius_mm is not None]
+    told += [f"axis.{name}.radius_mm {text}" for name in flat]
     sections = ("voltage", "temperature", "table")
     places = [(f"axis.{name}.{key}", getattr(axis, key)) for name, axis in config.axis.items() for key in sections]
     places.append(("nc_source.modbus_coil", config.nc_source.modbus_coil))

@@ -109,6 +109,12 @@ def planes(reference: Trajectory, rows: slice = slice(None)) -> list[tuple[str, 
     return [(a, b) if order.index(a) < order.index(b) else (b, a) for a, b in pairs]
 
 
+def _names(reference: Trajectory, plane: tuple[str, str]) -> tuple[str, str]:
+    """Return what a map's edges are called; a rotary axis is drawn as the length of arc at its radius."""
+    across, along = (f"{axis} along its rim" if axis in reference.mm_per_degree else axis for axis in plane)
+    return across, along
+
+
 def _flat(reference: Trajectory, positions: Prediction | None, plane: tuple[str, str]) -> Float:
     """Return the reference's, or a prediction's, path (n, 2) in a plane."""
     path = reference.path_mm if positions is None else reference.table_mm(positions.predicted_mm)
@@ -125,7 +131,7 @@ def _along(cases: Sequence[tuple[str, Prediction]]) -> Section:
         named = [Place(str(k), *path[row]) for k, (_, row) in enumerate(worst_places(cases[0][1]), 1)]
         for label, predicted in cases:
             caption = f"{label}, plane {plane[0]}{plane[1]}: {_um(float(predicted.contour_um.max()))} at most{same}"
-            picture = figures.error_map(path, predicted.contour_um, largest, plane, named, least)
+            picture = figures.error_map(path, predicted.contour_um, largest, _names(reference, plane), named, least)
             pictures.append((caption, picture))
     errors = {label: predicted.contour_um for label, predicted in cases}
     pictures.append(("Contour error over time", figures.contour_errors(reference.dt_s, errors)))
@@ -206,7 +212,9 @@ def _place(cases: Sequence[tuple[str, Prediction]], zone: Zone, row: int) -> tup
     reach = NEAR_MIDDLE * half * np.array([1.0, figures.TALL])
     across, along = np.clip((low + high) / 2, worst_mm - reach, worst_mm + reach)
     larger = f", errors {factor} times as large" if factor > 1 else ""
-    return caption + larger, figures.corner(curves, (float(across), float(along)), half, plane, on_path=False)
+    return caption + larger, figures.corner(
+        curves, (float(across), float(along)), half, _names(reference, plane), on_path=False
+    )
 
 
 def nearest_mm(predicted: Prediction, rows: slice) -> Float:
