@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from pydantic import Field, ValidationInfo, model_validator
 
@@ -184,5 +185,8 @@ class MachineConfig(Section):
         # of a linear axis as before there were others, so that no record is void
         rotary = {"unit", "radius_mm"}
         linear = {n: {"max_difference_um", *(rotary if axis.unit == "mm" else ())} for n, axis in self.axis.items()}
-        told = self.model_dump_json(exclude={**dict.fromkeys(BESIDE_THE_MACHINE, True), "axis": linear})
+        unused: dict[str, Any] = {**dict.fromkeys(BESIDE_THE_MACHINE, True), "axis": linear}
+        if not self.nc.wrapped_axes:
+            unused["nc"] = {"wrapped_axes"}
+        told = self.model_dump_json(exclude=unused)
         return hashlib.sha256(f"{told}{files}".encode()).hexdigest()[:16]

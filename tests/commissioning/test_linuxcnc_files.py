@@ -129,6 +129,11 @@ def test_a_rotary_axis_is_read_in_degrees_and_the_second_joint_of_a_gantry_as_a_
     assert found.notes == ["LinuxCNC lets go A -720 to 720 deg: give `fdhil commission --room` no more than that"]
 
 
+def test_wrapped_rotary_axis_is_told(tmp_path: Path) -> None:
+    ini = ROTARY_AND_GANTRY.replace("[AXIS_A]", "[AXIS_A]\nWRAPPED_ROTARY = 1")
+    assert told(machine(tmp_path, ini))["nc.wrapped_axes"] == ["A"]
+
+
 def test_radians_become_degrees_and_other_angles_are_refused(tmp_path: Path) -> None:
     ini = ROTARY_AND_GANTRY.replace("ANGULAR_UNITS = degree", "ANGULAR_UNITS = radian")
     assert told(machine(tmp_path, ini))["axis.A.rapid_speed_deg_s"] == pytest.approx(math.degrees(90.0))

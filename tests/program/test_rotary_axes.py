@@ -9,7 +9,7 @@ import pytest
 
 from fdhil.config import MachineConfig, parse
 from fdhil.errors import ProgramError, RecordingError
-from fdhil.program import interpret, plan
+from fdhil.program import Budget, Rapid, interpret, plan
 from fdhil.program.demand_csv import read_demand_csv, write_demand_csv
 from fdhil.records import Float, Trajectory
 from tests.bench import bench_document, rotary_and_gantry_document, rotary_axis
@@ -168,3 +168,25 @@ def test_demand_beyond_the_limits_of_a_rotary_axis_is_noted_in_degrees(tmp_path:
     path.write_text("time_s,X_mm,Y_mm,A_deg\n" + "".join(f"{k / 1000:.3f},0,0,{0.4 * k}\n" for k in range(99)))
     texts = [note.text for note in read_demand_csv(path, parse(document)).notes]
     assert any(text.startswith("axis A moves at 400 deg/s at") and "rapid_speed_deg_s is 280" in text for text in texts)
+
+
+WRAPPED = (["A90", "A270", "A10", "A-350", "A-10", "A0", "A-0"], [90.0, 270.0, 370.0, 350.0, 10.0, 360.0, 360.0])
+"""Words, and where LinuxCNC 2.9 goes with WRAPPED_ROTARY = 1 (rs274 -i)."""
+
+
+def test_absolute_words_of_a_wrapped_axis_turn_by_their_sign() -> None:
+    config = machine(wrapped_axes=["A"])
+    words, ends = WRAPPED
+    found = list(interpret([f"G0 {word}" for word in words], Budget.of(config.nc)))
+    assert [motion.rotary[0].end for motion in found if isinstance(motion, Rapid)] == ends
+    demand = plan(found, config)
+    assert turned(demand, config)[-1] == pytest.approx(360.0)
+
+
+def test_absolute_word_of_more_than_one_turn_is_refused_on_a_wrapped_axis() -> None:
+    budget = Budget.of(machine(wrapped_axes=["A"]).nc)
+    with pytest.raises(ProgramError, match="line 1, 'A400': 400 is no position of a wrapped rotary axis"):
+        list(interpret(["G90 G0 A400"], budget))
+    assert [motion.rotary[0].end for motion in interpret(["G91 G0 A400"], budget) if isinstance(motion, Rapid)] == [
+        400.0
+    ]

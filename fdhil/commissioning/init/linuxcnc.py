@@ -260,6 +260,9 @@ def _axis(ini: Ini, hal: Hal, letter: str, joint: int, unit: _Unit, machine: Mac
     told, here, rotary, factor = machine.told, f"axis.{letter}", unit.name == "deg", unit.factor
     if rotary:
         told[f"{here}.unit"] = Told("deg", f"LinuxCNC: axis {letter} is rotary")
+        if ini.number(f"AXIS_{letter}", "WRAPPED_ROTARY"):
+            before = told["nc.wrapped_axes"].value if "nc.wrapped_axes" in told else []
+            told["nc.wrapped_axes"] = Told([*before, letter], "LinuxCNC: WRAPPED_ROTARY")
     most = f"MAX_{'ANGULAR' if rotary else 'LINEAR'}_VELOCITY"
     path = ini.number("TRAJ", most)
     value, source = _limit(ini, letter, joint, "MAX_VELOCITY", machine)
