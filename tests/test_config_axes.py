@@ -148,6 +148,31 @@ def test_what_cannot_be_is_refused_with_its_key(change: Change, expected: str) -
     assert expected in str(caught.value)
 
 
+@pytest.mark.parametrize("value", [None, True, "x", [], {}, [1, 2], {"a": 1}, float("nan"), float("inf"), -1, 10**400])
+@pytest.mark.parametrize("key", ["axis", "unit", "radius_mm", "rapid_speed_deg_s", "correction", "drive", "sim"])
+def test_wrong_kind_of_value_is_a_fault_of_the_configuration(key: str, value: object) -> None:
+    """None: the key is missing. The conversion of angles leaves to the models what only they can refuse."""
+    document = rotary_and_gantry_document()
+    document["sim"] = {"axis": {"A": {}}}
+    tables = [document] if key in ("axis", "sim") else [document["axis"]["A"], document["axis"]["Y"]]
+    for table in tables:
+        table.pop(key, None)
+        if value is not None:
+            table[key] = value
+    if (key, value) in [
+        ("correction", None),
+        ("correction", {}),
+        ("drive", None),
+        ("sim", None),
+        ("drive", {}),
+        ("sim", {}),
+    ]:
+        assert config.parse(document).axis["A"].mm_per_unit > 1.0
+    else:
+        with pytest.raises(ConfigError):
+            config.parse(document)
+
+
 def test_radius_of_a_linear_axis_is_questioned_and_not_used() -> None:
     document = bench_document("X")
     document["axis"]["X"]["radius_mm"] = 80.0

@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from fdhil.config.section import is_second_drive
+from fdhil.config.section import LARGEST, is_second_drive
 from fdhil.errors import ConfigFault
 
 _OWN_SENSORS = ("table", "accelerometer", "temperature", "voltage")
@@ -38,11 +38,14 @@ def rotary_axes(document: Mapping[str, Any]) -> dict[str, float]:
     axes = {name: _table(axis) for name, axis in _table(document.get("axis")).items()}
     rotary = {name: axis for name, axis in axes.items() if axis.get("unit") == "deg" or any("_deg" in k for k in axis)}
     radii = {name: axis.get("radius_mm") for name, axis in rotary.items()}
-    return {name: mm_per_degree(float(r)) if r is not None and _is_length(r) else 1.0 for name, r in radii.items()}
+    return {
+        name: mm_per_degree(float(r)) if r is not None and _is_number(r) and r > 0 else 1.0 for name, r in radii.items()
+    }
 
 
-def _is_length(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0.0 < value < math.inf
+def _is_number(value: Any) -> bool:
+    """Whether a value is a number that the models do not refuse anyway."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
 
 
 def complete(document: Mapping[str, Any], faults: list[ConfigFault]) -> dict[str, Any]:
@@ -122,4 +125,4 @@ def _scaled(value: Any, factor: float) -> Any:
     """Return a number, or a list of them, times ``factor``; anything else is left for the models to refuse."""
     if isinstance(value, list | tuple):
         return [_scaled(item, factor) for item in value]
-    return value * factor if isinstance(value, int | float) and not isinstance(value, bool) else value
+    return value * factor if _is_number(value) else value
