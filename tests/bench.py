@@ -62,3 +62,20 @@ def bench_toml(axes: str = "XY", corrected: bool = True, **changes: Any) -> str:
 def bench_config(axes: str = "XY", folder: Path = Path()) -> config.MachineConfig:
     """Return the bench's configuration; its store is below ``folder``."""
     return config.parse(bench_document(axes), folder=folder)
+
+
+def rotary_axis(radius_mm: float = 100.0, **changes: Any) -> dict[str, Any]:
+    """Return the table of the bench's axis as a rotary one: a worm of 30 to 1, in degrees."""
+    axis = bench_axis(False, unit="deg", radius_mm=radius_mm)
+    for key in ("screw_pitch_mm", "rapid_speed_mm_s", "max_acceleration_mm_s2"):
+        del axis[key]
+    axis |= {"screw_pitch_deg": 12.0, "rapid_speed_deg_s": 280.0, "max_acceleration_deg_s2": 2300.0}
+    axis["correction"] = {"max_offset_mdeg": 140.0, "max_speed_deg_s": 11.0, "max_acceleration_deg_s2": 1100.0}
+    return axis | changes
+
+
+def rotary_and_gantry_document(**nc: Any) -> dict[str, Any]:
+    """Return a mill with X, a gantry axis Y of the drives Y and Y2, and a rotary axis A; ``nc`` is its [nc]."""
+    document = bench_document("XY")
+    document["axis"] |= {"Y2": {"drive": {"sign": -1}}, "A": rotary_axis()}
+    return document | ({"nc": nc} if nc else {})

@@ -24,7 +24,7 @@ from fdhil.model.closed_loop import State
 from fdhil.model.kernels import CURRENT
 from fdhil.prediction.contour import contour_error_um
 from fdhil.prediction.model_terms import Band, band
-from fdhil.records import Float, Parameters, rms
+from fdhil.records import Float, Parameters, rms, table_path
 
 ALONE_S, JOINED_S = 0.9, 1.4  # from where on rows go over into the checked ones, and where they are those
 AT_START_INCREMENTS = 1.5
@@ -162,9 +162,9 @@ class FirstBlock:
         )
 
     def _better(self, found: Mapping[str, _Found]) -> bool:
-        around = np.column_stack([self._path[axis] for axis in found])
+        around = table_path((*found,), np.column_stack([self._path[axis] for axis in found]))
         old_um, new_um = (
-            rms(contour_error_um(around, np.column_stack(positions), self._period_s, 0))
+            rms(contour_error_um(around, table_path((*found,), np.column_stack(positions)), self._period_s, 0))
             for positions in ([one.old_mm for one in found.values()], [one.new_mm for one in found.values()])
         )
         return new_um < old_um

@@ -20,7 +20,7 @@ from fdhil.correction.learning import Lesson, learn
 from fdhil.correction.limits import fit_all
 from fdhil.prediction import contour_error_um
 from fdhil.prediction.behind_motor import ahead_of_motor_mm
-from fdhil.records import Float, Parameters, Reason, rms
+from fdhil.records import Float, Parameters, Reason, rms, table_path
 from fdhil.store.lessons import lesson_path, read_lesson, write_lesson
 
 MOST_ROWS = 1_000_000
@@ -51,7 +51,8 @@ class Pupil:
             axis: (delayed(path, tau_s / period_s) - position_mm[:, k]) * 1e3
             for k, (axis, path) in enumerate(self.demand_mm.items())
         }
-        left_um = rms(contour_error_um(planned, position_mm, period_s))
+        path, table = (table_path((*self.demand_mm,), rows) for rows in (planned, position_mm))
+        left_um = rms(contour_error_um(path, table, period_s))
         lesson = learn(self.lesson, error_um, left_um, self.models, self.config)
         write_lesson(self.path, lesson)
         return lesson

@@ -23,7 +23,7 @@ from fdhil.errors import StoreError
 from fdhil.prediction import contour_error_um
 from fdhil.prediction.contour import WINDOW_S
 from fdhil.prediction.gain import plus_minus
-from fdhil.records import AxisSamples, Float, Int, MoveKind, NcState, Notice, Parameters, Reason
+from fdhil.records import AxisSamples, Float, Int, MoveKind, NcState, Notice, Parameters, Reason, table_path
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 Rows = tuple[Int, Float, Float]
@@ -245,7 +245,8 @@ class Pass:
             position = self._position[self._first : end]
             if self._ahead_mm is not None:
                 position = position + self._ahead_mm[self._rows : self._rows + len(position)]
-            error = contour_error_um(self._demand, position, self._dt_s, self._first)
+            path, table = table_path(self._axes, self._demand), table_path(self._axes, position)
+            error = contour_error_um(path, table, self._dt_s, self._first)
             self._rows, self._left = self._rows + error.size, self._left - error.size
             self._squares += float(error @ error)
             self._max_um = max(self._max_um, float(error.max()))

@@ -113,7 +113,8 @@ class Teller:
         assert self._zero_ns is not None
         places: dict[str, float] = {}
         for joint, axis in enumerate(self._axes):
-            places.setdefault(axis, cycle.joints[joint] * self._mm)  # of two joints of an axis the first
+            # of two joints of an axis the first; degrees of A, B and C
+            places.setdefault(axis, cycle.joints[joint] * (1.0 if axis in "ABC" else self._mm))
         return {
             "cycle": cycle.number,
             "stamp_ns": round(self._zero_ns + cycle.number * self._period_ns),

@@ -133,7 +133,8 @@ def _circles(config: Path, asked: Asked, plane: tuple[str, str], from_history: b
 
 
 def _table_mm(predicted: Prediction, plane: tuple[str, str]) -> Float:
-    return np.column_stack([predicted.predicted_mm[axis] for axis in plane])
+    reference = predicted.reference
+    return reference.table_mm(predicted.predicted_mm)[:, [reference.table_axes.index(axis) for axis in plane]]
 
 
 def read_path(path: Path, plane: tuple[str, str]) -> Float:

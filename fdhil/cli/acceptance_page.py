@@ -52,7 +52,10 @@ def _verdict(found: Findings) -> Section:
         ["cycle", f"{machine.machine.sync_period_s * 1e3:g} ms"],
     ]
     for axis, section in machine.axis.items():
-        reach = f"{section.screw_pitch_mm:g} mm a turn, rapid {section.rapid_speed_mm_s * 0.06:g} m/min"
+        rapid = f"{section.rapid_speed_mm_s * 0.06:g} m/min"
+        if section.unit == "deg":
+            rapid = section.shown(section.rapid_speed_mm_s, "/s", "g")
+        reach = f"{section.shown(section.screw_pitch_mm, form='g')} a turn, rapid {rapid}"
         rows.append([f"axis {axis}", f"{reach}, at most {section.max_acceleration_mm_s2 / 1e3:g} m/s²"])
     points = [[str(number), point] for number, point in enumerate(found.open_points, 1)]
     tables = [Table(("", "open point"), points)] if points else []

@@ -204,5 +204,7 @@ def _ask(machine: MachineConfig, axis: str) -> None:
         f"The set-up of axis {axis} is as it must be. Now the drive is switched on and the axis moves by 10 um, "
         f"then up to {largest_move_um(machine, axis):.0f} um to and fro. Is it free to move, and may it?"
     )
+    if axis[0] + "2" in machine.axis:
+        question = f"{axis} is one of two drives of a gantry axis: its beam will be skewed by as much. {question}"
     advice = "nothing was moved or written; start again when it may move, with --yes where nobody can be asked"
     confirm(axis, question, advice)

@@ -62,14 +62,16 @@ def told(does: str, moves: str) -> str:
 
 
 def room_of(given: tuple[float, float] | None) -> Room | None:
-    """Return the room that was given, mm back and forward; click.BadParameter where it is none."""
+    """Return the room that was given, mm or degrees back and forward; click.BadParameter where it is none."""
     from fdhil.commissioning.strokes import Room
 
     if given is None:
         return None
     back, forward = given
     if not (-1e4 <= back <= 0.0 <= forward <= 1e4):
-        text = "--room wants two numbers of mm, 0 or less and 0 or more: how far it may go back, and forward"
+        text = (
+            "--room wants two numbers of mm (or degrees), 0 or less and 0 or more: how far it may go back, and forward"
+        )
         raise click.BadParameter(text)
     return Room(back, forward)
 

@@ -59,14 +59,16 @@ def moves_of(machine: MachineConfig, axis: str) -> dict[str, str]:
 
 def trial_moves(machine: MachineConfig, axis: str, room: Room) -> dict[str, str]:
     """Return what each step of the ``TRIAL`` moves; DriveFault where the room is too small."""
-    from fdhil.commissioning.strokes import plan_jog, plan_rapid
+    from fdhil.commissioning.strokes import plan_jog, plan_rapid, require_single_drive
     from fdhil.commissioning.trial import RAPIDS
 
+    require_single_drive(machine, axis)
     settings = machine.axis[axis]
     jog, rapid = plan_jog(axis, settings, room), plan_rapid(axis, settings, room)
+    steep = settings.shown(rapid.acceleration_mm_s2, "/s2", "g")
     return dict.fromkeys(TRIAL, NOTHING) | {
         "jog": f"{jog}, and back",
-        "test rapids": f"{rapid} with {rapid.acceleration_mm_s2:g} mm/s2, and back, {RAPIDS // 2} times",
+        "test rapids": f"{rapid} with {steep}, and back, {RAPIDS // 2} times",
     }
 
 

@@ -30,7 +30,8 @@ def try_commissioned(
     from fdhil.commissioning.trial import Operator, try_axis
 
     axis = record.axis
-    room = asked.room or (None if asked.yes else _asked_room(axis))
+    gantry = axis[0] + "2" in machine.axis  # of whose drives none is moved alone
+    room = asked.room or (None if asked.yes or gantry else _asked_room(axis, machine.axis[axis].unit))
     if room is None:
         asked.say(f"axis {axis} is not tried by moving it: no --room was given, so units, signs and model are unproven")
         return None
@@ -55,10 +56,10 @@ def try_commissioned(
     return dict(tried.found)
 
 
-def _asked_room(axis: str) -> Room | None:
+def _asked_room(axis: str, unit: str) -> Room | None:
     """Ask how far the axis may be moved; None where nobody allows it."""
     question = (
-        f"How far may axis {axis} go from here, for a jog and for rapids, in mm? Back and forward, as: -20 200; "
+        f"How far may axis {axis} go from here, for a jog and for rapids, in {unit}? Back and forward, as: -20 200; "
         "Enter: not at all"
     )
     said = answered(question)

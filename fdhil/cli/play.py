@@ -191,17 +191,18 @@ def _told(plan: Plan, program: Path) -> str:
     ]
     for axis, path in trajectory.position_mm.items():
         speed = abs(path[1:] - path[:-1]).max(initial=0.0) / trajectory.dt_s
-        lines.append(
-            f"  {axis} from {path[0]:.3f} to {path[-1]:.3f} mm, between {path.min():.3f} and {path.max():.3f} mm, "
-            f"at up to {speed:.1f} mm/s"
-        )
+        ends, least, most = path[[0, -1]], path.min(), path.max()
+        first, last, low, high = (plan.config.axis[axis].shown(mm, form=".3f") for mm in (*ends, least, most))
+        fastest = plan.config.axis[axis].shown(speed, "/s", ".1f")
+        lines.append(f"  {axis} from {first} to {last}, between {low} and {high}, at up to {fastest}")
     return "\n".join(lines)
 
 
 def _ask(bench: Bench, program: Path, here: list[int]) -> None:
     """Ask before anything moves; DriveFault when the answer is no, or nobody is there to give one."""
     ways = zip(bench.plan.axes, bench.away_mm(here), strict=True)
-    start = ", ".join(f"{axis} {way:+.3f} mm" for axis, way in ways if way)
+    shown = {axis: bench.plan.config.axis[axis] for axis in bench.plan.axes}
+    start = ", ".join(f"{axis} {shown[axis].shown(way, form='+.3f')}" for axis, way in ways if way)
     first = f"First the axes go slowly to the start ({start}). " if start else ""
     question = (
         f"The drives are as they were commissioned. {first}Then {program.name} is played. "

@@ -273,8 +273,10 @@ def _prediction_columns(predicted: Prediction) -> dict[str, tuple[Float, int]]:
     reference = predicted.reference
     columns: dict[str, tuple[Float, int]] = {"time_s": (reference.time_s, 6 if reference.dt_s >= 1e-5 else 9)}
     for axis in reference.axes:
-        columns[f"{axis}_reference_mm"] = (reference.position_mm[axis], 6)
-        columns[f"{axis}_predicted_mm"] = (predicted.predicted_mm[axis], 6)
+        unit = "deg" if axis in reference.mm_per_degree else "mm"
+        factor = reference.mm_per_degree.get(axis, 1.0)
+        columns[f"{axis}_reference_{unit}"] = (reference.position_mm[axis] / factor, 6)
+        columns[f"{axis}_predicted_{unit}"] = (predicted.predicted_mm[axis] / factor, 6)
         columns[f"{axis}_error_um"] = (predicted.error_um[axis], 4)
     columns["contour_error_um"] = (predicted.contour_um, 4)
     return columns

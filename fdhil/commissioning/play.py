@@ -160,8 +160,10 @@ class Bench:
             travel = records[master.axis].travel
             if travel is not None and not (travel[0] <= of.low and of.high <= travel[1]):
                 low, high = sorted(self._mm(master, limit) for limit in travel)
-                text = f"its software limits (0x607D) leave it {low:g} to {high:g} mm, less than [axis.{master.axis}"
-                raise DriveFault(master.device, f"{text}.setpoints] travel_mm; correct that")
+                axis = self._config.axis[master.axis]
+                leave = f"{low / axis.mm_per_unit:g} to {axis.shown(high, form='g')}"
+                text = f"its software limits (0x607D) leave it {leave}, less than [axis.{master.axis}"
+                raise DriveFault(master.device, f"{text}.setpoints] {axis.shown_key('travel_mm')}; correct that")
 
     def _require_one_counter(self) -> None:
         counters = {read_optional(master, Object.SYNC_COUNTER_OVERFLOW) or 0 for master in self.masters}
@@ -190,14 +192,19 @@ class Bench:
         """DriveFault where an axis is outside its travel, or not at the start and nobody said that it may go there."""
         for master, at, away, of in zip(self.masters, here, self.away_mm(here), self.plan.bounds, strict=True):
             if not of.low <= at <= of.high:
-                text = f"it stands at {self._mm(master, at):.3f} mm, outside its travel; bring it inside by hand"
+                stands = self._shown(master, self._mm(master, at))
+                text = f"it stands at {stands}, outside its travel; bring it inside by hand"
                 raise DriveFault(master.device, text)
             if abs(away) > NEAR_MM and not go_to_start:
-                text = f"it stands at {self._mm(master, at):.3f} mm, {abs(away):.3f} mm from the start of the demand"
+                stands, off = (self._shown(master, mm) for mm in (self._mm(master, at), abs(away)))
+                text = f"it stands at {stands}, {off} from the start of the demand"
                 raise DriveFault(master.device, f"{text}; move it there, or let it go there slowly with --go-to-start")
 
     def _mm(self, master: Master, increments: float) -> float:
         return self._config.axis[master.axis].scaling.to_mm(increments)
+
+    def _shown(self, master: Master, mm: float) -> str:
+        return self._config.axis[master.axis].shown(mm, form=".3f")
 
     # the drives are led
 

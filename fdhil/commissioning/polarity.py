@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from fdhil.commissioning.finding import Finding
+from fdhil.config import Axis
 from fdhil.records import Float, Recording
 
 SPEED_TOLERANCE = 0.05
@@ -20,14 +21,15 @@ RESTING = 0.2  # of the top speed: slower rows tell of offsets and rounding
 CODE = "SignOrScale"
 
 
-def judge_jog(jog: Recording, distance_mm: float) -> Iterator[Finding]:
+def judge_jog(jog: Recording, distance_mm: float, axis: Axis) -> Iterator[Finding]:
     """Compare what was heard of a jog over ``distance_mm`` and back with what an axis with right units shows."""
     asked = abs(distance_mm)
     way = float(np.nanmax(np.abs(jog.position_mm - jog.position_mm[np.isfinite(jog.position_mm)][0])))
-    cause = f"{CODE}: it was to go {asked:g} mm and its position (0x6064) went {way:.3f}"
+    wanted, went = axis.shown(asked, form="g"), axis.shown(way, form=".3f")
+    cause = f"{CODE}: it was to go {wanted} and its position (0x6064) went {went}"
     same = abs(way - asked) <= TRAVEL_TOLERANCE * asked
     advice = "its set-point and its position count differently; correct its factors (0x6091, 0x6092)"
-    yield Finding("travel", f"{asked:g} mm", f"{way:.3f} mm", same, cause, advice)
+    yield Finding("travel", wanted, went, same, cause, advice)
     yield _speed(jog)
     yield from _table(jog)
     power = signed_power(jog)

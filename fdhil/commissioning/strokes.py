@@ -6,9 +6,9 @@ What the set-points of a stroke are is the business of ``set_points``.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from fdhil.config import Axis
+from fdhil.config import Axis, MachineConfig
 from fdhil.errors import DriveFault
 from fdhil.identification.windows import PLATEAU_S, RAPID_SHARE
 
@@ -24,24 +24,25 @@ SLOWEST = RAPID_SHARE + 0.05  # of the rapid speed: what is slower counts as a f
 
 @dataclass(frozen=True, slots=True)
 class Room:
-    """How far an axis may go from where it stands, mm: back (0 or less) and forward (0 or more)."""
+    """How far an axis may go from where it stands, in its unit: back (0 or less) and forward (0 or more)."""
 
-    back_mm: float
-    forward_mm: float
+    back: float
+    forward: float
 
     @property
-    def farthest_mm(self) -> float:
+    def farthest(self) -> float:
         """The side with more room, with its sign."""
-        return self.forward_mm if self.forward_mm >= -self.back_mm else self.back_mm
+        return self.forward if self.forward >= -self.back else self.back
 
     def __str__(self) -> str:
-        return f"{self.back_mm:+g} to {self.forward_mm:+g} mm"
+        return f"{self.back:+g} to {self.forward:+g}"
 
 
 @dataclass(frozen=True, slots=True)
 class Stroke:
-    """One move from rest to rest: signed distance, and the largest speed, acceleration and jerk."""
+    """One move of an axis from rest to rest: signed distance, and the largest speed, acceleration and jerk."""
 
+    axis: Axis
     distance_mm: float
     speed_mm_s: float
     acceleration_mm_s2: float
@@ -49,22 +50,32 @@ class Stroke:
 
     def back(self) -> Stroke:
         """Return the same move the other way."""
-        return Stroke(-self.distance_mm, self.speed_mm_s, self.acceleration_mm_s2, self.jerk_mm_s3)
+        return replace(self, distance_mm=-self.distance_mm)
 
     def __str__(self) -> str:
         toward = "plus" if self.distance_mm > 0 else "minus"
-        return f"{abs(self.distance_mm):g} mm toward {toward} at {self.speed_mm_s:.3g} mm/s"
+        way, speed = self.axis.shown(abs(self.distance_mm), form="g"), self.axis.shown(self.speed_mm_s, "/s", ".3g")
+        return f"{way} toward {toward} at {speed}"
+
+
+def require_single_drive(config: MachineConfig, axis: str) -> None:
+    """DriveFault for a drive of a gantry axis, which must not move without the other."""
+    both = [name for name in config.axis if name[0] == axis[0]]
+    if len(both) > 1:
+        text = f"{' and '.join(both)} move one beam, and one of them alone would skew it; nothing was moved"
+        raise DriveFault(f"drive {axis}", f"{text}: leave --room out, and let the NC make rapids")
 
 
 def plan_jog(axis: str, settings: Axis, room: Room) -> Stroke:
     """Return the jog, toward the side with more room; DriveFault where there is too little."""
-    side = USED * room.farthest_mm
+    side = USED * room.farthest * settings.mm_per_unit
     if abs(side) < LEAST_JOG_MM:
-        text = f"there is room from {room} for the jog, which needs {LEAST_JOG_MM:g} mm to one side"
+        least = settings.shown(LEAST_JOG_MM, form=".3g")
+        text = f"there is room from {room} {settings.unit} for the jog, which needs {least} to one side"
         raise DriveFault(f"drive {axis}", f"{text}; give it more with --room, or leave --room out to move nothing")
     acceleration = min(JOG_ACCELERATION_MM_S2, GENTLE * settings.max_acceleration_mm_s2)
     speed = min(JOG_MM_S, GENTLE * settings.top_speed_mm_s)
-    return Stroke(math.copysign(min(JOG_MM, abs(side)), side), speed, acceleration, 10 * acceleration)
+    return Stroke(settings, math.copysign(min(JOG_MM, abs(side)), side), speed, acceleration, 10 * acceleration)
 
 
 def plan_rapid(axis: str, settings: Axis, room: Room) -> Stroke:
@@ -72,7 +83,7 @@ def plan_rapid(axis: str, settings: Axis, room: Room) -> Stroke:
 
     As fast as G0, or as the room allows; DriveFault where that would be no rapid any more.
     """
-    side, top = USED * room.farthest_mm, settings.rapid_speed_mm_s
+    side, top = USED * room.farthest * settings.mm_per_unit, settings.rapid_speed_mm_s
     limits = settings.setpoints
     fastest = (limits.max_speed_mm_s if limits else None) or top
     steepest = (limits.max_acceleration_mm_s2 if limits else None) or settings.max_acceleration_mm_s2
@@ -81,12 +92,15 @@ def plan_rapid(axis: str, settings: Axis, room: Room) -> Stroke:
     spent_s = acceleration / jerk + CRUISE_S
     fits = acceleration / 2 * (math.sqrt(spent_s**2 + 4 * abs(side) / acceleration) - spent_s)
     if fastest < SLOWEST * top:
-        text = f"[axis.{axis}.setpoints] allows {fastest:g} mm/s where G0 is {top:g}, so that no rapid can be tried"
-        raise DriveFault(f"drive {axis}", f"{text}; raise its max_speed_mm_s, or leave --room out")
+        most, rapid = settings.shown(fastest, "/s", "g"), settings.shown(top, "/s", "g")
+        text = f"[axis.{axis}.setpoints] allows {most} where G0 is {rapid}, so that no rapid can be tried"
+        key = settings.shown_key("max_speed_mm_s")
+        raise DriveFault(f"drive {axis}", f"{text}; raise its {key}, or leave --room out")
     if fits < SLOWEST * top:
         least = SLOWEST * top * (SLOWEST * top / acceleration + spent_s)
-        text = f"there is room from {room} for test rapids, which need {math.ceil(least / USED)} mm to one side"
+        needed = f"{math.ceil(least / USED / settings.mm_per_unit)} {settings.unit}"
+        text = f"there is room from {room} {settings.unit} for test rapids, which need {needed} to one side"
         raise DriveFault(f"drive {axis}", f"{text}; move the axis away from its end, and give it more with --room")
     speed = min(top, fits, fastest)
     way = min(abs(side), speed * (speed / acceleration + spent_s))
-    return Stroke(math.copysign(way, side), speed, acceleration, jerk)
+    return Stroke(settings, math.copysign(way, side), speed, acceleration, jerk)

@@ -24,9 +24,10 @@ def travel_of(master: Master, record: CommissioningRecord, room: Room, given: Tr
 
     ``given`` is the travel of the trial that was stopped: the same words from another place mean another one.
     """
-    scaling, said = master.config.axis[master.axis].scaling, master.config.axis[master.axis].setpoints
+    settings = master.config.axis[master.axis]
+    scaling, said, unit = settings.scaling, settings.setpoints, settings.mm_per_unit
     here = scaling.to_mm(master.heard.objects[master.profile.position])
-    low, high = here + room.back_mm, here + room.forward_mm
+    low, high = here + room.back * unit, here + room.forward * unit
     limits: dict[str, Travel] = {}
     if record.travel is not None:
         limits["its software limits (0x607D)"] = Travel(*sorted(scaling.to_mm(limit) for limit in record.travel))
@@ -36,7 +37,8 @@ def travel_of(master: Master, record: CommissioningRecord, room: Room, given: Tr
         limits["the room that the trial began with"] = Travel(given.low_mm - SLACK_MM, given.high_mm + SLACK_MM)
     for by, (least, most) in limits.items():
         if low < least or high > most:
-            text = f"it stands at {here:.3f} mm and may go from {least:g} to {most:g} mm by {by}, not {room} from here"
+            text = f"it stands at {settings.shown(here, form='.3f')} and may go from {least / unit:g} to "
+            text += f"{settings.shown(most, form='g')} by {by}, not {room} {settings.unit} from here"
             advice = "give it another --room, or move it away from its end; --again begins a new trial"
             raise DriveFault(master.device, f"{text}; {advice}")
     return Travel(low, high)

@@ -16,7 +16,7 @@ from fdhil.commissioning.polarity import judge_acceleration, judge_jog
 from fdhil.commissioning.progress import Found, Progress
 from fdhil.commissioning.record import CommissioningRecord
 from fdhil.commissioning.steps import enable, holds_for, prepare, rolled_back
-from fdhil.commissioning.strokes import Room, Stroke, plan_jog, plan_rapid
+from fdhil.commissioning.strokes import Room, Stroke, plan_jog, plan_rapid, require_single_drive
 from fdhil.commissioning.stroking import Travel, stroke, travel_of
 from fdhil.commissioning.survey import listen, require, survey
 from fdhil.commissioning.timing import judge_answers, judge_sync, measure
@@ -70,6 +70,7 @@ def try_axis(
     DriveFault when something differs or is not believed, and as commissioning does, after everything was rolled back.
     """
     axis, trial = record.axis, Trial()
+    require_single_drive(config, axis)
     jog, rapid = plan_jog(axis, config.axis[axis], room), plan_rapid(axis, config.axis[axis], room)
     with Master(config, axis) as master:
         listen(master)
@@ -167,7 +168,7 @@ def jog_to_and_fro(master: Master, travel_mm: Travel, jog: Stroke, operator: Ope
         for moved in (jog, jog.back()):
             stroke(master, travel_mm, moved, JOG_REST_S)
         wait_heard(master, heard)
-    findings = list(judge_jog(heard.recording(), jog.distance_mm))
+    findings = list(judge_jog(heard.recording(), jog.distance_mm, jog.axis))
     require(master, findings)
     saw = operator.saw(f"The drive went {jog}, and back. Is that what you saw the table do?")
     if saw is False:

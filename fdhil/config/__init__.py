@@ -25,7 +25,7 @@ from fdhil.config.position_range import PositionRange
 from fdhil.config.reading import load, load_places, parse, read_toml, toml_document, unlikely
 from fdhil.config.reality import Reality
 from fdhil.config.regulators import Regulators
-from fdhil.config.section import Section
+from fdhil.config.section import Section, is_second_drive
 from fdhil.config.sensors import Thermometer, Voltage
 from fdhil.config.service import Access, Maintenance
 from fdhil.config.simulation import Noise, SimAxis, Thermal
@@ -60,6 +60,7 @@ __all__ = [
     "Thermal",
     "Thermometer",
     "Voltage",
+    "is_second_drive",
     "load",
     "load_places",
     "parse",

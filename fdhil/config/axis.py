@@ -11,6 +11,7 @@ from pydantic import Field, PrivateAttr, field_validator
 
 from fdhil import tables
 from fdhil.cia402 import Scaling
+from fdhil.config.axis_tables import angular, mm_per_degree
 from fdhil.config.regulators import Regulators
 from fdhil.config.section import Finite, NotNegative, Positive, Section, one_of
 from fdhil.config.sensors import Thermometer, Voltage
@@ -137,8 +138,15 @@ class Drive(Section):
 
 
 class Axis(Section):
-    """[axis.X]"""
+    """[axis.X]; [axis.X2] is the second drive of a gantry axis and takes the keys of [axis.X] that it has not.
 
+    A rotary axis is written in degrees, as rapid_speed_deg_s for rapid_speed_mm_s; its um are those at radius_mm.
+    """
+
+    unit: Literal["mm", "deg"] = Field("mm", description="deg: a rotary axis, whose keys have deg in place of mm")
+    radius_mm: Positive | None = Field(
+        None, ge=10.0, le=1e4, description="of a rotary axis: the radius at which its angles count as path error"
+    )
     screw_pitch_mm: Positive = Field(ge=1e-3, le=1e4, description="table travel per motor revolution")
     rapid_speed_mm_s: Positive = Field(ge=1e-3, le=1e5, description="speed of G0")
     max_acceleration_mm_s2: Positive = Field(ge=1e-2, le=1e6, description="acceleration of G0")
@@ -156,6 +164,9 @@ class Axis(Section):
         "response has it; left out: sought where replays of rapids leave much, else the table is where the motor is",
     )
     resonance_damping: NotNegative = Field(0.03, le=0.7, description="damping ratio of that resonance")
+    max_difference_um: Positive | None = Field(
+        None, le=1e4, description="of a gantry axis: how far its two drives may be apart; left out: 500"
+    )
     nominal: Nominal
     regulators: Regulators
     correction: CorrectionLimits | None = None
@@ -166,6 +177,24 @@ class Axis(Section):
     temperature: Thermometer | None = None
     table: TableEncoder | None = None
     accelerometer: Accelerometer | None = None
+
+    @property
+    def largest_difference_um(self) -> float:
+        """How far the two drives of a gantry axis may be apart."""
+        return self.max_difference_um or 500.0
+
+    @property
+    def mm_per_unit(self) -> float:
+        """Millimetres per unit of the axis: 1, or the length of arc of one degree at ``radius_mm``."""
+        return 1.0 if self.radius_mm is None or self.unit == "mm" else mm_per_degree(self.radius_mm)
+
+    def shown(self, mm: float, per: str = "", form: str = ".4g") -> str:
+        """Return a position, speed ("/s") or acceleration ("/s2") in the axis' unit."""
+        return f"{mm / self.mm_per_unit:{form}} {self.unit}{per}"
+
+    def shown_key(self, key: str) -> str:
+        """Return the name of a key as it is written for this axis."""
+        return angular(key) if self.unit == "deg" else key
 
     @property
     def jerk_mm_s3(self) -> float:

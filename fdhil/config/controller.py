@@ -41,6 +41,11 @@ class Nc(Section):
         description="a length or angle without a decimal point: whole units as LinuxCNC, thousandths of mm and degree "
         "(tenths of that in inch; Haas and Fanuc by default), or thousandths_and_feed: F too (Haas by default)",
     )
+    wrapped_axes: tuple[Literal["A", "B", "C"], ...] = Field(
+        (),
+        description="rotary axes whose absolute words are within one turn and turn by their sign (LinuxCNC: "
+        "[AXIS_A] WRAPPED_ROTARY)",
+    )
     max_blocks: int = Field(
         10_000_000, ge=1, le=10**12, description="blocks a program may execute before it is refused"
     )

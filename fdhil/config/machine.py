@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from pydantic import Field, ValidationInfo, model_validator
 
@@ -17,7 +18,7 @@ from fdhil.config.offset_bounds import limit_faults
 from fdhil.config.plausible import doubts
 from fdhil.config.publish import Publish
 from fdhil.config.regulators import period_faults
-from fdhil.config.section import AxisName, Positive, Section, ShownName
+from fdhil.config.section import AxisName, Positive, Section, ShownName, is_second_drive
 from fdhil.config.sensors import WORDS, LineUser, line_faults, line_user
 from fdhil.config.service import Access, Guard, Maintenance, Play, Store
 from fdhil.config.simulation import Sim
@@ -25,6 +26,7 @@ from fdhil.config.uplink import Uplink
 from fdhil.config.web import Web
 
 BESIDE_THE_MACHINE = {"access", "web", "publish", "uplink", "offers"}
+_OF_A_MOVE = ("rapid_speed_mm_s", "max_acceleration_mm_s2", "max_jerk_mm_s3")
 
 
 class Machine(Section):
@@ -71,6 +73,11 @@ class MachineConfig(Section):
             found = [] if (info.context or {}).get("made_up") else doubts(axis)
             faults += [f"axis.{name}.{doubt.key}: {doubt.text}" for doubt in found if limits or not doubt.possible]
             faults += limits
+            if axis.unit == "deg" and axis.radius_mm is None:
+                faults.append(f"axis.{name}.radius_mm: is missing: angles count as path error at a radius; give it")
+            if axis.unit == "deg" and name[0] in "XYZUVW":
+                faults.append(f"axis.{name}.unit: programs give {name[0]} in mm; name a rotary axis A, B or C")
+        faults += self._gantry_faults()
         faults += line_faults(self._line_users())
         faults += self._node_faults()
         faults += [f"sim.axis.{name}: there is no [axis.{name}]" for name in self.sim.axis if name not in self.axis]
@@ -79,6 +86,21 @@ class MachineConfig(Section):
         if faults:
             raise ValueError("\n".join(faults))
         return self
+
+    def _gantry_faults(self) -> Iterator[str]:
+        """Yield what both drives of a gantry axis must have in common, and what one of them lacks."""
+        for name in filter(is_second_drive, self.axis):
+            first, second = self.axis[name[0]], self.axis[name]
+            for key in ("unit", "radius_mm", "screw_pitch_mm", *_OF_A_MOVE):
+                if getattr(first, key) != getattr(second, key):
+                    yield f"axis.{name}.{first.shown_key(key)}: differs from axis.{name[0]}, and both move one beam"
+            if first.setpoints is not None or second.setpoints is not None:
+                text = "fdhil sends set-points to no drive of a gantry axis: one alone would skew the beam"
+                yield f"axis.{name[0]}.setpoints: {text}; leave the section out"
+            if first.drive.bus != second.drive.bus:
+                yield f"axis.{name}.drive.bus: both drives of axis {name[0]} are on one bus, whose SYNC they share"
+            if (first.correction is None) != (second.correction is None):
+                yield f"axis.{name}.correction: both drives of axis {name[0]} are corrected, or neither; give both"
 
     def _node_faults(self) -> Iterator[str]:
         """Yield what would make two senders of one COB-ID."""
@@ -89,9 +111,12 @@ class MachineConfig(Section):
             if node_id in drives:
                 yield f"{section}.node_id: it is that of drive {drives[node_id]}; both send a heartbeat"
         # the PDOs of a device's second axis are those of the next node-ID
-        ids = {(axis.drive.bus, self.node_id(name) + axis.drive.logical_axis) for name, axis in self.axis.items()}
-        if len(ids) < len(self.axis):
-            yield "axis: two drives of one bus have the same node_id"
+        ids: dict[tuple[str, int], str] = {}
+        for name, axis in self.axis.items():
+            other = ids.setdefault((axis.drive.bus, self.node_id(name) + axis.drive.logical_axis), name)
+            if other != name:
+                text = f"two drives of one bus have the same node_id; {other} and {name} need one each"
+                yield f"axis.{name}.drive.node_id: {text}"
         places: dict[tuple[str, ...], str] = {}
         for name, bus in self.bus.items():
             if bus.place is not None and places.setdefault(bus.place, name) != name:
@@ -119,6 +144,11 @@ class MachineConfig(Section):
     def node_id(self, axis: str) -> int:
         """Return the CANopen node-ID of an axis' drive."""
         return self.axis[axis].drive.node_id or list(self.axis).index(axis) + 1
+
+    @property
+    def mm_per_degree(self) -> dict[str, float]:
+        """The length of arc of one degree at the radius of each rotary axis."""
+        return {name: axis.mm_per_unit for name, axis in self.axis.items() if axis.unit == "deg"}
 
     @property
     def run_directory(self) -> Path:
@@ -152,4 +182,11 @@ class MachineConfig(Section):
         Who may look at it, and over which network, is not the machine: a change there voids no record.
         """
         files = "".join(axis.drive.files_digest for axis in self.axis.values())
-        return hashlib.sha256(f"{self.model_dump_json(exclude=BESIDE_THE_MACHINE)}{files}".encode()).hexdigest()[:16]
+        # of a linear axis as before there were others, so that no record is void
+        rotary = {"unit", "radius_mm"}
+        linear = {n: {"max_difference_um", *(rotary if axis.unit == "mm" else ())} for n, axis in self.axis.items()}
+        unused: dict[str, Any] = {**dict.fromkeys(BESIDE_THE_MACHINE, True), "axis": linear}
+        if not self.nc.wrapped_axes:
+            unused["nc"] = {"wrapped_axes"}
+        told = self.model_dump_json(exclude=unused)
+        return hashlib.sha256(f"{told}{files}".encode()).hexdigest()[:16]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from fdhil.config.axis import Axis
+from fdhil.config.axis import CEILING_ACCELERATION_MM_S2, CEILING_OFFSET_UM, CEILING_SPEED_MM_S, Axis
 
 AXIS_SPEED_SHARE = 0.10  # an offset never takes more than this of the axis' own speed
 AXIS_ACCELERATION_SHARE = 0.50
@@ -88,6 +88,15 @@ def limit_faults(axis: Axis, sync_period_s: float) -> list[str]:
     """Say why the given limits cannot be kept: the increments are too coarse, or the way to zero is too long."""
     if axis.correction is None:
         return []
+    if axis.unit == "deg":
+        own, per_deg = axis.correction, axis.mm_per_unit
+        for key, value, most in (
+            ("max_offset_mdeg", own.max_offset_um / per_deg, CEILING_OFFSET_UM),
+            ("max_speed_deg_s", own.max_speed_mm_s / per_deg, CEILING_SPEED_MM_S),
+            ("max_acceleration_deg_s2", own.max_acceleration_mm_s2 / per_deg, CEILING_ACCELERATION_MM_S2),
+        ):
+            if value > most * (1 + 1e-9):
+                return [f"{key} is {value:.4g}; of a rotary axis at most {most:g} is sent, whatever its radius"]
     limits = OffsetBounds.given(axis, sync_period_s)
     if limits.too_coarse:
         return [_too_coarse(axis, limits)]

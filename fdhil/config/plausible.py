@@ -96,27 +96,31 @@ def doubts(axis: Axis) -> list[Doubt]:
     broken = [relation for relation in RELATIONS if not _within(relation.figure(numbers), relation.ordinary)]
     if not broken:
         return []
-    mended = [slip for slip in SLIPS if _mends(slip, numbers, broken)]
-    found = [_doubt(relation, numbers, mended) for relation in broken]
+    slips = [slip for slip in SLIPS if axis.shown_key(slip.key) == slip.key]  # angles are not mistaken for lengths
+    mended = [slip for slip in slips if _mends(slip, numbers, broken)]
+    found = [_doubt(axis, relation, numbers, mended) for relation in broken]
     found.sort(key=lambda doubt: doubt.possible)
     return found[:1] if mended else found  # one wrong unit has many consequences
 
 
-def _doubt(relation: Relation, numbers: Numbers, mended: list[Slip]) -> Doubt:
+def _doubt(axis: Axis, relation: Relation, numbers: Numbers, mended: list[Slip]) -> Doubt:
     figure = relation.figure(numbers)
     possible = _within(figure, relation.possible)
     low, high = relation.ordinary
     bounds = f"{low:g} to {high:g}" if low > 0 else f"at most {high:g}"
-    text = f"{_listed(relation, numbers)}: {relation.text} is {figure:.3g}{_spaced(relation.unit)}, "
+    text = f"{_listed(axis, relation, numbers)}: {relation.text} is {figure:.3g}{_spaced(relation.unit)}, "
     text += f"feed drives have {bounds}{_spaced(relation.unit)}"
     guesses = [f"{slip.key} = {numbers[slip.key] * slip.factor:.4g} ({numbers[slip.key]:g} {slip.unit})"
                for slip in mended[:MOST_NAMED]]  # fmt: skip
     text += f"; did you mean {' or '.join(guesses)}?" if guesses else "; check the units of these keys"
-    return Doubt(mended[0].key if mended else relation.keys[0], text, possible)
+    return Doubt(axis.shown_key(mended[0].key if mended else relation.keys[0]), text, possible)
 
 
-def _listed(relation: Relation, numbers: Numbers) -> str:
-    return ", ".join(f"{key.rpartition('.')[2]} = {numbers[key]:g}" for key in relation.keys)
+def _listed(axis: Axis, relation: Relation, numbers: Numbers) -> str:
+    """Return the numbers as they are written for the axis."""
+    shown = {key: axis.shown_key(key) for key in relation.keys}
+    factor = {key: 1.0 if shown[key] == key else axis.mm_per_unit for key in relation.keys}
+    return ", ".join(f"{shown[key].rpartition('.')[2]} = {numbers[key] / factor[key]:g}" for key in relation.keys)
 
 
 def _spaced(unit: str) -> str:

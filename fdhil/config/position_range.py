@@ -14,18 +14,24 @@ _SHOWN = 1e4  # parts of a millimetre
 
 @dataclass(frozen=True, slots=True)
 class PositionRange:
-    """The set-points of one axis in increments, from ``low`` to ``high``; ``per_mm`` has the sign of the drive."""
+    """The set-points of one axis in increments, from ``low`` to ``high``; ``per_mm`` has the sign of the drive.
+
+    ``unit`` of ``mm_per_unit`` is what people give the axis in.
+    """
 
     axis: str
     low: int
     high: int
     per_mm: float
+    unit: str = "mm"
+    mm_per_unit: float = 1.0
 
     @staticmethod
     def of(name: str, axis: Axis, sync_period_s: float) -> PositionRange:
         """Return the range of an axis: INTEGER32 less the largest offset that may be sent to it."""
         most = OffsetBounds.given(axis, sync_period_s).whole[0] if axis.correction is not None else 0
-        return PositionRange(name, *target_range(most), axis.scaling.sign * axis.scaling.increments_per_mm)
+        per_mm = axis.scaling.sign * axis.scaling.increments_per_mm
+        return PositionRange(name, *target_range(most), per_mm, axis.unit, axis.mm_per_unit)
 
     def fits(self, position_mm: float) -> bool:
         """Return whether the set-point of a finite position, and each offset on top of it, fit into 32 bits."""
@@ -38,7 +44,8 @@ class PositionRange:
 
     def fault(self, position_mm: float) -> str:
         """Return what is wrong with a position that does not fit, and what to do."""
-        text = f"axis {self.axis} at {position_mm:.10g} mm: the set-point with its largest offset exceeds 32 bits"
-        text += f" of increments ({abs(self.per_mm):.10g} per mm); the last position that fits is"
-        text += f" {self.last_mm(position_mm):.10g} mm; move the work, or set the drive to coarser increments"
+        unit, here, last = self.unit, position_mm / self.mm_per_unit, self.last_mm(position_mm) / self.mm_per_unit
+        text = f"axis {self.axis} at {here:.10g} {unit}: the set-point with its largest offset exceeds 32 bits"
+        text += f" of increments ({abs(self.per_mm) * self.mm_per_unit:.10g} per {unit}); the last position that fits"
+        text += f" is {last:.10g} {unit}; move the work, or set the drive to coarser increments"
         return text

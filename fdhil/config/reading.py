@@ -7,12 +7,14 @@ import logging
 import re
 import tomllib
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
+from fdhil.config.axis_tables import angular, complete, linear, rotary_axes
 from fdhil.config.machine import MachineConfig
 from fdhil.config.plausible import doubts
 from fdhil.config.section import LARGEST, Section
@@ -107,10 +109,16 @@ def parse(
 
     ``made_up``: its axes need not be those of a machine that can be.
     """
+    units: list[ConfigFault] = []
+    rotary = rotary_axes(document)
+    if not made_up:
+        document = complete(document, units)
     try:
         config = MachineConfig.model_validate(document, context={"made_up": made_up})
     except ValidationError as error:
-        raise ConfigError(source, _faults(error)) from None
+        raise ConfigError(source, [*units, *(_as_written(fault, rotary) for fault in _faults(error))]) from None
+    if units:
+        raise ConfigError(source, units)
     store, guard = _placed_store(config.store, folder), _placed_guard(config.guard, folder)
     worn = {
         name: axis.model_copy(update={"eds": folder / axis.eds if axis.eds else None})
@@ -140,6 +148,16 @@ def _placed_guard(guard: Guard, folder: Path) -> Guard:
     return guard.model_copy(update={"run_directory": folder / guard.run_directory if guard.run_directory else None})
 
 
+def _as_written(fault: ConfigFault, rotary: Mapping[str, float]) -> ConfigFault:
+    """Return a fault of a rotary axis with the key that its file has; numbers in it are lengths at the radius."""
+    parts = fault.path.removeprefix("sim.").split(".")
+    key = angular(parts[-1])
+    if parts[0] != "axis" or len(parts) < 3 or parts[1] not in rotary or not (key != parts[-1] or "_um" in key):
+        return fault
+    at = "" if "missing" in fault.what else f" at its radius, where 1 deg is {rotary[parts[1]]:.4g} mm"
+    return replace(fault, path=f"{fault.path.removesuffix(parts[-1])}{key}", what=f"{fault.what}{at}")
+
+
 def load_as(whole: type[S], path: Path, what: str) -> S:
     """Read another file than a machine's, whose tables are those of ``whole``; ConfigError with every fault."""
     return checked_as(whole, read_toml(path, what), str(path))
@@ -157,6 +175,9 @@ def unlikely(config: MachineConfig) -> list[str]:
     """Return a sentence for everything about the axes that can be, but hardly is."""
     found = [(name, doubt) for name, axis in config.axis.items() for doubt in doubts(axis)]
     told = [f"axis.{name}.{doubt.key} is unlikely: {doubt.text}" for name, doubt in found]
+    text = 'is that of a rotary axis and not used; give unit = "deg" too, or leave it out'
+    flat = [name for name, axis in config.axis.items() if axis.unit == "mm" and axis.radius_mm is not None]
+    told += [f"axis.{name}.radius_mm {text}" for name in flat]
     sections = ("voltage", "temperature", "table")
     places = [(f"axis.{name}.{key}", getattr(axis, key)) for name, axis in config.axis.items() for key in sections]
     places.append(("nc_source.modbus_coil", config.nc_source.modbus_coil))
@@ -264,7 +285,8 @@ def _section(loc: tuple[int | str, ...], whole: type[Section] = MachineConfig) -
 def field_at(path: str) -> FieldInfo | None:
     """Return the field of a key, as ``axis.X.nominal.R``; None where there is none."""
     *outer, key = path.split(".")
-    return _section(tuple(outer)).model_fields.get(key)
+    fields = _section(tuple(outer)).model_fields
+    return fields.get(key) or (fields.get(linear(key)) if outer[:1] == ["axis"] else None)
 
 
 def _arguments(annotation: Any) -> list[Any]:

@@ -34,7 +34,13 @@ def _without_controls(name: str) -> str:
 
 
 ShownName = Annotated[str, AfterValidator(_without_controls)]  # on terminals, pages and in other programs
-AxisName = Annotated[str, Field(pattern="^[A-Z]$")]
+AXIS_PATTERN = "[A-Z]2?"  # Y2 is the second drive of the gantry axis Y
+AxisName = Annotated[str, Field(pattern=f"^{AXIS_PATTERN}$")]
+
+
+def is_second_drive(axis: str) -> bool:
+    """Whether a name, as Y2, is that of the second drive of a gantry axis."""
+    return len(axis) == 2 and axis[1] == "2"
 
 
 def _check_types(plan: Any, of: type[BaseModel]) -> None:

@@ -20,13 +20,14 @@ from typing import Any
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from fdhil.config.axis_tables import linear
 from fdhil.config.machine import MachineConfig
 from fdhil.config.section import Section
 
 EXAMPLES: Mapping[str, Any] = {  # of keys without a default: the bench machine
     "machine.name": "my machine",
     "screw_pitch_mm": 20.0, "rapid_speed_mm_s": 500.0, "max_acceleration_mm_s2": 4000.0, "max_jerk_mm_s3": 160000.0,
-    "resonance_hz": 80.0,
+    "resonance_hz": 80.0, "radius_mm": 100.0, "max_difference_um": 500.0,
     "R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0,
     "position_gain_per_s": 50.0, "speed_kp": 23.562, "speed_ki": 1184.35, "current_limit_a": 200.0,
     "current_kp": 12.566, "current_ki": 1256.64, "voltage_limit_v": 300.0,
@@ -119,12 +120,12 @@ def filled(document: Mapping[str, Any], sources: Mapping[str, str], head: str = 
         if values is None:
             left += [f"[{table.path}]"] if first else []
             continue
-        own = {key: value for key, value in values.items() if key in dict(table.keys)}
+        own = {linear(key): (key, value) for key, value in values.items() if linear(key) in dict(table.keys)}
         lines += ["", *(_heading(replace(table, optional=False)) if first else [f"[{table.path}]"])]
         for key, field in table.keys:
             if key in own:
                 lines += _comment(field.description or "") if first else []
-                lines += _line(key, own[key], sources.get(f"{table.path}.{key}", ""))
+                lines += _line(*own[key], sources.get(f"{table.path}.{own[key][0]}", ""))
             elif first:
                 lines += [*_comment(field.description or ""), f"#{key} = {toml(_example(table.path, key, field))}"]
     text = "\n".join(

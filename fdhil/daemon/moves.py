@@ -34,7 +34,7 @@ class Moves:
     def __init__(self, axis: str, config: MachineConfig) -> None:
         settings = config.axis[axis]
         self._period_s = config.machine.sync_period_s
-        self._rapid_mm_s = settings.rapid_speed_mm_s
+        self._axis, self._rapid_mm_s = settings, settings.rapid_speed_mm_s
         self._mm_per_rad = settings.screw_pitch_mm / (2 * math.pi)
         self._source = config.g0.source
         self._needed = max(RAPID_SHARE, load_event_source(self._source).least_share)
@@ -125,24 +125,27 @@ class Moves:
         ``windows`` is how many of them became one.
         """
         scale, fastest = self.scale, self.fastest_mm_s
+        pitch, rapid = map(self._axis.shown_key, ("screw_pitch_mm", "rapid_speed_mm_s"))
         if scale is not None and abs(scale - 1.0) > SCALE_TOLERANCE:
             text = f"the position goes {scale:.3g} times as far as the speed says"
             return "ScaleSuspect", f"{text}; correct increments_per_rev, the drive's profile or its sign"
         if self.seen >= FEW and fastest > TOO_FAST * self._rapid_mm_s:
             return "PitchSuspect", (
-                f"moves reach {fastest:.4g} mm/s, {fastest / self._rapid_mm_s:.2f} times the rapid speed of the"
-                " config; correct screw_pitch_mm, increments_per_rev or rapid_speed_mm_s"
+                f"moves reach {self._axis.shown(fastest, '/s')}, {fastest / self._rapid_mm_s:.2f} times the rapid"
+                f" speed of the config; correct {pitch}, increments_per_rev or {rapid}"
             )
         if self.seen < FEW or windows:
             return None
         return self._unused(now_s)
 
     def _unused(self, now_s: float) -> tuple[str, str] | None:
+        pitch, rapid = map(self._axis.shown_key, ("screw_pitch_mm", "rapid_speed_mm_s"))
         if self.slow:
             return "MovesNotUsed", (
                 f"{self.seen} moves seen, none used: {self.slow} stay below {self._needed:.0%} of the rapid speed of"
-                f" {self._rapid_mm_s:g} mm/s, the fastest at {self.fastest_mm_s:.4g}; make rapids at full override, or"
-                " correct rapid_speed_mm_s or screw_pitch_mm"
+                f" {self._axis.shown(self._rapid_mm_s, '/s', 'g')}, the fastest at"
+                f" {self._axis.shown(self.fastest_mm_s, '/s')}; make rapids at full override, or correct {rapid} or"
+                f" {pitch}"
             )
         if self.usable >= FEW and now_s - self.usable_s > PATIENCE_S:
             return "MovesNotUsed", (

@@ -53,6 +53,10 @@ WORDS: Mapping[str, tuple[str, str]] = {
     "PitchSuspect": ("what is identified is wrong by that share", "compare screw_pitch_mm with the machine"),
     "MovesNotUsed": ("no rapid of this axis is identified", "see the reason in the text; look at [g0]"),
     "NcSilent": ("which moves are rapids is not known, none is used", "see that the NC and its interface run"),
+    "GantrySkew": (
+        "the beam may be skewed; a correction of this machine is ramped to zero",
+        "stop the axis, compare both drives' positions and couplings, then arm again",
+    ),
     # sensors
     "ModbusTimeout": (_NO_VOLTAGE, "check the sensor's supply, address and wiring"),
     "ModbusException": (_NO_VOLTAGE, "compare the registers with the sensor's manual"),

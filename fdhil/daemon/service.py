@@ -24,6 +24,7 @@ from fdhil.daemon.acquisition import Acquisition, OpenSource
 from fdhil.daemon.audited import Audited
 from fdhil.daemon.clock import ClockWatch, newest_record_s
 from fdhil.daemon.control import SOCKET_NAME, ControlServer
+from fdhil.daemon.gantry_watch import GantryWatch
 from fdhil.daemon.kernel_warmup import warm
 from fdhil.daemon.live import LiveStream
 from fdhil.daemon.lock import sole_owner
@@ -71,6 +72,7 @@ class Service:
         self._desk = ArmingDesk(config, self._store, self._run_directory, clock)
         self._watch = Watch(config, self._clock.now_s())
         self._live = LiveStream(config)
+        self._gantry = GantryWatch(config)
         self._pipelines: dict[str, AxisPipeline] = {}
         self._queues = {axis: RecordQueue() for axis in config.axis}
         self._busy_since_s: dict[str, float] = {}
@@ -199,6 +201,7 @@ class Service:
         if isinstance(record, Temperature):
             self._desk.knowledge.note_temperature(record)
         elif isinstance(record, AxisSamples):
+            self._gantry.feed(record)
             self._desk.hear(record)
         for axis in self._config.axis if isinstance(record, TickTimes) else (record.axis,):
             if axis in self._queues:
@@ -295,6 +298,10 @@ class Service:
             if self._acquisition.source is not None:
                 self._watch.hearing.counted(self._acquisition.source.counters(), now_s)
             self._tell(self._watch.troubles(now_s))
+            skewed, notices = self._gantry.look()
+            self._tell(notices)
+            if skewed:
+                await self._desk.disarm()
 
     async def _watch_resources(self, clock: ClockWatch) -> None:
         """Look now and then: is memory, are descriptors nearly used up, was the clock set, does an offer wait."""

@@ -77,7 +77,7 @@ class DemandRecorder:
             raise ConfigError(
                 config.machine.name, [ConfigFault("axis", what, "record each bus with a config of its axes")]
             )
-        self._dt_s = config.machine.sync_period_s
+        self._dt_s, self._mm_per_degree = config.machine.sync_period_s, config.mm_per_degree
         self._rest_rows = math.ceil(rest_s / self._dt_s)
         self._end_rows = math.ceil(config.nc.end_rest_s / self._dt_s)
         self._axes = {name: _Sniffed([], []) for name in config.axis}
@@ -126,7 +126,8 @@ class DemandRecorder:
         rapid = np.zeros(stop - first, np.bool_)
         rapid.setflags(write=False)
         time_s = frozen(np.arange(stop - first) * self._dt_s)
-        reference = Trajectory(self._dt_s, time_s, position, rapid, frozen_ints(np.zeros(stop - first)))
+        line = frozen_ints(np.zeros(stop - first))
+        reference = Trajectory(self._dt_s, time_s, position, rapid, line, mm_per_degree=self._mm_per_degree)
         return RecordedDemand(reference, tuple(gaps), tuple(self._doubts.values()))
 
 

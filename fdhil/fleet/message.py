@@ -33,7 +33,8 @@ LARGEST_RECORD = 1 << 20  # bytes of JSON
 MOST_DEPTH = 20  # of lists in lists
 _SUBJECT = re.compile(r"fdhil\.v1\.([A-Za-z0-9_-]{1,64})\.records")
 _HEAD = re.compile(
-    rb"fdhil-record-1 ([0-9a-f]{32}) ([A-Z]|-) ([a-z]{1,20}) ([0-9a-f]{64}) (\d{1,18}) (\d{1,10}\.\d{6}) (\d{1,9}|-)\n"
+    rb"fdhil-record-1 ([0-9a-f]{32}) ([A-Z]2?|-) ([a-z]{1,20}) ([0-9a-f]{64}) (\d{1,18}) (\d{1,10}\.\d{6})"
+    rb" (\d{1,9}|-)\n"
 )
 MANY_DIGITS = 100 * b"0"
 LARGEST_NUMBER = 1e100  # what is reckoned with is squared

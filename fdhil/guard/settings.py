@@ -276,7 +276,7 @@ def _check(settings: Settings) -> None:
 
 def _check_axis(axis: AxisSettings) -> None:
     where = f"axis {axis.name}: "
-    _word(axis.name, "[A-Z]", "an axis' name")
+    _word(axis.name, "[A-Z]2?", "an axis' name")
     _whole(axis.node_id, 1, 127, where + "node_id")
     _whole(axis.window, 1, 2**32, where + "window")
     _whole(axis.setpoint_delay_cycles, 0, 16, where + "setpoint_delay_cycles")

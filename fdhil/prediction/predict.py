@@ -84,7 +84,7 @@ def _responses(
 
 
 def _contour(reference: Trajectory, responses: Mapping[str, Response]) -> Float:
-    actual = np.column_stack([responses[axis].table_mm for axis in reference.axes])
+    actual = reference.table_mm({axis: response.table_mm for axis, response in responses.items()})
     return contour_error_um(reference.path_mm, actual, reference.dt_s)
 
 

@@ -44,7 +44,7 @@ def demand_sources(
     averages = Averages(config.nc.smoothing_s, reference.dt_s)
     if config.nc.profile != "fir":
         return _source(reference, path, stretch, averages.capped), _source(reference, path, stretch, averages.stretched)
-    fastest = [TOO_FAST * config.axis[axis].rapid_speed_mm_s * reference.dt_s for axis in reference.axes]
+    fastest = [TOO_FAST * config.axis[axis].rapid_speed_mm_s * reference.dt_s for axis in reference.table_axes]
     under = averages.taken_off(path)
     if under is not None and bool(np.all(np.abs(np.diff(under, axis=0)) <= fastest)):
         return _source(reference, under, stretch, averages.smoothed), None
@@ -61,7 +61,7 @@ def stretches_around(over: Bool, apart: int) -> Int:
 
 
 def _source(reference: Trajectory, path: Float, stretch: Int, rule: Rule) -> Source:
-    positions = reference.path_mm
+    positions, columns = reference.path_mm, reference.table_axes
     fastest = _fastest(_steps(positions) * 60.0 / reference.dt_s, stretch)
 
     def at(shares: Mapping[int, float]) -> Trajectory:
@@ -71,7 +71,7 @@ def _source(reference: Trajectory, path: Float, stretch: Int, rule: Rule) -> Sou
         return replace(
             reference,
             time_s=frozen(reference.time_s[0] + np.arange(lines.size) * reference.dt_s),
-            position_mm={axis: frozen(moved[:, a]) for a, axis in enumerate(reference.axes)},
+            position_mm={axis: frozen(moved[:, columns.index(axis[0])]) for axis in reference.axes},
             rapid=np.broadcast_to(np.False_, lines.size),
             line=frozen_ints(lines),
         )

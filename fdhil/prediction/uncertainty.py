@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 
 import numpy as np
@@ -76,14 +77,15 @@ def contour_std_um(
 
 def _across(reference: Trajectory) -> list[Float]:
     """Return per axis (n,) the share of an axis' variance that is across the path: 1 - t^2 of its direction t."""
-    path = reference.path_mm
+    path, columns = reference.path_mm, reference.table_axes
+    drives = Counter(axis[0] for axis in reference.axes)  # a gantry axis is at the mean of two
     if path.shape[1] == 1:
-        return [np.ones(len(path))]
+        return [np.ones(len(path)) / drives[axis[0]] ** 2 for axis in reference.axes]
     velocity = np.gradient(path, axis=0)
     speed = np.linalg.norm(velocity, axis=1)
     moving = speed > 1e-9
     direction = np.where(moving[:, None], velocity / np.maximum(speed, 1e-12)[:, None], 0.0)
-    return [1.0 - direction[:, a] ** 2 for a in range(path.shape[1])]
+    return [(1.0 - direction[:, columns.index(axis[0])] ** 2) / drives[axis[0]] ** 2 for axis in reference.axes]
 
 
 def sensitivity_um(
@@ -100,17 +102,15 @@ def sensitivity_um(
     reference = prediction.reference
     found = _positions(reference, models, config, offset_um)
     path = reference.path_mm
-    here = np.column_stack([found[axis][2] for axis in reference.axes])
-    base = contour_error_um(path, here, reference.dt_s)
+    here = {axis: found[axis][2] for axis in reference.axes}
+    base = contour_error_um(path, reference.table_mm(here), reference.dt_s)
     result: list[dict[str, dict[str, float]]] = [{axis: {} for axis in reference.axes} for _ in prediction.zones]
-    for a, axis in enumerate(reference.axes):
+    for axis in reference.axes:
         moved, steps, _ = found[axis]
         for k, (name, value) in enumerate(values_of(models[axis]).items()):
             if main_name(name) != name:
                 continue
-            other = here.copy()
-            other[:, a] = moved[k]
-            contour = contour_error_um(path, other, reference.dt_s)
+            contour = contour_error_um(path, reference.table_mm({**here, axis: moved[k]}), reference.dt_s)
             per_percent = 0.01 * abs(value) / steps[k]
             for zone, per_axis in zip(prediction.zones, result, strict=True):
                 rows = prediction.rows(zone)

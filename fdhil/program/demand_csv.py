@@ -1,4 +1,7 @@
-"""Demand CSV: a recorded or exported reference, a row per SYNC period, ``time_s,X_mm,Y_mm[,Z_mm]``."""
+"""Demand CSV: a recorded or exported reference, a row per SYNC period, ``time_s,X_mm,Y_mm[,Z_mm][,A_deg]``.
+
+Of a gantry axis one column is enough: the second drive has the same demand unless it has a column of its own.
+"""
 
 from __future__ import annotations
 
@@ -62,10 +65,19 @@ def read_demand_csv(path: Path, config: MachineConfig, sha256: str | None = None
     table = _numbers(path, lines, names)
     columns = {name: table[:, k] for k, name in enumerate(names)}
     _check_times(path, lines, columns["time_s"], config.machine.sync_period_s)
-    moved = {name.removesuffix("_mm"): column for name, column in columns.items() if name.endswith("_mm")}
-    for axis, column in moved.items():
-        if axis not in config.axis and np.ptp(column) > _MOVED_MM:
-            raise RecordingError(f"{path}: axis {axis} moves, which the configuration lacks; add [axis.{axis}] to it")
+    moved = {}
+    for name, column in columns.items():
+        axis, _, unit = name.rpartition("_")
+        if unit in ("mm", "deg"):
+            known = config.axis.get(axis)
+            if known is None and np.ptp(column) > _MOVED_MM:
+                text = f"axis {axis} moves, which the configuration lacks; add [axis.{axis}] to it"
+                raise RecordingError(f"{path}: {text}")
+            if known is not None and known.unit != unit:
+                text = f"has a column {name}, and the configuration has axis {axis} in {known.unit}"
+                raise RecordingError(f"{path} {text}; write {axis}_{known.unit}, or correct unit in [axis.{axis}]")
+            moved[axis] = column * known.mm_per_unit if known is not None else column
+    moved |= {name: moved[name[0]] for name in config.axis if name not in moved and name[0] in moved}
     _check_speeds(path, {axis: moved[axis] for axis in config.axis if axis in moved}, config)
     still = np.zeros(len(table))
     rapid = still.astype(np.bool_)
@@ -74,7 +86,9 @@ def read_demand_csv(path: Path, config: MachineConfig, sha256: str | None = None
     if (beyond := first_beyond(position_mm, config)) is not None:
         raise RecordingError(f"{path} line {_line_of(lines, beyond.row)}: {beyond.text}")
     time_s = frozen(columns["time_s"])
-    demand = Trajectory(config.machine.sync_period_s, time_s, position_mm, rapid, frozen_ints(still))
+    demand = Trajectory(
+        config.machine.sync_period_s, time_s, position_mm, rapid, frozen_ints(still), mm_per_degree=config.mm_per_degree
+    )
     return replace(demand, notes=limit_notes(demand, config))
 
 
@@ -143,9 +157,12 @@ def _check_speeds(path: Path, columns: Mapping[str, Float], config: MachineConfi
         return
     name = max(ratios, key=lambda axis: ratios[axis])
     if ratios[name] > _TOO_FAST:
+        axis = config.axis[name]
+        thousandths = "um" if axis.unit == "mm" else "mdeg"
         raise RecordingError(
-            f"{path}: axis {name} moves at {speeds[name]:.3g} mm/s, {ratios[name]:.3g} times its rapid speed; "
-            f"is {name}_mm in um or in increments? give it in mm, or correct rapid_speed_mm_s"
+            f"{path}: axis {name} moves at {speeds[name] / axis.mm_per_unit:.3g} {axis.unit}/s, {ratios[name]:.3g} "
+            f"times its rapid speed; is {name}_{axis.unit} in {thousandths} or in increments? give it in {axis.unit}, "
+            f"or correct {axis.shown_key('rapid_speed_mm_s')}"
         )
     if ratios[name] < _TOO_SLOW and max(float(np.ptp(values)) for values in columns.values()) < _SMALL_MM:
         text = "%s: no axis moves by more than %g mm or faster than %.2g of its rapid speed; is it in m? give mm"
@@ -153,10 +170,12 @@ def _check_speeds(path: Path, columns: Mapping[str, Float], config: MachineConfi
 
 
 def write_demand_csv(trajectory: Trajectory, file: Path | IO[bytes]) -> None:
-    """Write a reference as demand CSV: mm with 9 decimals. RecordingError when the file cannot be written."""
+    """Write a reference as demand CSV: mm and degrees with 9 decimals. RecordingError when it cannot be written."""
     decimals = max(6, min(12, 1 - math.floor(math.log10(trajectory.dt_s))))
-    table = np.column_stack([trajectory.time_s, *trajectory.position_mm.values()])
-    header = ",".join(["time_s", *(f"{axis}_mm" for axis in trajectory.axes)])
+    turn = trajectory.mm_per_degree
+    moved = {f"{a}_deg" if a in turn else f"{a}_mm": p / turn.get(a, 1.0) for a, p in trajectory.position_mm.items()}
+    table = np.column_stack([trajectory.time_s, *moved.values()])
+    header = ",".join(["time_s", *moved])
     formats = [f"%.{decimals}f", *("%.9f" for _ in trajectory.axes)]
     try:
         np.savetxt(file, table, fmt=formats, delimiter=",", header=header, comments="")

@@ -25,11 +25,12 @@ class Dialect:
 
     dwell_unit: Literal["s", "ms", "ms_without_point"] = "s"
     integers: Literal["whole", "thousandths", "thousandths_and_feed"] = "whole"
+    wrapped_axes: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, nc: Nc) -> Dialect:
         """Return the dialect that a machine's configuration sets."""
-        return cls(nc.dwell_unit, nc.integers)
+        return cls(nc.dwell_unit, nc.integers, nc.wrapped_axes)
 
     @property
     def plain(self) -> bool:

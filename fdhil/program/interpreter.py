@@ -22,7 +22,7 @@ from fdhil.program.commands import Command
 from fdhil.program.expressions import now
 from fdhil.program.flow import Flow
 from fdhil.program.machine import Machine
-from fdhil.program.modal import Modal
+from fdhil.program.modal import INDEX, Modal
 from fdhil.program.motions import Feed, Motion, Rapid
 from fdhil.program.parameters import Variables
 from fdhil.program.source import Source
@@ -61,6 +61,7 @@ class Interpreter:
         self._plain = budget.dialect.plain
         self._machine = Machine(budget)
         modal = self._machine.modal
+        modal.wrapped = frozenset(INDEX[axis.lower()] for axis in budget.dialect.wrapped_axes)
         first = Source(source, budget.max_line_chars)
         names = names_of(
             modal, lambda: self._flow.source.line, lambda: self._flow.depth, lambda: self._variables.returned

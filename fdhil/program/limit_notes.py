@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from fdhil.config import MachineConfig
+from fdhil.config import MachineConfig, is_second_drive
 from fdhil.records import Float, Reason, Trajectory
 
 ROOM = 1.05  # times a limit, up to where it counts as kept
@@ -30,13 +30,18 @@ def _beyond(demand: Trajectory, config: MachineConfig) -> Iterator[Reason]:
         position, step = demand.position_mm[name], _resolution(demand.position_mm[name])
         speed = _measured(_speed, position, demand.dt_s, axis.rapid_speed_mm_s, step)
         acceleration = _measured(_acceleration, position, demand.dt_s, axis.max_acceleration_mm_s2, step)
-        speeds.append(speed)
-        key = f"axis.{name}."
-        yield from _note(
-            demand, speed, axis.rapid_speed_mm_s, f"axis {name} moves at", "mm/s", key + "rapid_speed_mm_s"
-        )
-        limit, key = axis.max_acceleration_mm_s2, key + "max_acceleration_mm_s2"
-        yield from _note(demand, acceleration, limit, f"axis {name} accelerates by", "mm/s2", key)
+        if axis.unit == "mm" and not is_second_drive(name):
+            speeds.append(speed)
+        unit = axis.mm_per_unit
+        for what, found, per, key in (
+            ("moves at", speed, "s", "rapid_speed_mm_s"),
+            ("accelerates by", acceleration, "s2", "max_acceleration_mm_s2"),
+        ):
+            told, limit = f"axis {name} {what}", getattr(axis, key) / unit
+            shown = f"axis.{name}.{axis.shown_key(key)}"
+            yield from _note(demand, found / unit, limit, told, f"{axis.unit}/{per}", shown)
+    if not speeds:
+        return
     along, limit = np.sqrt(np.sum(np.square(speeds), axis=0)), config.nc.max_path_speed_mm_s
     yield from _note(demand, along, limit, "the path is run at", "mm/s", "nc.max_path_speed_mm_s")
 

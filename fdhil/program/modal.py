@@ -62,6 +62,7 @@ class Modal:
     path_control: int = 640
     path_tolerance_mm: float = 0.0
     joining_mm: float = 0.0
+    wrapped: frozenset[int] = frozenset()  # rotary axes whose absolute words are within one turn
 
     @property
     def plain(self) -> bool:

@@ -9,6 +9,9 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 Point = tuple[float, float, float]
+ALL_AXES = "XYZABCUVW"
+Place = tuple[float, ...]  # of ALL_AXES: mm, of A B C degrees
+ORIGIN: Place = (0.0,) * len(ALL_AXES)
 PLANES = ("XY", "XZ", "YZ")
 # plane -> indices of its two axes in the order that makes a positive angle counter-clockwise seen from the positive
 # end of the normal axis, then the normal axis; XZ is turned about +Y from Z to X
@@ -98,6 +101,14 @@ class Dwell:
 Motion = Rapid | Feed | Arc | Dwell
 
 
+def reached(motion: Rapid | Feed | Arc, start: Place) -> Place:
+    """Return where a motion from ``start`` ends, of all axes."""
+    end = [*motion.end, *start[3:]]
+    for turned in motion.rotary:
+        end[ALL_AXES.index(turned.axis)] = turned.end
+    return tuple(end)
+
+
 class Swept(NamedTuple):
     """An arc as it is gone along, in mm and rad: its ``centre`` and the ``radii`` and the angle at its ends.
 
@@ -112,7 +123,7 @@ class Swept(NamedTuple):
     length_mm: float
 
     @staticmethod
-    def of(motion: Arc, start: Point) -> Swept:
+    def of(motion: Arc, start: Sequence[float]) -> Swept:
         """Return what an arc sweeps from ``start`` on."""
         axes = PLANE_AXES[motion.plane]
         centre = complex(motion.centre[axes[0]] or 0.0, motion.centre[axes[1]] or 0.0)

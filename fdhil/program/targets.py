@@ -85,14 +85,33 @@ def target(modal: Modal, block: Block) -> list[float]:
         whole = [c + t for c, t in zip(modal.machine_all(), modal.tool, strict=True)]
         for index, value in words.items():
             whole[index] = length_mm(modal, index, value)
-        return modal.from_machine([w - t for w, t in zip(whole, modal.tool, strict=True)])
+        end = modal.from_machine([w - t for w, t in zip(whole, modal.tool, strict=True)])
+        for index in modal.wrapped.intersection(words):
+            end[index] = _wrapped(block, index, words[index], end[index], modal.position[index])
+        return end
     end = list(modal.position)
     if polar:
         end[0], end[1] = _polar(modal, block)
     for index, value in words.items():
         value = length_mm(modal, index, value)
+        if modal.absolute and index in modal.wrapped:
+            value = _wrapped(block, index, value, value, end[index])
         end[index] = value if modal.absolute else end[index] + value
     return end
+
+
+def _wrapped(block: Block, index: int, word: float, place: float, now: float) -> float:
+    """Return where an absolute word turns a wrapped rotary axis from ``now``: its sign is the direction, as LinuxCNC's.
+
+    LinuxCNC 2.9, WRAPPED_ROTARY: the angle within a turn is next reached in that direction.
+    """
+    if abs(word) >= 360.0:
+        raise block.fault(AXES[index], f"{word:g} is no position of a wrapped rotary axis; give less than one turn")
+    end = abs(place) + math.floor(now / 360.0) * 360.0
+    backward = math.copysign(1.0, word) < 0.0
+    if backward:
+        return end - 360.0 if end > now else end
+    return end + 360.0 if end < now else end
 
 
 def _polar(modal: Modal, block: Block) -> tuple[float, float]:

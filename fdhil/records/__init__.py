@@ -7,7 +7,7 @@ name says ``_um``. Drive increments appear in none of them.
 from __future__ import annotations
 
 from fdhil.records.nc import NcState
-from fdhil.records.paths import Correction, Prediction, Skill, Trajectory, Zone
+from fdhil.records.paths import Correction, Prediction, Skill, Trajectory, Zone, table_path
 from fdhil.records.signals import (
     AxisSamples,
     MoveEvent,
@@ -96,5 +96,6 @@ __all__ = [
     "frozen_ints",
     "read_only",
     "rms",
+    "table_path",
     "unit_of",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,7 +16,7 @@ class Trajectory:
     """A reference on the SYNC grid: ``time_s`` (n,) and ``position_mm`` per axis (n,); ``rapid`` (n,) marks G0 rows.
 
     ``line`` (n,) is the source line of the program that ordered the row, 0 where there is none. ``notes`` question the
-    program.
+    program. The mm of a rotary axis are lengths of arc at its radius, where it has ``mm_per_degree``.
     """
 
     dt_s: float
@@ -25,20 +25,44 @@ class Trajectory:
     rapid: Bool
     line: Int
     notes: tuple[Reason, ...] = ()
+    mm_per_degree: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """The axes in the order of the machine."""
+        """The axes in the order of the machine, both drives of a gantry axis."""
         return tuple(self.position_mm)
 
     @property
+    def table_axes(self) -> tuple[str, ...]:
+        """The axes of the path, a gantry axis once."""
+        return table_axes(self.axes)
+
+    @property
     def path_mm(self) -> Float:
-        """The path (n, d), a column per axis."""
-        return np.column_stack([self.position_mm[axis] for axis in self.axes])
+        """The path (n, d), a column for each of ``table_axes``."""
+        return self.table_mm(self.position_mm)
+
+    def table_mm(self, position_mm: Mapping[str, Float]) -> Float:
+        """Return the path (n, d) of the table whose drives are at positions (n,) per axis."""
+        return table_path(self.axes, np.column_stack([position_mm[axis] for axis in self.axes]))
 
     def place(self, row: int) -> str:
-        """Say where a row is: ``X 1.0 Y 2.0``."""
-        return " ".join(f"{axis} {self.position_mm[axis][row]:.1f}" for axis in self.axes)
+        """Return where a row is: ``X 1.0 Y 2.0``, a rotary axis in degrees."""
+        at = {axis: self.position_mm[axis][row] / self.mm_per_degree.get(axis, 1.0) for axis in self.table_axes}
+        return " ".join(f"{axis} {position:.1f}" for axis, position in at.items())
+
+
+def table_axes(axes: Sequence[str]) -> tuple[str, ...]:
+    """Return the axes of a path: Y for the drives Y and Y2 of a gantry axis."""
+    return tuple(dict.fromkeys(axis[0] for axis in axes))
+
+
+def table_path(axes: Sequence[str], position_mm: Float) -> Float:
+    """Return the path (n, d) of a table whose drives are at (n, k): a gantry axis is at the mean of both its drives."""
+    found = table_axes(axes)
+    if len(found) == len(axes):
+        return position_mm
+    return np.column_stack([position_mm[:, [a[0] == axis for a in axes]].mean(axis=1) for axis in found])
 
 
 @dataclass(frozen=True, slots=True)

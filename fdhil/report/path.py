@@ -97,19 +97,25 @@ def _duration(reference: Trajectory) -> float:
 
 def planes(reference: Trajectory, rows: slice = slice(None)) -> list[tuple[str, str]]:
     """Return the planes in which the path moves, the one with most of it first; empty when one axis moves alone."""
-    reach = {axis: float(np.ptp(path[rows])) for axis, path in reference.position_mm.items()}
+    reach = {axis: float(np.ptp(reference.position_mm[axis][rows])) for axis in reference.table_axes}
     moving = sorted((axis for axis in reach if reach[axis] > 1e-6), key=lambda axis: -reach[axis])
     if len(moving) < 2:
         return []
-    order = list(reference.axes)
+    order = list(reference.table_axes)
     pairs = [(moving[0], other) for other in moving[1:]]
     return [(a, b) if order.index(a) < order.index(b) else (b, a) for a, b in pairs]
 
 
+def _names(reference: Trajectory, plane: tuple[str, str]) -> tuple[str, str]:
+    """Return what a map's edges are called; a rotary axis is drawn as the length of arc at its radius."""
+    across, along = (f"{axis} along its rim" if axis in reference.mm_per_degree else axis for axis in plane)
+    return across, along
+
+
 def _flat(reference: Trajectory, positions: Prediction | None, plane: tuple[str, str]) -> Float:
     """Return the reference's, or a prediction's, path (n, 2) in a plane."""
-    source = reference.position_mm if positions is None else positions.predicted_mm
-    return np.column_stack([source[axis] for axis in plane])
+    path = reference.path_mm if positions is None else reference.table_mm(positions.predicted_mm)
+    return path[:, [reference.table_axes.index(axis) for axis in plane]]
 
 
 def _along(cases: Sequence[tuple[str, Prediction]]) -> Section:
@@ -122,7 +128,7 @@ def _along(cases: Sequence[tuple[str, Prediction]]) -> Section:
         named = [Place(str(k), *path[row]) for k, (_, row) in enumerate(worst_places(cases[0][1]), 1)]
         for label, predicted in cases:
             caption = f"{label}, plane {plane[0]}{plane[1]}: {_um(float(predicted.contour_um.max()))} at most{same}"
-            picture = figures.error_map(path, predicted.contour_um, largest, plane, named, least)
+            picture = figures.error_map(path, predicted.contour_um, largest, _names(reference, plane), named, least)
             pictures.append((caption, picture))
     errors = {label: predicted.contour_um for label, predicted in cases}
     pictures.append(("Contour error over time", figures.contour_errors(reference.dt_s, errors)))
@@ -181,7 +187,7 @@ def _place(cases: Sequence[tuple[str, Prediction]], zone: Zone, row: int) -> tup
         errors = {label: predicted.error_um[axis][rows] for label, predicted in cases}
         return caption, figures.axis_errors(reference.time_s[rows], errors, axis)
     plane = found[0]
-    columns = [reference.axes.index(axis) for axis in plane]
+    columns = [reference.table_axes.index(axis) for axis in plane]
     path = _flat(reference, None, plane)
     seen = path[max(0, first - before) : last]
     wide, tall = np.ptp(seen, axis=0)
@@ -203,13 +209,15 @@ def _place(cases: Sequence[tuple[str, Prediction]], zone: Zone, row: int) -> tup
     reach = NEAR_MIDDLE * half * np.array([1.0, figures.TALL])
     across, along = np.clip((low + high) / 2, worst_mm - reach, worst_mm + reach)
     larger = f", errors {factor} times as large" if factor > 1 else ""
-    return caption + larger, figures.corner(curves, (float(across), float(along)), half, plane, on_path=False)
+    return caption + larger, figures.corner(
+        curves, (float(across), float(along)), half, _names(reference, plane), on_path=False
+    )
 
 
 def nearest_mm(predicted: Prediction, rows: slice) -> Float:
     """Return for each predicted point of ``rows`` the point (m, d) of the path from which its contour error counts."""
     reference = predicted.reference
-    actual = np.column_stack([predicted.predicted_mm[axis] for axis in reference.axes])[rows]
+    actual = reference.table_mm(predicted.predicted_mm)[rows]
     return nearest_points_mm(reference.path_mm, actual, reference.dt_s, rows.start)
 
 

@@ -10,7 +10,7 @@ import math
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -51,6 +51,9 @@ MOST_SHOWN = 12  # names in an error
 MAX_VALUES = 64_000_000  # half a gigabyte
 MAX_SAMPLES_CHARS = 16 * 1024 * 1024
 PITCH_M = (1e-5, 0.8)
+PITCH_DEG, RADIUS_M = (1e-3, 360.0), (0.01, 10.0)  # of a rotary axis, and where an angle is weighed as a length
+PITCH_OF_ROTARY = "pitch_deg_per_rev"
+ANGLES = {"position_m": "position_deg", "demand_m": "demand_deg"}
 RATE_HZ = (1.0, 1e6)
 SLOW_HZ = 200.0  # below, a drive that accelerates in 0.1 s does so within too few samples
 RECORD_HZ = 1000  # what a rapid is best recorded with
@@ -78,7 +81,9 @@ class RecordingTable:
 
 def recording_of(table: RecordingTable, source: str = "recording") -> Recording:
     """Return what a table says; RecordingError names what is wrong with it, and what to do about it."""
-    headers = check_headers(table.headers, table.columns, source)
+    check_headers(table.headers, table.columns, source)
+    table, pitches = _as_lengths(table, source)
+    headers = dict(table.headers)
     names = [name for name in (*COLUMNS, VOLTAGE, *TABLE) if name in table.columns]
     values = _rows(table, names, source)
     dt = 1.0 / _within(headers, "sample_rate_hz", RATE_HZ, source)
@@ -86,7 +91,7 @@ def recording_of(table: RecordingTable, source: str = "recording") -> Recording:
     columns = _spread(values, rows)
     sampling = _sampling(headers, source) if SAMPLING in headers else "interval_mean"
     _check_sources(headers, source)
-    pitch_m = _within(headers, "pitch_m_per_rev", PITCH_M, source)
+    pitch_m = _within(headers, "pitch_m_per_rev", pitches, source)
     rapid_m_s = _within(headers, "rapid_speed_m_per_s", RAPID_M_S, source) if "rapid_speed_m_per_s" in headers else None
     return Recording(
         axis=headers["axis"],
@@ -110,6 +115,23 @@ def recording_of(table: RecordingTable, source: str = "recording") -> Recording:
     )
 
 
+def _as_lengths(table: RecordingTable, source: str) -> tuple[RecordingTable, tuple[float, float]]:
+    """Return a table of a rotary axis with lengths of arc in place of its angles, and which pitches it may have."""
+    headers, columns = dict(table.headers), dict(table.columns)
+    if PITCH_OF_ROTARY not in headers:
+        return table, PITCH_M
+    if "radius_m" not in headers:
+        raise RecordingError(
+            f"{source} has no header radius_m: give the radius at which its angles count as path error"
+        )
+    m_per_deg = math.radians(_within(headers, "radius_m", RADIUS_M, source))
+    headers["pitch_m_per_rev"] = repr(_within(headers, PITCH_OF_ROTARY, PITCH_DEG, source) * m_per_deg)
+    if (rapid := _optional(headers, "rapid_speed_deg_per_s", source)) is not None:
+        headers["rapid_speed_m_per_s"] = repr(rapid * m_per_deg)
+    columns |= {name: columns.pop(angle) * m_per_deg for name, angle in ANGLES.items()}
+    return replace(table, headers=headers, columns=columns), (0.0, math.inf)
+
+
 def check_size(rows: int, columns: int, source: str) -> None:
     """Refuse, before any of it is read, a file that declares more than a recording has."""
     if rows > MAX_ROWS or rows * columns > MAX_VALUES:
@@ -130,7 +152,13 @@ def unreadable(source: str, kind: str, error: BaseException) -> RecordingError:
 def check_headers(headers: Mapping[str, str], columns: Mapping[str, object], source: str) -> dict[str, str]:
     """Return the headers of a recording that has these columns; RecordingError names what is missing."""
     required = (*REQUIRED, SAMPLING) if VOLTAGE in columns else REQUIRED
-    missing = [key for key in required if not headers.get(key)]
+    rotary = PITCH_OF_ROTARY in headers
+    if rotary and "pitch_m_per_rev" in headers:
+        raise RecordingError(f"{source} has pitch_m_per_rev and {PITCH_OF_ROTARY}: keep that of its axis' unit")
+    if not rotary and (angles := [name for name in ANGLES.values() if name in columns]):
+        what = f"{source} has {' and '.join(angles)}, and no header {PITCH_OF_ROTARY}"
+        raise RecordingError(f"{what}: give it and radius_m, or name the columns position_m and demand_m")
+    missing = [key for key in required if not headers.get(key) and not (rotary and key == "pitch_m_per_rev")]
     if missing:
         raise RecordingError(
             f"{source} has no header {', '.join(missing)}: add a line such as '# {missing[0]}: ...', or give "
@@ -140,7 +168,8 @@ def check_headers(headers: Mapping[str, str], columns: Mapping[str, object], sou
         raise RecordingError(
             f"{source} has format {shown(headers['format'])}, which is not {FORMAT!r}: convert it first"
         )
-    absent = [name for name in COLUMNS if name not in columns]
+    wanted = [ANGLES.get(name, name) if rotary else name for name in COLUMNS]
+    absent = [name for name in wanted if name not in columns]
     if absent:
         has = ", ".join([shown(name) for name in columns][:MOST_SHOWN]) or "no columns"
         raise RecordingError(

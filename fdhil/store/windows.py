@@ -42,7 +42,7 @@ COLUMNS: Mapping[str, str] = {
 }
 AT_THE_TABLE = {"table_mm", "table_m_s2"}  # in no window of before there were such sensors: its digest stays
 OPTIONAL = {"voltage_v", "offset_mm", *AT_THE_TABLE}
-_NAME = re.compile(r"w(\d{8,12})-([A-Z])\.parquet")
+_NAME = re.compile(r"w(\d{8,12})-([A-Z]2?)\.parquet")
 _META = b"fdhil"
 REFUSED = (
     pa.ArrowException, OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError,

@@ -24,7 +24,7 @@ MOST_SETS = 2000
 Ask = Callable[..., Mapping[str, Any]]
 Label = Annotated[str, Query(min_length=1, max_length=32)]
 Machine = Annotated[str, Query(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
-Axis = Annotated[str, Query(pattern=r"^[A-Z]$")]
+Axis = Annotated[str, Query(pattern=r"^[A-Z]2?$")]
 
 
 class Answers:

@@ -19,7 +19,7 @@ from fdhil import config as machine_config
 from fdhil.cli.demo.toml import to_toml
 from fdhil.cli.main import cli, run_safely
 from fdhil.config.template import filled
-from tests.commissioning.test_linuxcnc_files import HAL_TEXT, INI
+from tests.commissioning.test_linuxcnc_files import HAL_TEXT, INI, ROTARY_AND_GANTRY
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
 from tests.eds import write_eds
@@ -93,6 +93,29 @@ def test_linuxcncs_files_and_few_answers_make_a_machine(fdhil: Said, tmp_path: P
     assert "R = 0.5  # from the answers" in text
     assert "Cd = 2.0  # guessed: 5 % of the continuous torque; the first rapids tell it" in text
     assert "/work" not in text
+
+
+def test_rotary_axis_and_gantry_of_linuxcnc_need_a_radius_and_two_node_ids(fdhil: Said, tmp_path: Path) -> None:
+    ini = ROTARY_AND_GANTRY.replace("[JOINT_2]", "[JOINT_2]\nSCALE = 819.2").replace("SCALE = 8192\n", "SCALE = 1000\n")
+    (tmp_path / "mill.ini").write_text(ini)
+    (tmp_path / "drives.hal").write_text(HAL_TEXT)
+    sheet = SHEET | {"drive": SHEET["drive"] | {"increments_per_rev": 8192}}
+    axes = {"X": sheet, "Y": sheet, "A": sheet | {"radius_mm": 120.0}}
+    file = tmp_path / "mill.toml"
+    arguments = ("init", file, "--from-linuxcnc", tmp_path / "mill.ini", "--offline", "--answers")
+    code, _, err = fdhil(*arguments, written(tmp_path, axis=axes | {"A": sheet}))
+    assert code == 2
+    assert "axis.A.radius_mm: is not known: of a rotary axis: the radius at which its angles count" in err
+    assert not file.exists()
+    code, _, err = fdhil(*arguments, written(tmp_path, axis=axes))
+    assert code == 0, err
+    made = machine_config.load(file)
+    assert len({*map(made.node_id, made.axis)}) == 4
+    assert (made.axis["Y"].drive.sign, made.axis["Y2"].drive.sign) == (-1, 1)
+    a, text = made.axis["A"], file.read_text()
+    assert (a.rapid_speed_mm_s / a.mm_per_unit, a.screw_pitch_mm / a.mm_per_unit) == pytest.approx((90.0, 8.192))
+    assert "rapid_speed_deg_s = 90.0  # LinuxCNC: [AXIS_A] MAX_VELOCITY" in text
+    assert "[axis.Y2.nominal]" not in text  # taken over
 
 
 def test_what_is_missing_is_named_at_once_and_nothing_is_written(fdhil: Said, tmp_path: Path) -> None:

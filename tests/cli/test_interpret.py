@@ -138,7 +138,7 @@ def test_a_number_that_another_nc_reads_otherwise_is_questioned(
         ("G0 X1\nG0 Z1\n", "line 2, 'Z': moves axis Z, which the configuration lacks"),
         (
             "G0 X1 A0\nG1 A5 F10\n",
-            "line 2, 'A': moves axis A, which the configuration lacks: add [axis.A]",
+            "line 2, 'A': moves axis A, which the configuration lacks; add [axis.A]",
         ),
         ("G0 X1\nG0 X9000000\n", "line 2, 'X': axis X at 9000000 mm: the set-point"),
     ],

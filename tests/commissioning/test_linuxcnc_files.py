@@ -86,7 +86,7 @@ def test_a_machine_is_read(tmp_path: Path) -> None:
         "axis.Z.rapid_speed_mm_s": 100.0,
         "axis.Z.max_acceleration_mm_s2": 500.0,
     }
-    assert {axis: (scale.increments_per_mm, scale.source) for axis, scale in found.scales.items()} == {
+    assert {axis: (scale.increments_per_unit, scale.source) for axis, scale in found.scales.items()} == {
         "X": (1000.0, "LinuxCNC: cia402.0.pos-scale"),
         "Y": (-819.2, "LinuxCNC: [JOINT_1] SCALE"),
     }
@@ -94,18 +94,65 @@ def test_a_machine_is_read(tmp_path: Path) -> None:
     assert found.notes == []
 
 
+ROTARY_AND_GANTRY = (
+    INI.replace("COORDINATES = X Y Z", "COORDINATES = XYYA\nANGULAR_UNITS = degree").replace(
+        "KINEMATICS = trivkins", "KINEMATICS = trivkins coordinates=XYYA"
+    )
+    + """
+[AXIS_A]
+MAX_VELOCITY = 90
+MAX_ACCELERATION = 600
+[JOINT_3]
+TYPE = ANGULAR
+FERROR = 2
+SCALE = 8192
+MIN_LIMIT = -720
+MAX_LIMIT = 720
+"""
+)
+
+
+def test_a_rotary_axis_is_read_in_degrees_and_the_second_joint_of_a_gantry_as_a_second_drive(tmp_path: Path) -> None:
+    found = machine(tmp_path, ROTARY_AND_GANTRY.replace("[JOINT_2]", "[JOINT_2]\nSCALE = 819.2"))
+    assert found.axes == ("X", "Y", "Y2", "A")
+    of_table = {
+        path.removeprefix("axis.A."): value for path, value in told(found).items() if path.startswith("axis.A.")
+    }
+    assert of_table == {
+        "unit": "deg", "rapid_speed_deg_s": 90.0, "max_acceleration_deg_s2": 600.0,
+        "drive.following_error_window_deg": 2.0,
+    }  # fmt: skip
+    assert not any(path.startswith("axis.Y2.") for path in told(found))
+    assert {axis: scale.increments_per_unit for axis, scale in found.scales.items()} == {
+        "X": 1000.0, "Y": -819.2, "Y2": 819.2, "A": 8192.0
+    }  # fmt: skip
+    assert found.notes == ["LinuxCNC lets go A -720 to 720 deg: give `fdhil commission --room` no more than that"]
+
+
+def test_wrapped_rotary_axis_is_told(tmp_path: Path) -> None:
+    ini = ROTARY_AND_GANTRY.replace("[AXIS_A]", "[AXIS_A]\nWRAPPED_ROTARY = 1")
+    assert told(machine(tmp_path, ini))["nc.wrapped_axes"] == ["A"]
+
+
+def test_radians_become_degrees_and_other_angles_are_refused(tmp_path: Path) -> None:
+    ini = ROTARY_AND_GANTRY.replace("ANGULAR_UNITS = degree", "ANGULAR_UNITS = radian")
+    assert told(machine(tmp_path, ini))["axis.A.rapid_speed_deg_s"] == pytest.approx(math.degrees(90.0))
+    with pytest.raises(ConfigError, match=r"TRAJ\.ANGULAR_UNITS.*is 'turns'.*one of degree"):
+        machine(tmp_path, ini.replace("= radian", "= turns"))
+
+
 def test_inches_become_millimetres(tmp_path: Path) -> None:
     found = machine(tmp_path, INI.replace("LINEAR_UNITS = mm", "LINEAR_UNITS = inch"))
     assert told(found)["axis.Y.rapid_speed_mm_s"] == pytest.approx(7620.0)
-    assert found.scales["Y"].increments_per_mm == pytest.approx(-819.2 / 25.4)
+    assert found.scales["Y"].increments_per_unit == pytest.approx(-819.2 / 25.4)
     assert told(machine(tmp_path, INI.replace("= mm", "= 1.0")))["axis.Y.rapid_speed_mm_s"] == 300.0
 
 
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("KINEMATICS = trivkins", "KINEMATICS = trivkins coordinates=xyy", "axis Y has joint 2 besides joint 1"),
-        ("KINEMATICS = trivkins", "KINEMATICS = trivkins coordinates=XYA", "axis A (joint 2) is rotary"),
+        ("KINEMATICS = trivkins", "KINEMATICS = trivkins coordinates=yyy", "axis Y has a third joint, 2: left out"),
+        ("KINEMATICS = trivkins", "KINEMATICS = trivkins coordinates=XYA", "axis A is rotary and left out: correct"),
         ("COORDINATES = X Y Z", "COORDINATES = X Y B", "axis B is joint 4 of trivkins without coordinates=, and there"),
         ("[AXIS_Z]\nMAX_VELOCITY = 100", "[AXIS_Z]", "axis Z: [AXIS_Z] has no MAX_VELOCITY, so that LinuxCNC takes 1"),
         ("MAX_VELOCITY = 550", "MAX_VELOCITY = 450", "does not keep it in programmed moves; make both equal"),
@@ -271,7 +318,7 @@ def test_spoilt_files_are_read_or_refused(spoilt: list[tuple[int, str]], step: i
     with contextlib.suppress(ConfigError):
         found = machine_of(ini, hal, Path("mill.ini"))
         assert found.axes
-        assert all(math.isfinite(scale.increments_per_mm) for scale in found.scales.values())
+        assert all(math.isfinite(scale.increments_per_unit) for scale in found.scales.values())
 
 
 @pytest.mark.debian

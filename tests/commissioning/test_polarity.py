@@ -12,8 +12,10 @@ import pytest
 from fdhil.commissioning.polarity import judge_acceleration, judge_jog
 from fdhil.commissioning.set_points import straight
 from fdhil.records import Recording, SlowVoltage, frozen
+from tests.bench import bench_config
 
 DT, PITCH, JOG = 0.001, 20.0, 5.0
+AXIS = bench_config("X").axis["X"]
 R, K, J, FRICTION = 0.5, 0.8, 0.075, 5.0
 
 
@@ -34,13 +36,18 @@ def jogged(weight_nm: float = 0.0, top_mm_s: float = 5.0, way_mm: float = JOG) -
 
 
 def causes(jog: Recording) -> str:
-    return "; ".join(finding.cause for finding in judge_jog(jog, JOG) if finding.ok is False)
+    return "; ".join(finding.cause for finding in judge_jog(jog, JOG, AXIS) if finding.ok is False)
 
 
 @pytest.mark.parametrize("weight_nm", [0.0, 20.0, -20.0])
 def test_a_right_axis_passes_also_one_that_carries_a_weight(weight_nm: float) -> None:
     jog = jogged(weight_nm)
-    assert [f.point for f in judge_jog(jog, JOG) if f.ok] == ["travel", "speed unit", "current sign", "voltage sign"]
+    assert [f.point for f in judge_jog(jog, JOG, AXIS) if f.ok] == [
+        "travel",
+        "speed unit",
+        "current sign",
+        "voltage sign",
+    ]
     lossy = replace(jog, current_a=frozen(np.where(np.arange(jog.current_a.size) % 50 == 3, np.nan, jog.current_a)))
     assert causes(lossy) == ""
 
@@ -90,7 +97,7 @@ def test_a_slower_sensor_is_judged_too() -> None:
 
 
 def test_without_a_voltage_nothing_is_said_of_it() -> None:
-    (voltage,) = [f for f in judge_jog(replace(jogged(), voltage_v=None), JOG) if f.point == "voltage sign"]
+    (voltage,) = [f for f in judge_jog(replace(jogged(), voltage_v=None), JOG, AXIS) if f.point == "voltage sign"]
     assert (voltage.ok, voltage.cause) == (None, "no voltage was heard")
 
 
@@ -107,7 +114,7 @@ def test_a_table_that_goes_another_way_is_told() -> None:
     seen = replace(
         jog, table_mm=frozen(np.where(np.arange(jog.position_mm.size) % 3 == 0, jog.position_mm + 7.0, np.nan))
     )
-    assert [f.point for f in judge_jog(seen, JOG) if f.ok][2] == "table"
+    assert [f.point for f in judge_jog(seen, JOG, AXIS) if f.ok][2] == "table"
     turned = replace(jog, table_mm=-jog.position_mm)
     assert "its table goes -1 times the way of its motor" in causes(turned)
     assert causes(replace(jog, table_mm=jog.position_mm * np.nan)) == ""

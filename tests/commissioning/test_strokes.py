@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import pytest
 
-from fdhil.commissioning.strokes import Room, plan_jog, plan_rapid
-from fdhil.config import Axis
+from fdhil.commissioning.strokes import Room, plan_jog, plan_rapid, require_single_drive
+from fdhil.config import Axis, parse
 from fdhil.errors import DriveFault
-from tests.drivers.wire import machine
+from tests.bench import rotary_and_gantry_document
+from tests.drivers import wire
 
 
 @pytest.fixture
 def axis() -> Axis:
     """500 mm/s with 4000 mm/s2."""
-    return machine().axis["X"]
+    return wire.machine().axis["X"]
 
 
 def test_a_jog_is_short_slow_and_toward_the_side_with_room(axis: Axis) -> None:
@@ -50,3 +51,23 @@ def test_what_would_be_no_rapid_is_refused_with_the_room_it_needs(axis: Axis) ->
     with pytest.raises(DriveFault, match=r"room from -50 to \+90 mm for test rapids, which need 102 mm to one side"):
         plan_rapid("X", axis, Room(-50.0, 90.0))
     assert plan_rapid("X", axis, Room(-50.0, 102.0)).speed_mm_s >= 325.0
+
+
+def test_strokes_of_a_rotary_axis_take_room_and_are_told_in_degrees() -> None:
+    axis = parse(rotary_and_gantry_document()).axis["A"]
+    rapid = plan_rapid("A", axis, Room(-10.0, 300.0))
+    assert rapid.speed_mm_s == pytest.approx(280.0 * axis.mm_per_unit)
+    assert str(rapid).endswith("deg toward plus at 280 deg/s")
+    assert str(plan_jog("A", axis, Room(0.0, 90.0))) == "2.86479 deg toward plus at 2.86 deg/s"
+    with pytest.raises(
+        DriveFault, match=r"room from \+0 to \+0\.1 deg for the jog, which needs 0\.286 deg to one side"
+    ):
+        plan_jog("A", axis, Room(0.0, 0.1))
+
+
+@pytest.mark.parametrize("axis", ["Y", "Y2"])
+def test_no_drive_of_a_gantry_axis_is_moved_alone(axis: str) -> None:
+    machine = parse(rotary_and_gantry_document())
+    with pytest.raises(DriveFault, match=f"drive {axis}: Y and Y2 move one beam, and one of them alone would skew it"):
+        require_single_drive(machine, axis)
+    require_single_drive(machine, "X")

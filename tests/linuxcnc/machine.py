@@ -39,7 +39,7 @@ MAX_ACCELERATION = {acceleration}
 MIN_LIMIT = -1000
 MAX_LIMIT = 1000
 [JOINT_{number}]
-TYPE = LINEAR
+TYPE = {kind}
 HOME = 0
 HOME_SEARCH_VEL = 0
 HOME_LATCH_VEL = 0
@@ -82,6 +82,8 @@ ANGULAR_UNITS = degree
 NO_FORCE_HOMING = 1
 DEFAULT_LINEAR_VELOCITY = {speed}
 MAX_LINEAR_VELOCITY = 2000
+DEFAULT_ANGULAR_VELOCITY = {speed}
+MAX_ANGULAR_VELOCITY = 2000
 DEFAULT_LINEAR_ACCELERATION = {acceleration}
 MAX_LINEAR_ACCELERATION = {acceleration}
 """
@@ -102,18 +104,18 @@ class LinuxCnc:
         self._lines: IO[str] | None = None
         write_machine(self.folder, speed_mm_s, acceleration_mm_s2, hal, axes)
         with socket.create_server(("127.0.0.1", 0)) as door:
-            self._start(door.getsockname()[1], len(axes))
+            self._start(door.getsockname()[1], axes)
             try:
                 self._meet(door)
             except BaseException:
                 self.close()
                 raise
 
-    def _start(self, port: int, joints: int) -> None:
+    def _start(self, port: int, axes: str) -> None:
         if os.geteuid() == 0:
             for path in (self.folder, *self.folder.iterdir()):
                 os.chown(path, NOBODY, NOBODY)
-        environment = os.environ | {"HOME": str(self.folder), "OPERATOR_PORT": str(port), "JOINTS": str(joints)}
+        environment = os.environ | {"HOME": str(self.folder), "OPERATOR_PORT": str(port), "AXES": axes}
         environment.pop("DISPLAY", None)
         with (self.folder / "log").open("ab") as log:
             self._child = self._as_nobody(
@@ -249,7 +251,11 @@ def write_machine(folder: Path, speed_mm_s: float, acceleration_mm_s2: float, ha
     (folder / "nobody_at_the_panel.py").chmod(0o755)
     limits = {"speed": speed_mm_s, "acceleration": acceleration_mm_s2}
     ini = MACHINE.format(folder=folder, axes=axes, joints=len(axes), **limits)
-    ini += "".join(AXIS.format(letter=letter, number=number, **limits) for number, letter in enumerate(axes))
+    kinds = ["ANGULAR" if letter in "ABC" else "LINEAR" for letter in axes]
+    ini += "".join(
+        AXIS.format(letter=letter, number=number, kind=kind, **limits)
+        for number, (letter, kind) in enumerate(zip(axes, kinds, strict=True))
+    )
     (folder / "machine.ini").write_text(ini)
     for name in ("machine.tbl", "machine.var", "log"):
         (folder / name).touch()
@@ -281,7 +287,7 @@ class DemandRecorder(LinuxCnc):
                 self._samples.put([float(word) for word in words])
 
     def record(self, program: str) -> Float:
-        """Return the ordered X, Y, Z (n, 3) in mm of each servo cycle of a program, from its first motion to its last.
+        """Return the ordered axes (n, 3), mm or degrees, of each servo cycle of a program, from first to last motion.
 
         It begins at zero, in the state after power-up. AssertionError when a cycle was not recorded or nothing moved.
         """

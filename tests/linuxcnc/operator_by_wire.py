@@ -19,12 +19,14 @@ from typing import Any
 
 import linuxcnc  # type: ignore[import-not-found]  # the package's own module, for the system's Python alone
 
-JOINTS = int(os.environ["JOINTS"])
+AXES = os.environ["AXES"]
+JOINTS = len(AXES)
 PATIENCE_S = 300.0
 LOOK_S = 1.0
 # what a program may have left changed; the axes go back to zero
-POWER_UP = ["M64 P0", "G54 G92.1 G49 G40 G80 G8", *(f"G10 L2 P{system} X0 Y0 Z0 R0" for system in range(1, 10))]
-POWER_UP += ["G53 G0 X0 Y0 Z0", "G64 G17 G21 G90 G91.1 G94 G97 G98", "M5 M9 M48", "M65 P0"]
+ZERO = " ".join(f"{axis}0" for axis in AXES)
+POWER_UP = ["M64 P0", "G54 G92.1 G49 G40 G80 G8", *(f"G10 L2 P{system} {ZERO} R0" for system in range(1, 10))]
+POWER_UP += [f"G53 G0 {ZERO}", "G64 G17 G21 G90 G91.1 G94 G97 G98", "M5 M9 M48", "M65 P0"]
 
 
 class Failed(Exception):

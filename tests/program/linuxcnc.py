@@ -126,8 +126,8 @@ class _Canon:
         self.scale = scale
 
 
-def ask(program: Path, limit_s: float = 20.0) -> Answer:
-    """Run the reference on a file, with tools that have no length and no stored parameters.
+def ask(program: Path, limit_s: float = 20.0, ini: str = "") -> Answer:
+    """Run the reference on a file and an INI of this text, with tools that have no length and no stored parameters.
 
     SubprocessError when it does not end in time, or crashes.
     """
@@ -135,6 +135,9 @@ def ask(program: Path, limit_s: float = 20.0) -> Answer:
         (Path(folder) / "tool.tbl").write_text("".join(f"T{n} P{n} Z0 D0\n" for n in range(1, 56)))
         (Path(folder) / "empty.var").touch()
         arguments = [str(RS274), "-t", f"{folder}/tool.tbl", "-v", f"{folder}/empty.var", "-g", "-n", "2"]
+        if ini:
+            (Path(folder) / "machine.ini").write_text(ini)
+            arguments += ["-i", f"{folder}/machine.ini"]
         arguments.append(str(program.resolve()))
         done = subprocess.run(arguments, cwd=program.parent, capture_output=True, timeout=limit_s, check=False)
     if done.returncode < 0:

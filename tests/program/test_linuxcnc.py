@@ -5,10 +5,12 @@ from __future__ import annotations
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from fdhil.errors import ProgramError
-from fdhil.program import Motion, interpret
+from fdhil.program import Budget, Motion, interpret
+from fdhil.program.dialect import Dialect
 from tests.program.generated import GROUPS, program
 from tests.program.linuxcnc import Answer, ask, cases, difference
 
@@ -47,6 +49,18 @@ def compare(motions: list[Motion], error: str, reference: Answer, tolerance_mm: 
     if error:
         return ""
     return difference(motions, reference.motions, tolerance_mm)
+
+
+def test_wrapped_rotary_axis_turns_as_the_reference_has_it(tmp_path: Path) -> None:
+    """Absolute words of either sign, G91, G53 and G92, in a random order."""
+    path, random = tmp_path / "program.ngc", np.random.default_rng(4)
+    budget = Budget(dialect=Dialect(wrapped_axes=("A",)))
+    for _ in range(20):
+        words = [f"A{angle:.3f}" for angle in random.choice([-1, 1], 40) * random.uniform(0.0, 359.0, 40)]
+        heads = random.choice(["G90 G0", "G90 G0", "G91 G0", "G90 G53 G0", "G92"], 40)
+        path.write_text("\n".join(map(" ".join, zip(heads, words, strict=True))) + "\nM2\n")
+        reference = ask(path, ini="[AXIS_A]\nWRAPPED_ROTARY = 1\n[RS274NGC]\n")
+        assert compare(list(interpret(path, budget)), "", reference, ROUNDING_MM) == ""
 
 
 @pytest.mark.parametrize("group", GROUPS)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -57,13 +58,13 @@ def ours(text: str, acceleration_mm_s2: float = ACCELERATION_MM_S2, profile: str
     return np.asarray(rows[: moving[-1] + 2])
 
 
-@pytest.fixture(scope="module")
-def theirs() -> Iterator[Theirs]:
+@contextmanager
+def recorder(axes: str) -> Iterator[Theirs]:
     """LinuxCNC's rows for a program; where they are more than ``most_rows`` they are recorded again, twice at most.
 
     Where a busy computer holds its interpreter up, its planner has nothing to look ahead to and brakes.
     """
-    with DemandRecorder(acceleration_mm_s2=ACCELERATION_MM_S2) as nc:
+    with DemandRecorder(acceleration_mm_s2=ACCELERATION_MM_S2, axes=axes) as nc:
 
         def recorded(text: str, most_rows: float) -> Float:
             for _ in range(3):
@@ -71,6 +72,12 @@ def theirs() -> Iterator[Theirs]:
                     break
             return rows
 
+        yield recorded
+
+
+@pytest.fixture(scope="module")
+def theirs() -> Iterator[Theirs]:
+    with recorder("XYZ") as recorded:
         yield recorded
 
 

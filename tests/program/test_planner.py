@@ -186,11 +186,11 @@ def test_the_path_is_run_no_faster_than_the_nc_allows(profile: str, text: str, m
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_a_motion_of_an_axis_that_is_not_planned_is_refused_with_its_line(profile: str) -> None:
-    """Configured or not; a word that leaves the axis where it is orders nothing."""
+    """Missing, or configured in mm; a word that leaves the axis where it is orders nothing."""
     document = bench_document("XYA")
     document["nc"] = {"profile": profile}
     config = parse(document)
     assert plan(list(interpret(["G0 X10 A0", "G1 Y5 A0 F1000"])), config).position_mm["A"].max() == 0.0
     for text in ("A5", "X20 A5", "B1"):
-        with pytest.raises(ProgramError, match=f"line 2, '{text[-2]}': moves axis {text[-2]}.* planned in X, Y and Z"):
+        with pytest.raises(ProgramError, match=f"line 2, '{text[-2]}': moves axis {text[-2]}, which.*unit = \"deg\""):
             plan(list(interpret(["G0 X10", f"G1 {text} F1000"])), config)

@@ -228,3 +228,49 @@ def test_what_stands_twice_is_refused_and_empty_cells_of_a_spreadsheet_are_not()
 def test_a_recording_saved_with_other_separators_shows_what_it_has() -> None:
     with pytest.raises(RecordingError, match=r"no column time_s, .*; it has 'time_s;voltage_V;.*--columns"):
         parse_recording(_text().replace(",", ";"))
+
+
+def _angular(text: str) -> str:
+    """The same motor, its axis told as a rotary one of 12 degrees a turn."""
+    text = text.replace("# pitch_m_per_rev: 0.02", "# pitch_deg_per_rev: 12\n# radius_m: 0.1")
+    text = text.replace("# rapid_speed_m_per_s: 0.5", "# rapid_speed_deg_per_s: 300")
+    return text.replace("position_m", "position_deg").replace("demand_m", "demand_deg")
+
+
+def test_recording_of_a_rotary_axis_is_read_in_degrees() -> None:
+    recording = parse_recording(_angular(_text()))
+    mm_per_deg = math.radians(100.0)
+    assert recording.pitch_mm == pytest.approx(12.0 * mm_per_deg)
+    assert recording.rapid_speed_rad_s == pytest.approx(300.0 / 12.0 * 2 * math.pi)
+    assert recording.position_mm[2] == pytest.approx(1.0 * mm_per_deg)
+    assert recording.demand_mm[2] == pytest.approx(1.0 * mm_per_deg)
+
+
+def test_direct_drive_of_a_large_table_is_read() -> None:
+    text = _angular(_text()).replace("pitch_deg_per_rev: 12", "pitch_deg_per_rev: 360")
+    assert parse_recording(text.replace("radius_m: 0.1", "radius_m: 0.8")).pitch_mm == pytest.approx(1600 * math.pi)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("# radius_m: 0.1\n", "", "has no header radius_m: give the radius at which its angles count as path error"),
+        ("radius_m: 0.1", "radius_m: 100", "radius_m = 100, machines have 0.01 to 10"),
+        ("pitch_deg_per_rev: 12", "pitch_deg_per_rev: 720", "pitch_deg_per_rev = 720, machines have 0.001 to 360"),
+        (
+            "# axis",
+            "# pitch_m_per_rev: 0.02\n# axis",
+            "has pitch_m_per_rev and pitch_deg_per_rev: keep that of its axis",
+        ),
+        ("demand_deg", "demand_m", "has no column demand_deg"),
+        (
+            "# pitch_deg_per_rev: 12",
+            "# pitch_m_per_rev: 0.02",
+            "has position_deg and demand_deg, and no header pitch_deg_per_rev",
+        ),
+    ],
+)
+def test_what_a_recording_of_a_rotary_axis_lacks_is_named(old: str, new: str, words: str) -> None:
+    with pytest.raises(RecordingError) as caught:
+        parse_recording(_angular(_text()).replace(old, new))
+    assert words in str(caught.value)

@@ -11,7 +11,8 @@ from fdhil.commissioning.init.drives import FoundBus, FoundDrive, needs_dc_link
 from fdhil.commissioning.init.linuxcnc import Machine, Scale
 from fdhil.commissioning.init.questions import PITCH, QUESTIONS, Question
 from fdhil.commissioning.init.told import Told, rounded
-from fdhil.config import Drive
+from fdhil.config import Drive, is_second_drive
+from fdhil.config.axis_tables import angular, linear
 from fdhil.config.reading import checked
 from fdhil.drivers.cia402.abilities import GENERIC
 from fdhil.drivers.cia402.profile import DriveProfile
@@ -100,12 +101,19 @@ def settle_axis(
 ) -> None:
     """Settle [axis.X]; ``others`` are the axes before it, ``found`` what is on the buses."""
     drive = _settle_drive(draft, axis, found)
+    scale = nc.scales.get(axis) if nc else None
+    if is_second_drive(axis):  # it takes the rest from the first
+        if scale is not None:
+            draft.tell(f"axis.{axis}.drive.sign", Told(-1 if scale.increments_per_unit < 0 else 1, scale.source))
+        return
+    if axis in "ABC":
+        draft.settle(f"axis.{axis}.unit", "deg for a table that turns", Told("deg", f"guessed: {axis} turns", True))
     profile = _settle_profile(draft, axis, drive, folder)
     for key, told in (drive.told if drive is not None else {}).items():
         draft.tell(f"axis.{axis}.{key}", told)
-    _settle_scale(draft, axis, nc.scales.get(axis) if nc else None, others)
+    _settle_scale(draft, axis, scale, others)
     for question in QUESTIONS:
-        if _applies(question.key, profile):
+        if _applies(question.key, profile) and (question.key != "radius_mm" or _is_rotary(draft, axis)):
             _settle(draft, axis, question, others)
     if drive is not None:
         _tell_window(draft, axis, drive.window_increments)
@@ -214,24 +222,34 @@ def _from(path: Path, folder: Path) -> str:
 
 def _settle_scale(draft: Draft, axis: str, scale: Scale | None, others: Sequence[str]) -> None:
     """Of the NC's scale, the drive's increments and the pitch two tell the third; all three must agree."""
-    turn, pitch = f"axis.{axis}.drive.increments_per_rev", f"axis.{axis}.screw_pitch_mm"
+    turn, pitch = f"axis.{axis}.drive.increments_per_rev", _path(draft, axis, PITCH.key)
     if scale is not None:
-        per_mm = abs(scale.increments_per_mm)
+        per_unit = abs(scale.increments_per_unit)
         if draft.get(turn) and pitch not in draft.values:
-            draft.tell(pitch, Told(rounded(draft.get(turn) / per_mm), f"{scale.source}, and the drive's increments"))
-        if scale.increments_per_mm < 0:
+            draft.tell(pitch, Told(rounded(draft.get(turn) / per_unit), f"{scale.source}, and the drive's increments"))
+        if scale.increments_per_unit < 0:
             draft.tell(f"axis.{axis}.drive.sign", Told(-1, f"{scale.source} is negative"))
     _settle(draft, axis, PITCH, others)
     if scale is None or draft.get(pitch) is None:
         return
     if turn not in draft.values:
-        draft.tell(turn, Told(round(per_mm * draft.get(pitch)), f"{scale.source}, times the pitch"))
+        draft.tell(turn, Told(round(per_unit * draft.get(pitch)), f"{scale.source}, times the pitch"))
     found = draft.get(turn) / draft.get(pitch)
-    if abs(found - per_mm) > 1e-3 * per_mm:
+    if abs(found - per_unit) > 1e-3 * per_unit:
+        unit = "deg" if _is_rotary(draft, axis) else "mm"
         draft.notes.append(
-            f"axis {axis}: {scale.source} is {per_mm:g} increments/mm, the drive and the pitch make {found:g}: one of "
+            f"axis {axis}: {scale.source} is {per_unit:g} increments/{unit}, drive and pitch make {found:g}: one of "
             "the three is wrong, or the NC's scale counts something else; measure before anything moves"
         )
+
+
+def _is_rotary(draft: Draft, axis: str) -> bool:
+    return bool(draft.get(f"axis.{axis}.unit") == "deg")
+
+
+def _path(draft: Draft, axis: str, key: str) -> str:
+    """Return the path of a key, as a rotary axis has it where the axis is one."""
+    return f"axis.{axis}.{angular(key) if _is_rotary(draft, axis) else key}"
 
 
 def _applies(key: str, profile: DriveProfile | None) -> bool:
@@ -242,10 +260,11 @@ def _applies(key: str, profile: DriveProfile | None) -> bool:
 
 def _settle(draft: Draft, axis: str, question: Question, others: Sequence[str]) -> None:
     """Settle one key; where nothing tells or guesses it, a former axis' value is proposed to whoever is asked."""
-    path = f"axis.{axis}.{question.key}"
+    path = _path(draft, axis, question.key)
     proposal = _guess(draft, axis, question)
     if proposal is None and draft.ask is not None:
-        former = [(other, told) for other in others if (told := draft.values.get(f"axis.{other}.{question.key}"))]
+        key = path.removeprefix(f"axis.{axis}.")
+        former = [(other, told) for other in others if (told := draft.values.get(f"axis.{other}.{key}"))]
         if former:
             proposal = Told(former[-1][1].value, f"guessed: as axis {former[-1][0]}", guessed=True)
     if proposal is None and question.guess is not None and question.follows and path not in draft.values:
@@ -255,7 +274,8 @@ def _settle(draft: Draft, axis: str, question: Question, others: Sequence[str]) 
 
 def _guess(draft: Draft, axis: str, question: Question) -> Told | None:
     here = f"axis.{axis}."
-    known = {path.removeprefix(here): told.value for path, told in draft.values.items() if path.startswith(here)}
+    own = {path: told.value for path, told in draft.values.items() if path.startswith(here)}
+    known = {linear(path.removeprefix(here)): value for path, value in own.items()}  # guesses take ratios of lengths
     try:
         value: Any = question.guess(known) if question.guess is not None else None
     except (KeyError, TypeError, ZeroDivisionError):  # too little is known, or an answer is no number
@@ -265,8 +285,8 @@ def _guess(draft: Draft, axis: str, question: Question) -> Told | None:
 
 def _tell_window(draft: Draft, axis: str, increments: int | None) -> None:
     """The drive's own following-error window goes before that of the NC."""
-    turn, pitch = draft.get(f"axis.{axis}.drive.increments_per_rev"), draft.get(f"axis.{axis}.screw_pitch_mm")
-    path = f"axis.{axis}.drive.following_error_window_mm"
+    turn, pitch = draft.get(f"axis.{axis}.drive.increments_per_rev"), draft.get(_path(draft, axis, PITCH.key))
+    path = _path(draft, axis, "drive.following_error_window_mm")
     if increments in (None, *NO_OTHER_WINDOW) or not turn or not pitch:
         return
     told = Told(rounded(increments * pitch / turn), "the drive: 0x6065")

@@ -2,22 +2,26 @@
 
 Units: the INI's own ([TRAJ] LINEAR_UNITS) are taken to millimetres. Programmed moves keep [AXIS_x] MAX_VELOCITY and
 MAX_ACCELERATION, less the share of OFFSET_AV_RATIO, and [TRAJ] MAX_LINEAR_VELOCITY along the path; defaults are 1.
-Neither [JOINT_n] nor [TRAJ] MAX_LINEAR_ACCELERATION limits them (measured on LinuxCNC 2.9). Rotary axes and the second
-joint of a gantry are named and left out.
+Neither [JOINT_n] nor [TRAJ] MAX_LINEAR_ACCELERATION limits them (measured on LinuxCNC 2.9). Rotary axes are in degrees;
+the second joint of a gantry axis Y is the drive Y2.
 """
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 from fdhil.commissioning.init.linuxcnc_text import Hal, Ini, finite, parse_hal, parse_ini
 from fdhil.commissioning.init.told import Told, rounded
+from fdhil.config import is_second_drive
 from fdhil.errors import ConfigError, ConfigFault
 
 HAL_LIBRARY = Path("/usr/share/linuxcnc/hallib")
 MAX_BYTES = 1024 * 1024
 UNITS_MM = {"mm": 1.0, "metric": 1.0, "inch": 25.4, "in": 25.4, "imperial": 25.4}
 ROTARY = "ABC"
+UNITS_DEG = {"degree": 1.0, "deg": 1.0, "rad": math.degrees(1.0), "radian": math.degrees(1.0), "grad": 0.9, "gon": 0.9}
 ALL_AXES = "XYZABCUVW"
 _SCALE_PINS = ("position-scale", "pos-scale", "scale")
 _SCALE_KEYS = ("SCALE", "INPUT_SCALE", "ENCODER_SCALE", "STEP_SCALE")
@@ -29,9 +33,9 @@ LARGEST_OFFSET_MM = 0.25  # the ceiling of [axis.X.correction]
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Increments per millimetre, negative where the drive counts against the axis, and where it was read."""
+    """Increments per millimetre or degree, negative where the drive counts against the axis, and where it was read."""
 
-    increments_per_mm: float
+    increments_per_unit: float
     source: str
 
 
@@ -103,20 +107,43 @@ def machine_of(ini: Ini, hal: Hal, path: Path) -> Machine:
     machine.axes = tuple(joints)
     _common(ini, machine)
     _planner(ini, joints, unit_mm, machine)
+    units = {letter: _unit(ini, path, letter, unit_mm) for letter in joints}
     for letter, joint in joints.items():
-        _axis(ini, hal, letter, joint, unit_mm, machine)
-    machine.notes += _travel(ini, joints, unit_mm)
+        if is_second_drive(letter):
+            scale = _scale(ini, hal, joint, units[letter].factor)
+            machine.scales |= {letter: scale} if scale is not None else {}
+        else:
+            _axis(ini, hal, letter, joint, units[letter], machine)
+    machine.notes += _travel(ini, joints, units)
     return machine
 
 
-def _travel(ini: Ini, joints: Mapping[str, int], unit_mm: float) -> Iterator[str]:
+class _Unit(NamedTuple):
+    """What fdhil has an axis in, and how much of that the INI's unit is."""
+
+    name: str
+    factor: float
+
+
+def _unit(ini: Ini, path: Path, letter: str, unit_mm: float) -> _Unit:
+    if letter not in ROTARY:
+        return _Unit("mm", unit_mm)
+    named = ini.text("TRAJ", "ANGULAR_UNITS").lower() or "degree"
+    if named not in UNITS_DEG:
+        raise _fault(path, "TRAJ.ANGULAR_UNITS", f"is {named[:40]!r}", f"one of {', '.join(UNITS_DEG)}")
+    return _Unit("deg", UNITS_DEG[named])
+
+
+def _travel(ini: Ini, joints: Mapping[str, int], units: Mapping[str, _Unit]) -> Iterator[str]:
+    """Say how far the axes may go: commissioning asks for room, and no key of the configuration holds it."""
     ways = []
     for letter, joint in joints.items():
         places = (f"AXIS_{letter}", f"JOINT_{joint}")
         low = [value for place in places if (value := ini.number(place, "MIN_LIMIT")) is not None]
         high = [value for place in places if (value := ini.number(place, "MAX_LIMIT")) is not None]
         if low and high:
-            ways.append(f"{letter} {max(low) * unit_mm:g} to {min(high) * unit_mm:g} mm")
+            unit, factor = units[letter]
+            ways.append(f"{letter} {max(low) * factor:g} to {min(high) * factor:g} {unit}")
     if ways:
         yield f"LinuxCNC lets go {', '.join(ways)}: give `fdhil commission --room` no more than that"
 
@@ -151,13 +178,15 @@ def _joints(ini: Ini, notes: list[str]) -> dict[str, int]:
         section = f"JOINT_{joint}"
         if section not in ini.sections:
             continue
-        if letter in ROTARY or ini.text(section, "TYPE").upper() == "ANGULAR":
-            notes.append(f"axis {letter} (joint {joint}) is rotary and left out: fdhil knows linear feed drives")
+        angular = ini.text(section, "TYPE").upper() == "ANGULAR"
+        if letter in ALL_AXES and angular != (letter in ROTARY):
+            kind, other = ("rotary", "ANGULAR") if letter in ROTARY else ("linear", "LINEAR")
+            text = f"axis {letter} is {kind} and left out: correct [{section}] TYPE to {other}, or the letter"
+            notes.append(text)
+        elif f"{letter}2" in joints:
+            notes.append(f"axis {letter} has a third joint, {joint}: left out; a gantry axis has two drives")
         elif letter in joints:
-            notes.append(
-                f"axis {letter} has joint {joint} besides joint {joints[letter]} (a gantry); it is left out: "
-                "give its drive an axis of its own, by another letter, to watch it; correct none of the two"
-            )
+            joints[f"{letter}2"] = joint
         elif letter.isalpha() and letter.isascii():
             joints[letter] = joint
     return joints
@@ -192,7 +221,7 @@ def _planner(ini: Ini, joints: Mapping[str, int], unit_mm: float, machine: Machi
         )
         return
     told["nc.profile"] = Told("jerk_limited", "LinuxCNC: [TRAJ] PLANNER_TYPE 1, the S-curve planner of 2.10")
-    for letter in joints:
+    for letter in (each for each in joints if each not in ROTARY and not is_second_drive(each)):
         source = "LinuxCNC: [TRAJ] MAX_LINEAR_JERK"
         told[f"axis.{letter}.max_jerk_mm_s3"] = Told(rounded(min(jerk * unit_mm, LARGEST_JERK)), source)
     machine.notes.append(
@@ -224,41 +253,47 @@ def _limit(ini: Ini, letter: str, joint: int, name: str, machine: Machine) -> tu
     return value * (1.0 - ratio), source
 
 
-def _axis(ini: Ini, hal: Hal, letter: str, joint: int, unit_mm: float, machine: Machine) -> None:
-    told, here = machine.told, f"axis.{letter}"
-    path = ini.number("TRAJ", "MAX_LINEAR_VELOCITY")
+def _axis(ini: Ini, hal: Hal, letter: str, joint: int, unit: _Unit, machine: Machine) -> None:
+    told, here, rotary, factor = machine.told, f"axis.{letter}", unit.name == "deg", unit.factor
+    if rotary:
+        told[f"{here}.unit"] = Told("deg", f"LinuxCNC: axis {letter} is rotary")
+        if ini.number(f"AXIS_{letter}", "WRAPPED_ROTARY"):
+            before = told["nc.wrapped_axes"].value if "nc.wrapped_axes" in told else []
+            told["nc.wrapped_axes"] = Told([*before, letter], "LinuxCNC: WRAPPED_ROTARY")
+    most = f"MAX_{'ANGULAR' if rotary else 'LINEAR'}_VELOCITY"
+    path = ini.number("TRAJ", most)
     value, source = _limit(ini, letter, joint, "MAX_VELOCITY", machine)
     if path is not None and 0 < path < value:  # a move of this axis alone is no faster
-        value, source = path, "LinuxCNC: [TRAJ] MAX_LINEAR_VELOCITY"
-    told[f"{here}.rapid_speed_mm_s"] = Told(rounded(value * unit_mm), source)
+        value, source = path, f"LinuxCNC: [TRAJ] {most}"
+    told[f"{here}.rapid_speed_{unit.name}_s"] = Told(rounded(value * factor), source)
     value, source = _limit(ini, letter, joint, "MAX_ACCELERATION", machine)
-    told[f"{here}.max_acceleration_mm_s2"] = Told(rounded(value * unit_mm), source)
+    told[f"{here}.max_acceleration_{unit.name}_s2"] = Told(rounded(value * factor), source)
     ferror = ini.number(f"JOINT_{joint}", "FERROR")
     if ferror is not None and ferror > 0:
         source = f"LinuxCNC: [JOINT_{joint}] FERROR; the drive's own 0x6065 is compared by fdhil check"
-        told[f"{here}.drive.following_error_window_mm"] = Told(rounded(ferror * unit_mm), source)
-    scale = _scale(ini, hal, joint, unit_mm)
+        told[f"{here}.drive.following_error_window_{unit.name}"] = Told(rounded(ferror * factor), source)
+    scale = _scale(ini, hal, joint, factor)
     if scale is not None:
         machine.scales[letter] = scale
-    machine.notes += _beside(ini, hal, letter, joint, unit_mm)
+    machine.notes += _beside(ini, hal, letter, joint, unit)
 
 
-def _scale(ini: Ini, hal: Hal, joint: int, unit_mm: float) -> Scale | None:
+def _scale(ini: Ini, hal: Hal, joint: int, factor: float) -> Scale | None:
     """Return the scale that HAL sets on what is wired to the joint's feedback or command, else the INI's."""
     for pin in (f"joint.{joint}.motor-pos-fb", f"joint.{joint}.motor-pos-cmd"):
         for component in hal.around(pin):
             for name in _SCALE_PINS:
                 value = finite(hal.given.get(f"{component}.{name}", ""))
                 if value:
-                    return Scale(value / unit_mm, f"LinuxCNC: {component}.{name}")
+                    return Scale(value / factor, f"LinuxCNC: {component}.{name}")
     for key in _SCALE_KEYS:
         value = ini.number(f"JOINT_{joint}", key)
         if value:
-            return Scale(value / unit_mm, f"LinuxCNC: [JOINT_{joint}] {key}")
+            return Scale(value / factor, f"LinuxCNC: [JOINT_{joint}] {key}")
     return None
 
 
-def _beside(ini: Ini, hal: Hal, letter: str, joint: int, unit_mm: float) -> Iterator[str]:
+def _beside(ini: Ini, hal: Hal, letter: str, joint: int, unit: _Unit) -> Iterator[str]:
     """Say what LinuxCNC itself corrects, and what that means beside fdhil's offsets."""
     section = f"JOINT_{joint}"
     if (ini.number(section, "BACKLASH") or 0.0) > 0 or ini.text(section, "COMP_FILE"):
@@ -279,11 +314,11 @@ def _beside(ini: Ini, hal: Hal, letter: str, joint: int, unit_mm: float) -> Iter
             "set-points (0x607A) as they are: wire joint's motor-pos-cmd to the drive, and switch this loop off"
         )
     least = ini.number(section, "MIN_FERROR")
-    if least is not None and 0 < least * unit_mm < 2 * LARGEST_OFFSET_MM:
+    if least is not None and 0 < least * unit.factor < 2 * LARGEST_OFFSET_MM:  # and as many degrees
         yield (
-            f"axis {letter}: [{section}] MIN_FERROR is {least * unit_mm:g} mm; an offset is a following error "
-            f"to LinuxCNC: keep correction.max_offset_um below a quarter of it, or raise it to "
-            f"{4 * LARGEST_OFFSET_MM:g} mm"
+            f"axis {letter}: [{section}] MIN_FERROR is {least * unit.factor:g} {unit.name}; an offset is a following "
+            f"error to LinuxCNC: keep correction.max_offset_{'mdeg' if unit.name == 'deg' else 'um'} below a quarter "
+            f"of it, or raise it to {4 * LARGEST_OFFSET_MM:g} {unit.name}"
         )
 
 

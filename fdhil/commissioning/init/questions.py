@@ -51,6 +51,7 @@ PITCH = Question(
 )
 QUESTIONS = (
     Question("drive.increments_per_rev", "the drive's tool: what its position counts in one turn of the motor"),
+    Question("radius_mm", "the radius of the largest part on the table: there an angle is weighed as path error"),
     Question("rapid_speed_mm_s", "the NC's parameter for rapids; 1 m/min is 16.67 mm/s"),
     Question("max_acceleration_mm_s2", "the NC's parameter for the axis; 1 m/s2 is 1000 mm/s2"),
     Question("drive.rated_current_a", "the drive's tool or object 0x6075; often the motor's continuous current"),

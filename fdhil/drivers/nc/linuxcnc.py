@@ -32,6 +32,7 @@ class LinuxCnc:
     def __init__(self, config: MachineConfig) -> None:
         settings = config.nc_source.linuxcnc
         self._place = settings.host, settings.port
+        self._axes, self._mm_per_degree = tuple(config.axis), config.mm_per_degree
         self._silence_s = config.nc_source.silence_s
         self.name = f"LinuxCNC at {settings.host}:{settings.port}"
         self._reader: asyncio.StreamReader | None = None
@@ -125,7 +126,7 @@ class LinuxCnc:
                 feed_hold=_maybe(told, "feed_hold", bool),
                 tool=_maybe(told, "tool", _whole),
                 program=_maybe(told, "program", str),
-                demand_mm={str(axis): _finite(mm) for axis, mm in told["mm"].items()},
+                demand_mm=self._demand_mm(told["mm"]),
                 nc_tick=_whole(told["cycle"]),
                 nc_period_s=self._period_s,
             )
@@ -133,6 +134,12 @@ class LinuxCnc:
             raise ProtocolError(
                 self.name, f"a state cannot be read ({error!r}); use the bridge of this fdhil"
             ) from None
+
+    def _demand_mm(self, places: Mapping[str, Any]) -> dict[str, float]:
+        """Return the places of the machine's drives: both of a gantry axis at one, degrees as lengths of arc."""
+        found = {str(axis): _finite(place) for axis, place in places.items()}
+        found |= {name: found[name[0]] for name in self._axes if name[0] in found}
+        return {name: place * self._mm_per_degree.get(name, 1.0) for name, place in found.items()}
 
 
 def _maybe(told: Mapping[str, Any], key: str, kind: Any) -> Any:

@@ -17,7 +17,7 @@ import numpy as np
 from fdhil.config import MachineConfig
 from fdhil.errors import ProgramError
 from fdhil.program.dialect import Dialect
-from fdhil.program.motions import Dwell, Motion, Probe
+from fdhil.program.motions import ALL_AXES, Dwell, Motion, Probe
 from fdhil.program.planner import linuxcnc
 from fdhil.program.planner.limits import checked
 from fdhil.program.planner.look_ahead import LookAhead
@@ -50,7 +50,7 @@ def stream(
     A block is there as soon as the motions that reach into it were read; its times go on from the block before.
     """
     row = 0
-    waiting = np.empty((0, 5))
+    waiting = np.empty((0, len(ALL_AXES) + 2))
     for part in _parts(motions, config, block_rows, max_rows):
         waiting = np.concatenate([waiting, part])
         while len(waiting) >= block_rows:
@@ -62,7 +62,7 @@ def stream(
 
 
 def _parts(motions: Iterable[Motion], config: MachineConfig, block_rows: int, max_rows: float) -> Iterator[Float]:
-    """Yield X, Y, Z in mm, source line and rapid (0 or 1) of the next rows, (n, 5)."""
+    """Yield the positions of ``ALL_AXES``, source line and rapid (0 or 1) of the next rows, (n, 11)."""
     motions = _stopped_at_probes(checked(motions, config))
     if config.nc.profile == "linuxcnc":
         return linuxcnc.Planner(config, max_rows).parts(motions, block_rows)
@@ -88,7 +88,7 @@ def _smoothed(motions: Iterable[Motion], config: MachineConfig, block_rows: int,
     for segments in timeline.batches(motions):
         for rows in _spans(segments.first_row, segments.end_row, block_rows):
             part = segments.sample(rows, dt_s)
-            part[:, :3] = smoother(part[:, :3])
+            part[:, :-2] = smoother(part[:, :-2])
             yield part
 
 
@@ -113,15 +113,19 @@ def _spans(first_row: int, end_row: int, block_rows: int) -> Iterator[Int]:
 
 def _trajectory(rows: Float, first_row: int, config: MachineConfig) -> Trajectory:
     n, dt_s = len(rows), config.machine.sync_period_s
-    rapid = rows[:, 4].astype(np.bool_)
+    rapid = rows[:, -1].astype(np.bool_)
     rapid.setflags(write=False)
-    position_mm = {axis: frozen(rows[:, "XYZ".index(axis)] if axis in "XYZ" else np.zeros(n)) for axis in config.axis}
+    position_mm = {
+        name: frozen(rows[:, ALL_AXES.index(name[0])] * axis.mm_per_unit if name[0] in ALL_AXES else np.zeros(n))
+        for name, axis in config.axis.items()
+    }
     if (beyond := first_beyond(position_mm, config)) is not None:  # an arc may, between two ends that fit
-        raise ProgramError(int(rows[beyond.row, 3]), beyond.axis, beyond.text)
+        raise ProgramError(int(rows[beyond.row, -2]), beyond.axis, beyond.text)
     return Trajectory(
         dt_s=dt_s,
         time_s=frozen((first_row + np.arange(n)) * dt_s),
         position_mm=position_mm,
         rapid=rapid,
-        line=frozen_ints(rows[:, 3]),
+        line=frozen_ints(rows[:, -2]),
+        mm_per_degree=config.mm_per_degree,
     )

@@ -104,7 +104,7 @@ class CornerRules:
         curve = np.maximum(bend_out, bend_in)
         bend = curve + self._peak * (bend_out + bend_in) / 2.0
         return _Turn(
-            kink=np.linalg.norm(kink, axis=1),
+            kink=np.linalg.norm(kink[:, :3], axis=1),
             kink_by_acceleration=np.max(kink / self._acceleration, axis=1) + 1e-15,
             kink_by_jerk=np.max(kink / self._jerk, axis=1) + 1e-18,
             bend=bend_out + bend_in,

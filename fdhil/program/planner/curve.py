@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from fdhil.program.motions import ALL_AXES
 from fdhil.program.planner.corners import fade
 from fdhil.program.planner.pieces import LENGTH, WIDTH, points
 from fdhil.records import Float
@@ -18,7 +19,7 @@ class Curve:
         self._pieces = np.empty((0, WIDTH))
         self._end_mm = np.empty(0)  # path at the end of each piece
         self._half_mm = np.empty(0)  # half length of the blend at its start
-        self._start = np.zeros((1, 3))
+        self._start = np.zeros((1, len(ALL_AXES)))
 
     def add(self, pieces: Float, half_mm: Float) -> None:
         """Append pieces (n, WIDTH) whose blends at their starts have half lengths (n,)."""
@@ -35,7 +36,7 @@ class Curve:
             self._half_mm = self._half_mm[drop:]
 
     def at(self, path_mm: Float) -> Float:
-        """Return the points (n, 3) at lengths of path (n,)."""
+        """Return the points (n, 9) at lengths of path (n,)."""
         if not self._end_mm.size:
             return np.repeat(self._start, path_mm.size, axis=0)
         last = self._end_mm.size - 1

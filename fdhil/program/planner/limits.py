@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from fdhil.config import MachineConfig, PositionRange
 from fdhil.errors import ProgramError
-from fdhil.program.motions import PLANE_AXES, Arc, Dwell, Motion, Point, Rapid
+from fdhil.program.motions import ALL_AXES, ORIGIN, PLANE_AXES, Arc, Dwell, Motion, Place, Rapid, reached
 
 TICK_TOLERANCE = 1e-6  # of a row: an end so little after a row counts as on it
 _TINY_MM = 1e-9
@@ -17,38 +17,43 @@ _MAX_DWELL_ROWS = 1e9
 
 @dataclass(frozen=True, slots=True)
 class AxisLimits:
-    """Per axis X, Y, Z: speed (mm/s), acceleration (mm/s2) and jerk (mm/s3), infinite for an axis that is not there."""
+    """Per axis of ``ALL_AXES``: speed (mm/s), acceleration (mm/s2) and jerk (mm/s3), infinite for one that is missing.
 
-    speed: Point
-    acceleration: Point
-    jerk: Point
+    Those of a rotary axis are in degrees.
+    """
+
+    speed: Place
+    acceleration: Place
+    jerk: Place
     dt_s: float
     ranges: tuple[PositionRange | None, ...]
-    axes: frozenset[str]
     path_speed: float  # mm/s along the path
+    linear: frozenset[str]  # axes A, B, C that the configuration has in mm
 
     @staticmethod
     def of(config: MachineConfig) -> AxisLimits:
         """Return the limits of a machine's axes and its SYNC period."""
 
-        def each(name: str) -> Point:
-            x, y, z = (getattr(config.axis[axis], name) if axis in config.axis else math.inf for axis in "XYZ")
-            return x, y, z
+        dt_s, linear = config.machine.sync_period_s, frozenset(a for a in "ABC" if a in config.axis)
+        linear = frozenset(name for name in linear if config.axis[name].unit == "mm")
+        axes = [config.axis.get(name) if name not in linear else None for name in ALL_AXES]
 
-        speed, acceleration = each("rapid_speed_mm_s"), each("max_acceleration_mm_s2")
-        dt_s, axes = config.machine.sync_period_s, config.axis
-        ranges = tuple(PositionRange.of(axis, axes[axis], dt_s) if axis in axes else None for axis in "XYZ")
+        def each(key: str) -> Place:
+            return tuple(math.inf if axis is None else getattr(axis, key) / axis.mm_per_unit for axis in axes)
+
+        found = zip(ALL_AXES, axes, strict=True)
+        ranges = tuple(None if axis is None else PositionRange.of(name, axis, dt_s) for name, axis in found)
         return AxisLimits(
-            speed,
-            acceleration,
+            each("rapid_speed_mm_s"),
+            each("max_acceleration_mm_s2"),
             each("jerk_mm_s3"),
             dt_s,
             ranges,
-            frozenset(axes),
             config.nc.max_path_speed_mm_s,
+            linear,
         )
 
-    def check(self, motion: Motion, start: Point) -> None:
+    def check(self, motion: Motion, start: Place) -> None:
         """Raise ProgramError for an endless feed or dwell, an axis that the machine lacks, a place beyond 32 bits."""
         if isinstance(motion, Dwell):
             if motion.seconds / self.dt_s > _MAX_DWELL_ROWS:
@@ -56,26 +61,23 @@ class AxisLimits:
             return
         if not isinstance(motion, Rapid) and not motion.feed > 0.0:
             raise ProgramError(motion.line, "F", "the feed rate is 0, so the move would never end; give F")
-        moved = [abs(b - a) > _TINY_MM for a, b in zip(start, motion.end, strict=True)]
+        end = reached(motion, start)
+        moved = [abs(b - a) > _TINY_MM for a, b in zip(start, end, strict=True)]
         if isinstance(motion, Arc):
             for axis in PLANE_AXES[motion.plane][:2]:
                 moved[axis] = True
-        for name, moves, speed in zip("XYZ", moved, self.speed, strict=True):
+        for name, moves, speed in zip(ALL_AXES, moved, self.speed, strict=True):
             if moves and speed == math.inf:
-                raise ProgramError(
-                    motion.line, name, f"moves axis {name}, which the configuration lacks; add [axis.{name}]"
-                )
-        for turned in motion.rotary:
-            if abs(turned.end - turned.start) > _TINY_MM:
-                raise self._not_planned(motion.line, turned.axis)
-        for reach, end in zip(self.ranges, motion.end, strict=True):
-            if reach is not None and not reach.fits(end):
-                raise ProgramError(motion.line, reach.axis, reach.fault(end))
+                raise ProgramError(motion.line, name, f"moves axis {name}, {self._missing(name)}")
+        for reach, at in zip(self.ranges, end, strict=True):
+            if reach is not None and not reach.fits(at * reach.mm_per_unit):
+                raise ProgramError(motion.line, reach.axis, reach.fault(at * reach.mm_per_unit))
 
-    def _not_planned(self, line: int, axis: str) -> ProgramError:
-        lacks = "" if axis in self.axes else f", which the configuration lacks: add [axis.{axis}]"
-        also = "; programs are planned in X, Y and Z, so that the path is unknown: record the demand with fdhil record"
-        return ProgramError(line, axis, f"moves axis {axis}{lacks}{also}")
+    def _missing(self, axis: str) -> str:
+        if axis in self.linear:
+            return f'which turns by degrees, and the configuration has it in mm; give [axis.{axis}] unit = "deg"'
+        rotary = ' with unit = "deg" and radius_mm' if axis in "ABC" else ""
+        return f"which the configuration lacks; add [axis.{axis}]{rotary}"
 
     def rows(self, seconds: float) -> int:
         """Return the first SYNC row that is not before a time."""
@@ -84,10 +86,10 @@ class AxisLimits:
 
 def checked(motions: Iterable[Motion], config: MachineConfig) -> Iterator[Motion]:
     """Yield motions that the machine can be ordered; ProgramError for the first that it cannot."""
-    limits, at = AxisLimits.of(config), (0.0, 0.0, 0.0)
+    limits, at = AxisLimits.of(config), ORIGIN
     for motion in motions:
         limits.check(motion, at)
-        at = at if isinstance(motion, Dwell) else motion.end
+        at = at if isinstance(motion, Dwell) else reached(motion, at)
         yield motion
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.program.motions import Arc, Dwell, Feed, Motion, Point, Rapid
+from fdhil.program.motions import ORIGIN, Arc, Dwell, Feed, Motion, Rapid, reached
 from fdhil.program.planner import speed
 from fdhil.program.planner.corners import CornerRules
 from fdhil.program.planner.curve import Curve
@@ -63,7 +63,7 @@ class LookAhead:
         self._end_rows = self.filter_rows + limits.rows(config.nc.end_rest_s)
         self._rules = CornerRules(limits, self._filter_s)
         self.curve = Curve(smooth)
-        self._at: Point = (0.0, 0.0, 0.0)
+        self._at = ORIGIN
         self._new: list[Row] = []
         self._last = np.empty((0, WIDTH))  # the newest piece that the curve has, unless a stop came after it
         self._stops_after = False
@@ -101,7 +101,7 @@ class LookAhead:
 
     def _take(self, motion: Rapid | Feed | Arc) -> None:
         row = piece(motion, self._at, self._limits)
-        self._at = motion.end
+        self._at = reached(motion, self._at)
         if row is None:
             return
         changes = self._rapid_stop and self._before_rapid is not None and self._before_rapid != row[RAPID]

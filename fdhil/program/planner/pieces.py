@@ -7,46 +7,60 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from fdhil.program.motions import PLANE_AXES, PLANES, Arc, Feed, Point, Rapid, Swept
+from fdhil.program.motions import PLANE_AXES, PLANES, Arc, Feed, Place, Rapid, Swept, reached
 from fdhil.program.planner.limits import AxisLimits
 from fdhil.records import Float, Int
 
 # columns of a piece; the kind of an arc is the index of its plane
 KIND, LINE, RAPID, LENGTH, SPEED, ACCELERATION, JERK, BLENDS, TOLERANCE = range(9)
-START, STOP = slice(9, 12), slice(12, 15)
-_EXTRA = slice(15, 21)  # of an arc: centre, radius at start and end, angle at the start, angle swept
-WIDTH = 21
+START, STOP = slice(9, 18), slice(18, 27)
+_EXTRA = slice(27, 33)  # of an arc: centre, radius at start and end, angle at the start, angle swept
+WIDTH = 33
+_GROUPS = (slice(0, 3), slice(6, 9), slice(3, 6))  # the length of X Y Z, else of U V W, else of A B C: what F refers to
 LINE_KIND = -1.0
 _NO_EXTRA = (0.0,) * 6
 Row = tuple[float, ...]
 
 
-def piece(motion: Rapid | Feed | Arc, start: Point, limits: AxisLimits) -> Row | None:
+def length_of(start: Place, end: Place) -> float:
+    """Return the length of a straight move: mm of X Y Z, else of U V W, else degrees."""
+    return next((length for part in _GROUPS if (length := math.dist(start[part], end[part])) > 0.0), 0.0)
+
+
+def path_limit(start: Place, end: Place, limits: AxisLimits) -> float:
+    """Return the largest speed along the path, which limits lengths and no angles."""
+    turns_alone = start[:3] == end[:3] and start[6:] == end[6:]
+    return math.inf if turns_alone else limits.path_speed
+
+
+def piece(motion: Rapid | Feed | Arc, start: Place, limits: AxisLimits) -> Row | None:
     """Return the row of one motion, None where it has no length. Speeds keep each axis within its own limit."""
     extra: Row = _NO_EXTRA
     kind = LINE_KIND
+    end = reached(motion, start)
     if isinstance(motion, Arc):
         path = Swept.of(motion, start)
         kind, length = float(PLANES.index(motion.plane)), path.length_mm
-        share = [1.0, 1.0, 1.0]
-        share[PLANE_AXES[motion.plane][2]] = abs(path.rise_mm) / length if length else 0.0
+        share = [abs(b - a) / length if length else 0.0 for a, b in zip(start, end, strict=True)]
+        for axis in PLANE_AXES[motion.plane][:2]:
+            share[axis] = 1.0
         extra = (path.centre.real, path.centre.imag, *path.radii, path.begin_rad, path.angle_rad)
     else:
-        length = math.dist(start, motion.end)
-        share = [abs(b - a) / length if length else 0.0 for a, b in zip(start, motion.end, strict=True)]
+        length = length_of(start, end)
+        share = [abs(b - a) / length if length else 0.0 for a, b in zip(start, end, strict=True)]
     if length <= 0.0:
         return None
     speed, acceleration, jerk = (
         min(limit / part for limit, part in zip(axes, share, strict=True) if part)
         for axes in (limits.speed, limits.acceleration, limits.jerk)
     )
-    speed = min(speed, limits.path_speed)
+    speed = min(speed, path_limit(start, end, limits))
     if not isinstance(motion, Rapid):
         speed = min(speed, motion.feed / 60.0)
     corner = motion.corner
     return (
         kind, float(motion.line), float(isinstance(motion, Rapid)), length, speed, acceleration, jerk,
-        float(corner.mode == "blend"), corner.tolerance_mm, *start, *motion.end, *extra,
+        float(corner.mode == "blend"), corner.tolerance_mm, *start, *end, *extra,
     )  # fmt: skip
 
 
@@ -59,12 +73,12 @@ def _turning(pieces: Float) -> Iterator[tuple[Int, tuple[int, int, int]]]:
 
 
 def points(pieces: Float, distance: Float) -> Float:
-    """Return the points (n, 3) of pieces (n, WIDTH) at ``distance`` (n,) mm from their starts."""
+    """Return the points (n, 9) of pieces (n, WIDTH) at ``distance`` (n,) mm from their starts."""
     return points_at(pieces, np.clip(distance / pieces[:, LENGTH], 0.0, 1.0))
 
 
 def points_at(pieces: Float, share: Float) -> Float:
-    """Return the points (n, 3) of pieces (n, WIDTH) at ``share`` (n,) of their lengths, 0 to 1."""
+    """Return the points (n, 9) of pieces (n, WIDTH) at ``share`` (n,) of their lengths, 0 to 1."""
     start, stop = pieces[:, START], pieces[:, STOP]
     position = start + (stop - start) * share[:, None]
     at_end = share >= 1.0
@@ -80,7 +94,7 @@ def points_at(pieces: Float, share: Float) -> Float:
 
 
 def directions(pieces: Float, at_end: bool) -> tuple[Float, Float]:
-    """Return unit tangents (n, 3) and curvature vectors (n, 3), 1/mm, at the starts or at the ends of pieces."""
+    """Return tangents (n, 9) and curvature vectors (n, 9), per mm of path, at the starts or at the ends of pieces."""
     length = pieces[:, LENGTH, None]
     tangent = (pieces[:, STOP] - pieces[:, START]) / length
     curvature = np.zeros_like(tangent)

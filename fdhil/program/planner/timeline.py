@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.program.motions import Dwell, Motion, Point, Rapid
+from fdhil.program.motions import ORIGIN, Dwell, Motion, Rapid, reached
 from fdhil.program.planner.limits import TICK_TOLERANCE, AxisLimits, check_duration
 from fdhil.program.planner.pieces import (
     KIND,
@@ -22,6 +22,8 @@ from fdhil.program.planner.pieces import (
     STOP,
     WIDTH,
     Row,
+    length_of,
+    path_limit,
     piece,
     points_at,
 )
@@ -43,7 +45,7 @@ class Segments:
     end_row: int
 
     def sample(self, rows: Int, dt_s: float) -> Float:
-        """Return X, Y, Z in mm, source line and rapid (0 or 1) at SYNC ``rows`` (n,): (n, 5)."""
+        """Return the positions of ``ALL_AXES``, source line and rapid (0 or 1) at SYNC ``rows`` (n,): (n, 11)."""
         t = rows * dt_s
         index = np.searchsorted(self.table[:, _END_S], t - TICK_TOLERANCE * dt_s, side="left")
         chosen = self.table[np.minimum(index, len(self.table) - 1)]
@@ -78,7 +80,7 @@ class Timeline:
         self._settle_rows = settle_rows + limits.rows(config.nc.settle_s)
         self._end_rows = settle_rows + 1 + limits.rows(config.nc.end_rest_s)
         self._stop_always = config.nc.corner == "exact_stop"
-        self._at: Point = (0.0, 0.0, 0.0)
+        self._at = ORIGIN
         self._now_s = 0.0
         self._line = 0
         self._before: type[Motion] | None = None
@@ -113,7 +115,7 @@ class Timeline:
         if row is not None:
             span_s, ramps = self._rapid(motion) if isinstance(motion, Rapid) else (row[LENGTH] / row[SPEED], _EVEN)
             self._append(row, span_s, ramps)
-        self._at = motion.end
+        self._at = reached(motion, self._at)
 
     def _append(self, row: Row, span_s: float, ramps: Row) -> None:
         self._now_s += span_s
@@ -134,9 +136,10 @@ class Timeline:
 
     def _rapid(self, motion: Rapid) -> tuple[float, Row]:
         """Return how long a rapid lasts, and its ramps: one trapezoid for all axes, so that none exceeds its limits."""
-        way = [abs(b - a) for a, b in zip(self._at, motion.end, strict=True)]
+        end = reached(motion, self._at)
+        way = [abs(b - a) for a, b in zip(self._at, end, strict=True)]
         speed = min(v / w for v, w in zip(self._limits.speed, way, strict=True) if w)  # shares of the way per second
-        speed = min(speed, self._limits.path_speed / math.hypot(*way))
+        speed = min(speed, path_limit(self._at, end, self._limits) / length_of(self._at, end))
         acceleration = min(a / w for a, w in zip(self._limits.acceleration, way, strict=True) if w)
         ramp_s = min(speed / acceleration, 1.0 / math.sqrt(acceleration))
         span_s = 2.0 * ramp_s + max(0.0, (1.0 - acceleration * ramp_s**2) / (acceleration * ramp_s))

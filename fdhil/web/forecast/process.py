@@ -55,7 +55,7 @@ def forecast(program: Path, name: str, config: MachineConfig, folder: Path, tell
     document = correction_document(name, planned, predicted, models) | {
         "rows": reference.time_s.size,
         "sync_period_s": reference.dt_s,
-        "axes": list(reference.axes),
+        "axes": list(reference.table_axes),
         "moved": _reach(reference),
         "planes": planes(reference) or _single(reference),
         "parameters": parameters,
@@ -143,7 +143,7 @@ def zones(planned: Correction) -> list[dict[str, Any]]:
                 "start_s": zone.start_s,
                 "end_s": zone.end_s,
                 "feed_mm_min": round(_feed_mm_min(reference, row)),
-                "at_mm": [round(float(reference.position_mm[axis][row]), 6) for axis in reference.axes],
+                "at_mm": [round(float(reference.position_mm[axis][row]), 6) for axis in reference.table_axes],
                 "before_um": zone.max_um,
                 "after_um": float(after.contour_um[before.rows(zone)].max()),
             }
@@ -168,8 +168,8 @@ def _reach(reference: Trajectory) -> dict[str, list[float]]:
 
 def _single(reference: Trajectory) -> list[tuple[str, str]]:
     """Return the plane of a path in which at most one axis moves."""
-    moving = max(reference.axes, key=lambda axis: float(np.ptp(reference.position_mm[axis])))
-    other = next((axis for axis in reference.axes if axis != moving), moving)
+    moving = max(reference.table_axes, key=lambda axis: float(np.ptp(reference.position_mm[axis])))
+    other = next((axis for axis in reference.table_axes if axis != moving), moving)
     return [(moving, other)]
 
 

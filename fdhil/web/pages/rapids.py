@@ -56,7 +56,7 @@ async def _replayer(connection: HTTPConnection) -> Replayer:
 router = APIRouter(prefix="/api/rapids", lifespan=_replaying)
 Replaying = Annotated[Replayer, Depends(_replayer)]
 LOG = logging.getLogger("fdhil.web")
-Axis = Annotated[str, Path(pattern="^[A-Z]$")]
+Axis = Annotated[str, Path(pattern="^[A-Z]2?$")]
 Number = Annotated[int, Path(ge=1, le=LARGEST_ID)]
 PARQUET = "application/vnd.apache.parquet"
 
@@ -64,7 +64,7 @@ PARQUET = "application/vnd.apache.parquet"
 @router.get("")
 def rapids(
     here: Here,
-    axis: Annotated[str | None, Query(pattern="^[A-Z]$")] = None,
+    axis: Annotated[str | None, Query(pattern="^[A-Z]2?$")] = None,
     verdict: Verdict | None = None,
     code: Annotated[str | None, Query(max_length=64)] = None,
     before: Annotated[int | None, Query(ge=1, le=LARGEST_ID)] = None,
@@ -76,7 +76,7 @@ def rapids(
 
 
 @router.get("/counts")
-def counts(here: Here, axis: Annotated[str | None, Query(pattern="^[A-Z]$")] = None) -> Counts:
+def counts(here: Here, axis: Annotated[str | None, Query(pattern="^[A-Z]2?$")] = None) -> Counts:
     """Return how many of the newest rapids were accepted, and why the others were refused."""
     with here.history() as history:
         return counts_of(history, here.config.axis, axis)

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.program.motions import Arc, Dwell, Feed, Motion, Point, Rapid
+from fdhil.program.motions import ALL_AXES, ORIGIN, Arc, Dwell, Feed, Motion, Rapid, reached
 from fdhil.program.planner.limits import AxisLimits, check_duration
 from fdhil.program.planner.linuxcnc.blends import join
 from fdhil.program.planner.linuxcnc.cycles import Cycles
@@ -25,7 +25,7 @@ from fdhil.records import Float
 _DEPTH = 50
 _UNSETTLED = 3  # of the newest segments the limits have just changed
 _INTERPOLATED_ROWS = 2
-Row = tuple[float, float, float, int, bool]  # X, Y, Z, source line, rapid
+Row = tuple[float, ...]  # the positions of ALL_AXES, source line, rapid
 
 
 class Planner:
@@ -40,14 +40,14 @@ class Planner:
         self._end_rows = self._limits.rows(config.nc.end_rest_s)
         self._queue: deque[Segment] = deque()
         self._cycles = Cycles(self._queue, self._dt_s)
-        self._at: Point = (0.0, 0.0, 0.0)
+        self._at = ORIGIN
         self._line = 0
         self._count = 0
 
     def parts(self, motions: Iterable[Motion], block_rows: int) -> Iterator[Float]:
-        """Yield X, Y, Z in mm, source line and rapid (0 or 1) in blocks (n, 5); the first row is the rest."""
+        """Yield positions of ``ALL_AXES``, source line and rapid (0 or 1) in blocks (n, 11), from the rest on."""
         rows: list[Row] = []
-        past = np.zeros((2, 3))
+        past = np.zeros((2, len(ALL_AXES)))
         for row in self._rows(motions):
             rows.append(row)
             if len(rows) >= block_rows:
@@ -72,7 +72,7 @@ class Planner:
 
     def _take(self, motion: Rapid | Feed | Arc) -> None:
         new = segment(motion, self._at, self._limits)
-        self._at = motion.end
+        self._at = reached(motion, self._at)
         if new is None:
             return
         self._line = motion.line
@@ -106,15 +106,15 @@ class Planner:
         while len(queue) > left + 1 or (not left and queue):
             here = queue[0]
             self._line = here.line
-            x, y, z = cycles.step()
+            cycles.step()
             self._check()
-            yield (x, y, z, here.line, here.rapid)
+            yield (*cycles.at, *cycles.others, here.line, here.rapid)
             if self._settle_rows and here.ending == STOP and (not queue or queue[0] is not here):
                 yield from self._rest(self._settle_rows)
 
     def _rest(self, rows: int) -> Iterator[Row]:
         self._check(rows)
-        row = (*self._cycles.at, self._line, False)
+        row = (*self._cycles.at, *self._cycles.others, self._line, False)
         for _ in range(rows):
             yield row
 
@@ -126,6 +126,6 @@ class Planner:
 def _part(rows: list[Row], past: Float) -> tuple[Float, Float]:
     """Return a block of rows and its last two points: the joints' cubic interpolation weighs three points in a row."""
     table = np.array(rows, dtype=np.float64)
-    points = np.concatenate([past, table[:, :3]])
-    table[:, :3] = points[1:-1] + (points[:-2] - 2.0 * points[1:-1] + points[2:]) / 6.0
+    points = np.concatenate([past, table[:, :-2]])
+    table[:, :-2] = points[1:-1] + (points[:-2] - 2.0 * points[1:-1] + points[2:]) / 6.0
     return table, points[-2:]

@@ -10,12 +10,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from fdhil.program.motions import Point
+from fdhil.program.motions import Place, Point
 from fdhil.program.planner.limits import AxisLimits
 from fdhil.program.planner.linuxcnc.segments import (
     ALONG_SHARE,
     EXACT,
     NORMAL_SHARE,
+    PARABOLA,
     STOP,
     TANGENT,
     Segment,
@@ -42,6 +43,9 @@ def join(before: Segment, after: Segment, limits: AxisLimits) -> tuple[Segment, 
     """
     if before.rapid != after.rapid:
         before.ending = STOP
+    if before.turns or after.turns:  # measured: no arc between, and no kink is passed
+        after.after_parabola = before.ending == PARABOLA
+        return (before,)
     if before.ending == STOP or _passed(before, after, limits) or before.ending == EXACT:
         return (before,)
     arc = _arc(before, after, limits)
@@ -70,7 +74,7 @@ def _passed(before: Segment, after: Segment, limits: AxisLimits) -> bool:
         return False
     speed = min(before.free, after.free)
     step = speed / limits.dt_s + after.acceleration
-    share = max(abs(b - a) * step / limit for a, b, limit in zip(t1, t2, limits.acceleration, strict=True))
+    share = max(abs(b - a) * step / limit for a, b, limit in zip(t1, t2, limits.acceleration[:3], strict=True))
     if isinstance(before.shape, Turn) or isinstance(after.shape, Turn):
         share /= _KINK_SHARE_OF_ARC
     kept = min(share, _KINK_SHARE)
@@ -197,10 +201,10 @@ def _in_plane(shape: Line | Turn, normal: Point) -> bool:
     return shape.flat and abs(abs(dot(cross(shape.u, shape.v), normal)) - 1.0) < 1e-6
 
 
-def _within_plane(limits: Point, normal: Point) -> float:
+def _within_plane(limits: Place, normal: Point) -> float:
     """Return the largest acceleration or speed that may point anywhere in a plane."""
     scales = [math.sqrt(max(0.0, 1.0 - n * n)) for n in normal]
-    return min(limit / scale for limit, scale in zip(limits, scales, strict=True) if scale > 1e-9)
+    return min(limit / scale for limit, scale in zip(limits[:3], scales, strict=True) if scale > 1e-9)
 
 
 def _fastest(before: Segment, after: Segment, half: float, limits: AxisLimits, normal: Point) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 
-from fdhil.program.motions import Point
+from fdhil.program.motions import ORIGIN, Point
 from fdhil.program.planner.linuxcnc.blends import blend_speeds
 from fdhil.program.planner.linuxcnc.segments import PARABOLA, TANGENT, Segment
 from fdhil.program.planner.linuxcnc.shapes import minus, plus
@@ -17,12 +17,13 @@ _RAMP_S = 0.01  # segments that last no longer change their speed evenly
 
 
 class Cycles:
-    """Runs the segments of a queue; ``at`` is where the axes are ordered to be."""
+    """Runs the segments of a queue; ``at`` is where X Y Z are ordered to be, ``others`` where A B C U V W are."""
 
     def __init__(self, queue: deque[Segment], dt_s: float) -> None:
         self._queue = queue
         self._dt_s = dt_s
         self.at: Point = (0.0, 0.0, 0.0)
+        self.others = ORIGIN[3:]
         self._begun: Segment | None = None
         self._target = self._target_next = self._end_speed = 0.0
         self._along = self._along_next = 0.0
@@ -33,8 +34,8 @@ class Cycles:
         self._left_s = 0.0  # of a cycle within which the segment under way ends
         self._left_over = self._end = 0.0
 
-    def step(self) -> Point:
-        """Run one cycle and return the point that it orders."""
+    def step(self) -> None:
+        """Run one cycle."""
         queue = self._queue
         here = queue[0]
         if here is not self._begun:
@@ -42,14 +43,13 @@ class Cycles:
         if self._left_s:
             here = self._over()
             self._move(here, self._dt_s - self._left_over, self._along)
-            self.at = here.shape.at(here.place)
+            self.at, self.others = here.shape.at(here.place), here.others_at(here.place)
         else:
             self._move(here, self._dt_s, self._along)
-            self.at = here.shape.at(here.place)
+            self.at, self.others = here.shape.at(here.place), here.others_at(here.place)
             if here.ending == PARABOLA and len(queue) > 1:
                 self._blend(here, queue[1])
         self._check_end(here)
-        return self.at
 
     def _begin(self, here: Segment) -> None:
         """Take the limits of a segment that becomes the one under way."""
@@ -96,6 +96,9 @@ class Cycles:
         target = done * self._speeds[1] * self._blend_from / self._speeds[0]
         _advance(after, self._dt_s, self._along_next, 0.0, min(target, self._target_next))
         self.at = plus(self.at, minus(after.shape.at(after.place), after.shape.at(0.0)))
+        if after.turns:
+            more = zip(self.others, after.others_at(after.place), after.others, strict=True)
+            self.others = tuple(at + here - start for at, here, start in more)
 
     def _check_end(self, here: Segment) -> None:
         """Go on to the next segment at the end of this one; within a cycle where it does not stop."""

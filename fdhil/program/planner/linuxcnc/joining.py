@@ -19,11 +19,11 @@ def joined(motions: Iterable[Motion], start: Point = (0.0, 0.0, 0.0)) -> Iterato
     chain: list[Feed] = []
     at = start
     for motion in motions:
-        if chain and not (isinstance(motion, Feed) and _linkable(at, chain, motion)):
+        if chain and not (isinstance(motion, Feed) and not motion.rotary and _linkable(at, chain, motion)):
             yield chain[-1]
             at = chain[-1].end
             chain.clear()
-        if isinstance(motion, Feed) and motion.corner.mode == "blend":
+        if isinstance(motion, Feed) and motion.corner.mode == "blend" and not motion.rotary:
             if motion.end != at or chain:
                 chain.append(motion)
             continue

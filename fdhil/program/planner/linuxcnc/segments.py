@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from fdhil.program.motions import Arc, Feed, Point, Rapid
+from fdhil.program.motions import ORIGIN, Arc, Feed, Place, Rapid, reached
 from fdhil.program.planner.limits import AxisLimits
 from fdhil.program.planner.linuxcnc import shapes
 from fdhil.program.planner.linuxcnc.shapes import Shape, Turn
+from fdhil.program.planner.pieces import length_of, path_limit
 
 STOP, EXACT, PARABOLA, TANGENT = range(4)  # how a segment ends
 NORMAL_SHARE = math.sqrt(0.75)  # of the acceleration that turning may take
@@ -45,6 +46,20 @@ class Segment:
     speed: float = 0.0
     between: bool = False  # an arc put between two motions
     settled: bool = False  # its end will not move any more
+    others: Place = ORIGIN[3:]  # A B C U V W at its start
+    ways: Place = ORIGIN[3:]  # by how much they move on it
+
+    @property
+    def turns(self) -> bool:
+        """Whether it moves an axis other than X, Y and Z."""
+        return any(self.ways)
+
+    def others_at(self, distance: float) -> Place:
+        """Return where A B C U V W are at a distance from the start: they share the length evenly."""
+        if not self.turns:
+            return self.others
+        share = distance / self.nominal
+        return tuple(start + way * share for start, way in zip(self.others, self.ways, strict=True))
 
     @property
     def free(self) -> float:
@@ -92,18 +107,27 @@ class Segment:
         self.top = min(self.top, self.shape.length / (_SHORTEST_CYCLES * dt_s))
 
 
-def segment(motion: Rapid | Feed | Arc, start: Point, limits: AxisLimits) -> Segment | None:
+def segment(motion: Rapid | Feed | Arc, start: Place, limits: AxisLimits) -> Segment | None:
     """Return the segment of a motion, None where it has no length."""
+    end = reached(motion, start)
+    ways = tuple(b - a for a, b in zip(start[3:], end[3:], strict=True))
+    x, y, z = start[:3]
     if isinstance(motion, Arc):
-        return _turn(motion, shapes.turn(motion, start), limits)
-    shape = shapes.line(start, motion.end)
-    if shape.length <= 0.0:
-        return None
-    top, acceleration = (
-        min(limit / abs(part) for limit, part in zip(axes, shape.way, strict=True) if part)
-        for axes in (limits.speed, limits.acceleration)
-    )
-    return _segment(motion, shape, (top, acceleration, math.inf), limits.path_speed)
+        found = _turn(motion, shapes.turn(motion, (x, y, z)), ways, limits)
+    else:
+        shape = shapes.line((x, y, z), motion.end)
+        shape.length = shape.length or length_of(start, end)  # of a move of other axes alone
+        if shape.length <= 0.0:
+            return None
+        shares = [*shape.way, *(way / shape.length for way in ways)]
+        top, acceleration = (
+            min(limit / abs(part) for limit, part in zip(axes, shares, strict=True) if part)
+            for axes in (limits.speed, limits.acceleration)
+        )
+        found = _segment(motion, shape, (top, acceleration, math.inf), path_limit(start, end, limits))
+    if found is not None:
+        found.others, found.ways = start[3:], ways
+    return found
 
 
 def _segment(
@@ -119,7 +143,7 @@ def _segment(
     return Segment(motion.line, rapid, shape, wanted, top, acceleration, bent, tolerance, ending, shape.length)
 
 
-def _turn(motion: Arc, shape: Turn, limits: AxisLimits) -> Segment | None:
+def _turn(motion: Arc, shape: Turn, ways: Place, limits: AxisLimits) -> Segment | None:
     if shape.length <= 0.0:
         return None
     turning = (shape.radius + shape.growth / 2.0) * shape.angle
@@ -128,7 +152,7 @@ def _turn(motion: Arc, shape: Turn, limits: AxisLimits) -> Segment | None:
     bounds = []
     for axes in (limits.speed, limits.acceleration):
         longest = turning / min(axes[axis] for axis in plane)
-        longest = max([longest, *(rise[axis] / axes[axis] for axis in range(3) if rise[axis])])
+        longest = max([longest, *(way / axes[axis] for axis, way in enumerate([*rise, *map(abs, ways)]) if way)])
         bounds.append(shape.length / longest)
     top, acceleration = bounds
     radius = min(shape.radius, shape.radius + shape.growth)

@@ -36,7 +36,7 @@ def unit(a: Point) -> Point:
 
 @dataclass(slots=True)
 class Line:
-    """A straight line of ``length`` mm from ``start`` along the unit vector ``way``."""
+    """A line of ``length`` mm from ``start`` along the unit vector ``way``; 0 where others move alone."""
 
     start: Point
     way: Point
@@ -47,8 +47,8 @@ class Line:
         return plus(self.start, self.way, distance)
 
     def tangent(self, distance: float) -> Point:
-        """Return the unit direction at a distance from the start."""
-        return self.way
+        """Return the unit direction at a distance from the start; LinuxCNC has X for a line without length."""
+        return self.way if any(self.way) else (1.0, 0.0, 0.0)
 
     def cut(self, begin: float, end: float) -> None:
         """Take ``begin`` and ``end`` mm off its ends."""
