@@ -23,6 +23,7 @@ from fdhil.pipeline import AxisPipeline
 from fdhil.records import Notice, Window, frozen
 from fdhil.store.lessons import lesson_path, write_lesson
 from fdhil.store.rows import Stamp
+from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 DAY_S = 86_400.0
 APART_S = DAY_S / 2
@@ -67,13 +68,13 @@ def daemons_store(config: MachineConfig) -> Iterator[tuple[OutcomeStore, dict[st
     """Open the daemon's store with a clock that is set by hand."""
     clock: dict[str, Stamp] = {}
 
-    class Clock(Stamp):
+    class SetByHand(Stamp):
         @staticmethod
-        def now() -> Stamp:
+        def now(_clock: Clock = SYSTEM_CLOCK) -> Stamp:
             return clock["at"]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fdhil.daemon.outcome_store.Stamp", Clock)
+        patch.setattr("fdhil.daemon.outcome_store.Stamp", SetByHand)
         store = OutcomeStore(config)
         assert store.open() == []
         try:
