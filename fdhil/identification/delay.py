@@ -1,15 +1,23 @@
-"""Finds the delay of the voltage against current and speed, in whole samples, from the electrical equation alone."""
+"""Finds the delay of the voltage against current and speed: whole rows from [1] alone, less from a fit's innovations."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from fdhil.identification.derivatives import derivative
 from fdhil.identification.estimators.least_squares import Signals
-from fdhil.identification.normal import inverse_gram
+from fdhil.identification.fit import Fit, jacobian, typical
+from fdhil.identification.kalman import DELAY
+from fdhil.identification.normal import inverse_gram, solve
+from fdhil.records import Float
 
 SPAN_S = 0.025
 IMPROVEMENT = 1.5  # the residual's power must fall by this factor before another whole sample is believed
+
+LEAST_DELAY = 0.05  # of a row; a smaller delay cannot be told from the voltage's course within a row
+CHANCE = 2.0  # standard deviations of a delay that are chance, not doubt
 
 
 def coarse_delay(signals: Signals, dt_s: float) -> float:
@@ -34,3 +42,33 @@ def coarse_delay(signals: Signals, dt_s: float) -> float:
     if not np.isfinite(costs).all() or costs[reach] <= IMPROVEMENT * max(costs[best], 0.0) or abs(shifts[best]) < 1:
         return 0.0
     return float(shifts[best]) * dt_s
+
+
+def delay_score(plain: Fit) -> tuple[float, float]:
+    """Return the delay (s) that one Newton step from a fit without delay would add, and its standard deviation."""
+    d = delay_direction(plain)
+    rest = d - plain.but_delay @ solve(plain.but_delay, d)[0]
+    weight = float(rest @ rest)
+    return (float(rest @ plain.residuals) / weight, weight**-0.5) if weight > 0 else (0.0, np.inf)
+
+
+def delay_direction(result: Fit) -> Float:
+    """Return minus the derivative (m,) of the innovations by the delay."""
+    if DELAY in result.free:
+        return result.jacobian[:, result.free.index(DELAY)]
+    sizes = typical(result.theta, result.problem.motions)
+    return jacobian(result.problem, result.theta, result.residuals, [DELAY], sizes)[:, 0]
+
+
+def with_delay_doubt(made: Fit) -> Fit:
+    """Return the fit with its doubt about a delay of the voltage.
+
+    Regulators act several times within a row, which looks like a delay of a few per cent of it, but moves L
+    otherwise. So a small delay is not taken out: what it would change is a doubt, and so it is about a larger one.
+    """
+    if DELAY in made.free:
+        return replace(made, delay_doubt_s=LEAST_DELAY / 2 * min(m.dt_s for m in made.problem.motions))
+    if not (made.converged and np.isfinite(made.residuals).all()):
+        return made
+    delay, std = delay_score(made)
+    return replace(made, delay_doubt_s=float(np.sqrt(max(0.0, delay**2 - (CHANCE * std) ** 2))))

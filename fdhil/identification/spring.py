@@ -114,12 +114,12 @@ def _scores(base: Fit, grid: Float) -> Float:
 def _turned(base: Fit, spring: Spring, told: Told) -> tuple[Fit, float] | None:
     """Return the fit with the spring, and minus twice its log likelihood; None where it tells none."""
     plain, theta = base.problem.motions[0], base.theta
-    free = (*base.free, theta.size, theta.size + 1)
+    free, noises = (*base.free, theta.size, theta.size + 1), ()
     for _ in range(TURNS):
-        made = fit([_bent(plain, theta, spring)], np.append(theta, [0.0, 0.0]), free)
+        made = fit([_bent(plain, theta, spring)], np.append(theta, [0.0, 0.0]), free, noises)
         if not made.converged or not np.isfinite(made.residuals).all():
             return None
-        made = _with_prior(made, spring, told)
+        made, noises = _with_prior(made, spring, told), made.problem.noises
         theta, before = made.theta[:-2], spring
         spring = spring.moved(*made.theta[-2:])
         if not told.allows(spring):
