@@ -1,4 +1,4 @@
-"""Finds the delay of the voltage against current and speed: whole rows from [1] alone, less from a fit's innovations."""
+"""Finds the delay of the voltage against current and speed: whole rows from [1], less from innovations."""
 
 from __future__ import annotations
 

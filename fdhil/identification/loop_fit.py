@@ -19,8 +19,8 @@ from fdhil.identification.loop_replay import Rapid, replay, with_regulators
 from fdhil.records import Float
 
 DELAY = "current_delay_cycles"
-STEPS, TRIALS = 16, 8
-CONVERGED, ROUGH = 0.3, 30.0  # of minus twice the log likelihood: a step that gains less is the last, or one of the last
+STEPS, TRIALS = 24, 8
+CONVERGED = 0.3  # of minus twice the log likelihood: a step that gains less is the last
 SYSTEMATIC = 0.005  # of a gain: what rounding of the demand and a start that is not quite at rest do to all rapids
 LEAST_POSITION_MM, LEAST_CURRENT_A = 1e-5, 1e-4
 
@@ -177,28 +177,36 @@ def fit(problem: Problem, start: Float | None = None) -> Fit:
     for _ in range(STEPS):
         information, score = normal(made, slopes)
         score = score - weights * (made.coordinates - prior)
-        before = now
-        for _ in range(TRIALS):
+        before = made, now, answers
+        for _ in range(TRIALS if fresh else 1):
             matrix = information + np.diag(weights + damping * np.diag(information))
             step = _free_step(matrix, score, made.coordinates, low, high)
             at = np.clip(made.coordinates + step, low, high)
-            left, answers = left_of(problem, at)
+            left, reached = left_of(problem, at)
             trial = replace(made, coordinates=at, left=left, scale=scale_of(problem, left))
             value = cost(trial)
             if np.isfinite(value) and value < now:
-                now, made, damping = value, trial, max(damping / 10, 1e-9)
-                break
-            if not fresh:
+                now, made, answers, damping = value, trial, reached, max(damping / 10, 1e-9)
                 break
             damping *= 8
-        gained = before - now
+        gained = before[1] - now
         if fresh and gained < CONVERGED:
             break
-        # slopes hardly change near the bottom, and cost as much as all else
-        fresh = gained > ROUGH or gained < CONVERGED
+        fresh = gained < CONVERGED
         if fresh:
-            slopes = problem.slopes(made.coordinates, made.answers())
+            slopes = problem.slopes(made.coordinates, answers)
+        else:
+            slopes = _turned(slopes, made.coordinates - before[0].coordinates, answers, before[2], information)
     return made
+
+
+def _turned(
+    slopes: Sequence[Float], step: Float, after: Sequence[Float], before: Sequence[Float], metric: Float
+) -> list[Float]:
+    """Return slopes (2, n, k) that agree with what a ``step`` did (Broyden 1965): they cost as much as all else."""
+    share = np.diag(metric) * step
+    share = share / max(float(share @ step), 1e-300)
+    return [own + (a - b - own @ step)[..., None] * share for own, a, b in zip(slopes, after, before, strict=True)]
 
 
 def _free_step(matrix: Float, score: Float, at: Float, low: Float, high: Float) -> Float:
@@ -240,7 +248,7 @@ def covariance_of(made: Fit) -> Float:
 
 
 def likeliest(made: Fit, options: Sequence[tuple[str, ...]]) -> list[Fit]:
-    """Return where fits with further keys begin, the likeliest first.
+    """Return where fits with further keys begin, the likeliest first; those that are likelier than the fit without.
 
     Each of the ``options`` goes as far as the slopes lead in a straight line, from the end of the fit without and from
     where that began: a lack bends what is there.
@@ -249,7 +257,7 @@ def likeliest(made: Fit, options: Sequence[tuple[str, ...]]) -> list[Fit]:
     left, _ = left_of(made.problem, begun)
     starts = (made, Fit(made.problem, begun, left, scale_of(made.problem, left)))
     found = [one for start in starts for one in _ahead(start, options)]
-    return sorted((one for one in found if math.isfinite(one.deviance)), key=lambda one: one.deviance)
+    return sorted((one for one in found if one.deviance < made.deviance), key=lambda one: one.deviance)
 
 
 def _ahead(start: Fit, options: Sequence[tuple[str, ...]]) -> Iterator[Fit]:
