@@ -18,7 +18,7 @@ def any_voltage(motion: Motion) -> bool:
 
 def load_nm(motion: Motion, theta: Float) -> Float:
     """Return dry friction and the torque of the terms (n,) against the positive direction over each interval."""
-    return loads_nm(motion, theta[None])[0]
+    return np.asarray(loads_nm(motion, theta[None])[0])
 
 
 def loads_nm(motion: Motion, thetas: Float) -> Float:
@@ -28,17 +28,18 @@ def loads_nm(motion: Motion, thetas: Float) -> Float:
 
 def terms_nm(motion: Motion, theta: Float) -> Float:
     """Return the torque of the terms (n,) alone."""
-    return _added(np.zeros((1, motion.n)), motion, theta[None], LOAD)[0]
+    return np.asarray(_added(np.zeros((1, motion.n)), motion, theta[None], LOAD)[0])
 
 
 def voltage_v(motion: Motion, theta: Float) -> Float:
     """Return the mean voltage (n,) that reaches the motor over each interval, without its delay."""
-    return _known(_added(motion.delayed(float(theta[DELAY]))[None], motion, theta[None], VOLTAGE), motion, VOLTAGE)[0]
+    (added,) = _added(motion.delayed(float(theta[DELAY]))[None], motion, theta[None], VOLTAGE)
+    return _known(np.asarray(added), motion, VOLTAGE)
 
 
 def voltage_terms_v(motion: Motion, theta: Float) -> Float:
     """Return what the terms add to the voltage (n,) over each interval."""
-    return _added(np.zeros((1, motion.n)), motion, theta[None], VOLTAGE)[0]
+    return np.asarray(_added(np.zeros((1, motion.n)), motion, theta[None], VOLTAGE)[0])
 
 
 def _added(values: Float, motion: Motion, thetas: Float, kind: int) -> Float:

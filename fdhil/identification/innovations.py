@@ -78,10 +78,8 @@ def _whitened(motion: Motion, thetas: Float, variances: Float, gains: Float) -> 
     told = thetas[:, DELAY:] if any_voltage(motion) else thetas[:, DELAY, None]
     together = bool((told == told[0]).all())
     voltages = np.array([voltage_v(motion, theta) for theta in (thetas[:1] if together else thetas)])
-    alike = bool(
-        (thetas[:, CD] == thetas[0, CD]).all() and (thetas[:, FIRST_COURSE:] == thetas[0, FIRST_COURSE:]).all()
-    )
-    loads = loads_nm(motion, thetas[:1] if alike else thetas)
+    frictions = thetas[:, [CD, *range(FIRST_COURSE, thetas.shape[1])]]
+    loads = loads_nm(motion, thetas[:1] if bool((frictions == frictions[0]).all()) else thetas)
     return kalman.whiten(thetas, variances, Readings.of(motion), voltages, loads, gains)
 
 

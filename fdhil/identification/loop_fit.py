@@ -220,11 +220,13 @@ def _free_step(matrix: Float, score: Float, at: Float, low: Float, high: Float) 
 
 def normal(made: Fit, slopes: Sequence[Float]) -> tuple[Float, Float]:
     """Return information (k, k) and score (k,) of a fit with the ``slopes`` (2, n, k) of each rapid."""
-    information, score = 0.0, 0.0
+    k = slopes[0].shape[2]
+    information, score = np.zeros((k, k)), np.zeros(k)
     for phi, rest in _weighed(made, slopes):
-        flat = phi.reshape(-1, phi.shape[2])
-        information, score = information + flat.T @ flat, score + flat.T @ rest.ravel()
-    return np.asarray(information), np.asarray(score)
+        flat = phi.reshape(-1, k)
+        information += flat.T @ flat
+        score += flat.T @ rest.ravel()
+    return information, score
 
 
 def _weighed(made: Fit, slopes: Sequence[Float]) -> Iterator[tuple[Float, Float]]:

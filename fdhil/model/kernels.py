@@ -322,7 +322,7 @@ def _run_leaping(
     state: Float,
     out: Float,
 ) -> None:
-    """Run a cascade without delay and speed offsets as :func:`run` does, each speed cycle in one leap where it is linear.
+    """Run a cascade without delay and speed offsets as :func:`run` does, in one leap a speed cycle where it is linear.
 
     With terms a leap takes the mean of their torque; a constant voltage that is lost comes to a change of the integral.
     ``out`` (1 + kept, rows) is written. All that a cycle changes is in plain variables: memory would take most of it.
