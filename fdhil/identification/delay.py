@@ -11,11 +11,14 @@ from fdhil.identification.estimators.least_squares import Signals
 from fdhil.identification.fit import Fit, jacobian, typical
 from fdhil.identification.kalman import DELAY
 from fdhil.identification.normal import inverse_gram, solve
+from fdhil.identification.terms import WHOLE_DEAD_TIME
 from fdhil.records import Float
 
 SPAN_S = 0.025
-IMPROVEMENT = 1.5  # the residual's power must fall by this factor before another whole sample is believed
-
+# times that the power left must fall before a delay of whole rows is accepted: no voltage is early, but what the model
+# lacks of inverter and winding looks so
+LATER, EARLIER = 1.5, 9.0
+MOST_DELAY = 2.5  # rows, two and what rounds to them: what resembles a longer delay, and shows in no whole rows, is something else
 LEAST_DELAY = 0.05  # of a row; a smaller delay cannot be told from the voltage's course within a row
 CHANCE = 2.0  # standard deviations of a delay that are chance, not doubt
 
@@ -23,8 +26,8 @@ CHANCE = 2.0  # standard deviations of a delay that are chance, not doubt
 def coarse_delay(signals: Signals, dt_s: float) -> float:
     """Return by how many seconds, in whole samples, the voltage is late (early: negative); 0 unless it surely is.
 
-    [5] is fitted with the voltage moved by each number of samples; the best fit tells. Finer than a sample is the
-    business of the maximum-likelihood fit that starts here.
+    [5], with what an inverter's dead time takes, is fitted with the voltage moved by each number of samples; the best
+    fit tells. Up to ``MOST_DELAY`` a delay is the business of the maximum-likelihood fit: other things resemble it.
     """
     reach = min(max(3, round(SPAN_S / dt_s)), signals.speed.size // 8)
     slope = derivative(signals.current, dt_s)
@@ -32,14 +35,16 @@ def coarse_delay(signals: Signals, dt_s: float) -> float:
     kept = (signals.usable & np.isfinite(slope))[inside]
     if np.count_nonzero(kept) < 32:
         return 0.0
-    phi = np.where(kept, np.stack([slope, signals.current, signals.speed])[:, inside], 0.0)
+    lost = np.clip(signals.current / (WHOLE_DEAD_TIME * float(np.abs(signals.current).max())), -1.0, 1.0)
+    phi = np.where(kept, np.stack([slope, signals.current, signals.speed, lost])[:, inside], 0.0)
     inverse, _ = inverse_gram(phi.T)
     shifts = np.arange(-reach, reach + 1)
     pulls = np.stack([np.correlate(signals.voltage, column, "valid") for column in phi])
     power = np.correlate(signals.voltage**2, kept.astype(np.float64), "valid")
     costs = power - (pulls * (inverse @ pulls)).sum(axis=0)
     best = int(np.argmin(costs))
-    if not np.isfinite(costs).all() or costs[reach] <= IMPROVEMENT * max(costs[best], 0.0) or abs(shifts[best]) < 1:
+    near = costs[np.abs(shifts) <= MOST_DELAY].min()
+    if not np.isfinite(costs).all() or near <= (LATER if best > reach else EARLIER) * max(costs[best], 0.0):
         return 0.0
     return float(shifts[best]) * dt_s
 

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from fdhil.identification import friction_speed
 from fdhil.identification.covariance import SUMMED_LAGS
-from fdhil.identification.delay import LEAST_DELAY, delay_direction, with_delay_doubt
+from fdhil.identification.delay import LEAST_DELAY, MOST_DELAY, delay_direction, with_delay_doubt
 from fdhil.identification.fit import Fit, fit
 from fdhil.identification.identifiability import admissible
 from fdhil.identification.kalman import DELAY, LOAD
@@ -42,7 +42,6 @@ SIX = 6
 LEAST_SURE = 3.5  # standard deviations of a term, colour and all else that was chosen included
 LATE = "late"  # the candidate that is a delay of the voltage, and no term
 SURE_DELAY = 5.0  # standard deviations beyond which a delay is accepted
-MOST_DELAY = 2.0  # rows: what resembles a longer delay, and shows in no whole rows, is something else
 
 
 def add_terms(base: Fit, command: bool, estimate_of: Callable[[Fit], Estimate], *, delayed: bool = False) -> Fit:

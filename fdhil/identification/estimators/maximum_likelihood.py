@@ -17,7 +17,7 @@ import numpy as np
 
 from fdhil.config import Axis, Identification
 from fdhil.identification.covariance import TESTED_LAGS, aliasing, robust, suspicious
-from fdhil.identification.delay import coarse_delay, delay_direction, with_delay_doubt
+from fdhil.identification.delay import MOST_DELAY, coarse_delay, delay_direction, with_delay_doubt
 from fdhil.identification.estimators import least_squares
 from fdhil.identification.fit import Fit, but_delay, descend, fit, jacobian, pose, typical, with_delay
 from fdhil.identification.identifiability import admissible, judge
@@ -36,6 +36,7 @@ from fdhil.records import PARAMETERS, Estimate, Float, Result, Window
 __all__ = ["Fit", "descend", "estimate", "fit", "fit_windows", "jacobian", "pose", "typical"]
 NAME = "maximum_likelihood"
 INSTANT_DELAY = 0.5  # of a row
+RESEMBLING = 0.5  # of a delay that was found may be something else: dead time, axes d and q that are not parted
 TURNS = 2  # in which what loops do within rows follows the parameters
 FLOORS = np.array([1e-4, 1e-4, 1e-9])  # of R, K and Jt
 LEAST_TIME_CONSTANT_S = 1e-4  # of the winding: noise may drive the starting L below 0
@@ -175,9 +176,15 @@ def doubts(result: Fit, inverse: Float) -> Float:
         columns = np.column_stack([columns, _known_before(result, inverse)])
     if result.delay_doubt_s > 0.0:
         others = but_delay(free)
-        columns[others, 1] = -result.delay_doubt_s * solve(result.but_delay, delay_direction(result))[0]
+        columns[others, 1] = -max(result.delay_doubt_s, _resembled_s(result)) * solve(result.but_delay, delay_direction(result))[0]
         columns[DELAY, 1] = result.delay_doubt_s
     return columns
+
+
+def _resembled_s(result: Fit) -> float:
+    """Return how much of a delay may be something else that resembles it; of one that shows in whole rows, nothing."""
+    delay_s, first = abs(float(result.theta[DELAY])), result.problem.motions[0]
+    return RESEMBLING * delay_s if first.slow is None and delay_s <= MOST_DELAY * first.dt_s else 0.0
 
 
 def _known_before(result: Fit, inverse: Float) -> Float:
