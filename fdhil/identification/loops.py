@@ -19,6 +19,7 @@ from pydantic import ValidationError
 
 from fdhil.config import Axis, Identification, Regulators
 from fdhil.identification import loop_fit
+from fdhil.identification.demand_lead import with_demand_on_time
 from fdhil.identification.loop_fit import DELAY, KEYS, Fit, Problem
 from fdhil.identification.loop_replay import Rapid, fitting_periods, rapid_of, with_regulators
 from fdhil.identification.loop_start import CASCADE, begun_anew, made_up_axis
@@ -66,7 +67,8 @@ def identify_loops(
     without it the search begins from the demand alone. Set-points come every ``sync_period_s`` (left out: each row).
     Without ``growing`` the keys that are configured are found anew, and no others are tried: that takes no time.
     """
-    pairs = list(zip(windows, mechanics, strict=True))[-MOST_WINDOWS:]
+    on_time = [with_demand_on_time(window, axis, sync_period_s)[0] for window in windows[-MOST_WINDOWS:]]
+    pairs = list(zip(on_time, mechanics[-MOST_WINDOWS:], strict=True))
     told = [(rapid, own) for w, own in pairs if (rapid := rapid_of(w, own, sync_period_s)) is not None]
     if not told:
         return None
