@@ -18,7 +18,7 @@ SPAN_S = 0.025
 # times that the power left must fall before a delay of whole rows is accepted: no voltage is early, but what the model
 # lacks of inverter and winding looks so
 LATER, EARLIER = 1.5, 9.0
-MOST_DELAY = 2.5  # rows, two and what rounds to them: what resembles a longer delay, and shows in no whole rows, is something else
+MOST_DELAY = 2.5  # rows, two with rounding: what resembles a longer delay, and is none of whole rows, is none
 LEAST_DELAY = 0.05  # of a row; a smaller delay cannot be told from the voltage's course within a row
 CHANCE = 2.0  # standard deviations of a delay that are chance, not doubt
 

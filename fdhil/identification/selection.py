@@ -191,7 +191,8 @@ class _Bench:
 
     ``columns`` (m, p) are ``doubts`` about the voltage's course, the jacobian, and the courses of the candidates,
     the two of each at ``places`` (2, candidates): the last column, which is nil, where there is no second. ``gram``
-    (p, p) and ``pulls`` (p,) are their products, the doubts' expected sizes included; ``free`` those that are fitted.
+    (p, p), as far as it is asked for, and ``pulls`` (p,) are their products, the doubts' expected sizes included;
+    ``free`` are those that are fitted.
     """
 
     fit: Fit
@@ -219,17 +220,27 @@ class _Bench:
         nil = columns.shape[1] - 1
         places = np.array([first, np.where(np.array(sizes) == 2, first + 1, nil)], dtype=np.intp)
         places[0, [c.family == LATE for c in left]] = nil - 1
-        gram = columns.T @ columns
-        gram[range(doubts.shape[1]), range(doubts.shape[1])] += 1.0  # one deviation of them is all that is expected
-        pulls = columns.T @ base.residuals
         rows, free = np.arange(len(left)), list(range(begin))
-        return cls(base, left, columns, gram, pulls, doubts.shape[1], places, rows, free, delayed)
+        gram = np.diag(np.einsum("mp,mp->p", columns, columns))
+        gram[tuple(places)] = gram[tuple(places[::-1])] = np.einsum("mc,mc->c", *(columns[:, p] for p in places))
+        pulls = columns.T @ base.residuals
+        made = cls(base, left, columns, gram, pulls, doubts.shape[1], places, rows, free, delayed)
+        made._fill(free)
+        gram[range(doubts.shape[1]), range(doubts.shape[1])] += 1.0  # one deviation of them is all that is expected
+        return made
+
+    def _fill(self, rows: list[int]) -> None:
+        """Fill in the Gram matrix's ``rows``: those of candidates are asked for when they join."""
+        products = self.columns[:, rows].T @ self.columns
+        self.gram[rows], self.gram[:, rows] = products, products.T
 
     def without(self, taken: int, kept: Rows, joins: bool) -> _Bench:
         """Return the bench of those ``kept`` that are of another family than the ``taken``, which ``joins`` or not."""
         family = self.candidates[self.left[taken]].family
         others = [k for k in self.left[kept] if self.candidates[k].family != family]
         more = self._columns_of(int(self.left[taken])) if joins else []
+        if more:
+            self._fill(more)
         return replace(self, left=np.array(others, dtype=np.intp), free=[*self.free, *more])
 
     def _columns_of(self, candidate: int) -> list[int]:

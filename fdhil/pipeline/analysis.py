@@ -19,6 +19,7 @@ from fdhil.identification.without_voltage import told
 from fdhil.records import Estimate, Parameters, Reason, Result, Verdict, Window, WindowOutcome
 from fdhil.validation import BEFORE_ANY_FIT, LEAST_ROWS, OF_THE_FIT, WEIGHED, Evidence, Findings, ask
 from fdhil.validation.at_the_table import at_the_table
+from fdhil.validation.checks import PLATEAU
 from fdhil.validation.data_sheet import gain_error, scale_convention
 from fdhil.validation.signal_consistency import table_faults
 
@@ -191,8 +192,10 @@ def _gain(evidence: Evidence) -> Iterator[Reason]:
 
 def _outcome(evidence: Evidence, found: Findings) -> WindowOutcome:
     """Return the verdict: what is weighed refuses only where it does harm at the table, and warns else."""
-    weight, weighed = evidence.weight, [r for name, told in found.items() if name in WEIGHED for r in told]
-    reasons = [r for name, told in found.items() if name not in WEIGHED for r in told]
+    weight = evidence.weight
+    names = WEIGHED | {PLATEAU} if weight is not None and weight.through == "replay" else WEIGHED
+    weighed = [r for name, told in found.items() if name in names for r in told]
+    reasons = [r for name, told in found.items() if name not in names for r in told]
     # through ordinary loops only a share is known: what has a name says more
     if weight is not None and not weight.believed and (weight.in_um or not (reasons or weighed)):
         reasons += [weight.reason(), *_gain(evidence)]

@@ -176,7 +176,8 @@ def doubts(result: Fit, inverse: Float) -> Float:
         columns = np.column_stack([columns, _known_before(result, inverse)])
     if result.delay_doubt_s > 0.0:
         others = but_delay(free)
-        columns[others, 1] = -max(result.delay_doubt_s, _resembled_s(result)) * solve(result.but_delay, delay_direction(result))[0]
+        unsure = max(result.delay_doubt_s, _resembled_s(result))
+        columns[others, 1] = -unsure * solve(result.but_delay, delay_direction(result))[0]
         columns[DELAY, 1] = result.delay_doubt_s
     return columns
 
