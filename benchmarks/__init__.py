@@ -1,0 +1,3 @@
+
+
+import fdhil as fdhil  # before NumPy: it keeps the numeric libraries to one thread
