@@ -2,7 +2,7 @@
 
 The demand is the drive's own input and has no noise, so nothing is biased by a sensor's noise; what the mechanics do
 not explain is a known load. Levenberg and Marquardt's steps on the kernel; both signals weigh as what is left of them,
-renewed in every step: the sum of the logarithms of both spreads falls.
+renewed between the rounds.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from fdhil.records import Float
 
 DELAY = "current_delay_cycles"
 STEPS, TRIALS = 24, 8
-CONVERGED = 0.3  # of minus twice the log likelihood: a step that gains less is the last
+CONVERGED, ENOUGH = 1e-4, 0.05  # of the squares' sum: a step that gains less is the last, or asks for new slopes
+ROUNDS, SETTLED = 4, 1e-3  # in which the scale is renewed, until what is left changes by less
 SYSTEMATIC = 0.005  # of a gain: what rounding of the demand and a start that is not quite at rest do to all rapids
 LEAST_POSITION_MM, LEAST_CURRENT_A = 1e-5, 1e-4
 
@@ -138,6 +139,11 @@ class Fit:
         """Return the axis with the regulators found; a delay is whole only where it was not sought."""
         return self.problem.drive(self.coordinates)[0]
 
+    def squares(self, scale: Float) -> float:
+        """Return the sum of squares at some scale."""
+        pairs = zip(self.left, self.problem.rapids, strict=True)
+        return float(sum(np.square((left / scale[:, None])[:, one.known]).sum() for left, one in pairs))
+
     def answers(self) -> list[Float]:
         """Return position and current (2, n) of the closed loop, for each rapid."""
         pairs = zip(self.problem.rapids, self.left, strict=True)
@@ -165,15 +171,26 @@ def scale_of(problem: Problem, left: Sequence[Float]) -> Float:
 def fit(problem: Problem, start: Float | None = None) -> Fit:
     """Return the regulators that explain position and current best, from the axis as it is or from ``start``."""
     at = problem.start() if start is None else start
-    left, answers = left_of(problem, at)
-    made, prior, damping = Fit(problem, at, left, scale_of(problem, left)), at.copy(), 1e-3
+    left, _ = left_of(problem, at)
+    made, prior = Fit(problem, at, left, scale_of(problem, left)), at.copy()
+    for _ in range(ROUNDS):
+        before = made.unexplained_um
+        made = _descend(made, prior)
+        made = replace(made, scale=scale_of(problem, made.left))
+        if abs(made.unexplained_um - before) < SETTLED * before:
+            break
+    return made
+
+
+def _descend(made: Fit, prior: Float) -> Fit:
+    """Go down at one scale."""
+    problem, damping, answers = made.problem, 1e-3, made.answers()
     weights, (low, high) = 1.0 / problem.doubt() ** 2, problem.bounds()
-    rows = sum(int(np.count_nonzero(one.known)) for one in problem.rapids)
 
     def cost(of: Fit) -> float:
-        return rows * of.deviance + float(weights @ (of.coordinates - prior) ** 2)
+        return of.squares(made.scale) + float(weights @ (of.coordinates - prior) ** 2)
 
-    now, slopes, fresh = cost(made), problem.slopes(at, answers), True
+    now, slopes, fresh = cost(made), problem.slopes(made.coordinates, answers), True
     for _ in range(STEPS):
         information, score = normal(made, slopes)
         score = score - weights * (made.coordinates - prior)
@@ -183,16 +200,16 @@ def fit(problem: Problem, start: Float | None = None) -> Fit:
             step = _free_step(matrix, score, made.coordinates, low, high)
             at = np.clip(made.coordinates + step, low, high)
             left, reached = left_of(problem, at)
-            trial = replace(made, coordinates=at, left=left, scale=scale_of(problem, left))
+            trial = replace(made, coordinates=at, left=left)
             value = cost(trial)
             if np.isfinite(value) and value < now:
                 now, made, answers, damping = value, trial, reached, max(damping / 10, 1e-9)
                 break
             damping *= 8
         gained = before[1] - now
-        if fresh and gained < CONVERGED:
+        if fresh and gained < CONVERGED * before[1]:
             break
-        fresh = gained < CONVERGED
+        fresh = gained < ENOUGH * before[1]
         if fresh:
             slopes = problem.slopes(made.coordinates, answers)
         else:
@@ -250,7 +267,7 @@ def covariance_of(made: Fit) -> Float:
 
 
 def likeliest(made: Fit, options: Sequence[tuple[str, ...]]) -> list[Fit]:
-    """Return where fits with further keys begin, the likeliest first; those that are likelier than the fit without.
+    """Return where fits with further keys begin, the likeliest first.
 
     Each of the ``options`` goes as far as the slopes lead in a straight line, from the end of the fit without and from
     where that began: a lack bends what is there.
@@ -259,7 +276,7 @@ def likeliest(made: Fit, options: Sequence[tuple[str, ...]]) -> list[Fit]:
     left, _ = left_of(made.problem, begun)
     starts = (made, Fit(made.problem, begun, left, scale_of(made.problem, left)))
     found = [one for start in starts for one in _ahead(start, options)]
-    return sorted((one for one in found if one.deviance < made.deviance), key=lambda one: one.deviance)
+    return sorted((one for one in found if math.isfinite(one.deviance)), key=lambda one: one.deviance)
 
 
 def _ahead(start: Fit, options: Sequence[tuple[str, ...]]) -> Iterator[Fit]:
