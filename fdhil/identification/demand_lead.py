@@ -17,7 +17,9 @@ from fdhil.records import Float, Parameters, Window, read_only, rms
 
 LEAST_FEEDFORWARD = 0.5  # with less, a lag at constant speed is that of the position loop
 WHOLE = 0.3  # of a cycle, by which a lead may miss a whole number
-EXPLAINED = 0.003  # of what was left, at most, when the lead is taken out: with a filter or less feed-forward it is more
+EXPLAINED = (
+    0.003  # of what was left, at most, when the lead is taken out: with a filter or less feed-forward it is more
+)
 MOST = 32  # cycles
 LEAST_ROWS, SAME_GRID = 50, 1e-3
 

@@ -28,7 +28,7 @@ from fdhil.records import INTERVAL_95, LoopEstimate, Parameters, Reason, Verdict
 WORTH, WORTH_LEFT = 0.1, 0.1  # of the tolerance, or of what is left: what a key must explain to join
 LEAST_UM = 0.02
 WELL, NOTHING_UM = 0.25, 0.1  # of the tolerance, and in um: with less left nothing is missing
-MOST_WINDOWS, MOST_TRIED = 4, 12
+MOST_WINDOWS, MOST_TRIED = 4, 4
 DIFFER = "LoopsDiffer"
 LOOSE = 0.25  # relative standard deviation above which a gain is not known
 PID = ("position_gain_per_s", "speed_feedforward", "speed_kp", "position_ki_per_s2")
