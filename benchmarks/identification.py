@@ -11,17 +11,22 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
+
 from fdhil import tables
 from fdhil.config import Identification
 from fdhil.daemon.kernel_warmup import nominal_rapid
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import AxisPipeline, analyse
+from fdhil.pipeline.recorded import analyse_windows
 from fdhil.records import Window
 from fdhil.store.recording_csv import parse_recording
-from studies import bench
+from studies import bench, real_plant
 from tests.bench import bench_config
 
 WINDOWS = 40
+MACHINES = 8
+SYNC_S = 0.001
 ROWS = 1200
 WANTED_MS = 20
 NOISE = 0.005
@@ -43,6 +48,23 @@ def main() -> None:
     rapids = [nominal_rapid("X", config.axis["X"], 0.001, 1 - 2 * (k % 2), seed=k) for k in range(WINDOWS + 2)]
     took = [_timed(partial(pipeline.feed, window)) for window in rapids][2:]
     print(f"{'pipeline':<22} {rapids[0].n} samples, with pool, history, skill {_figures(took)}")
+    drawn_machines()
+
+
+def drawn_machines() -> None:
+    """Print the time of a window of machines as they are, without and with configuration, and with other loops."""
+    axis, settings = bench_config("X").axis["X"], Identification()
+    machines = [real_plant.drawn(np.random.default_rng(seed), real_plant.Mechanics()) for seed in range(MACHINES)]
+    for label, known, filter_s in (("no", None, 0.0), ("with", axis, 0.0), ("with a filter more", axis, 2e-3)):
+        took = []
+        for seed, (mechanics, loops, sensors) in enumerate(machines):
+            run = real_plant.run(mechanics, bench.shuttle(moves=4), replace(loops, speed_filter_s=filter_s))
+            windows = find_windows(real_plant.recording(run, mechanics, sensors, 0.5, seed))
+            call = partial(analyse_windows, windows, settings, known, None if known is None else SYNC_S)
+            if not seed:
+                call()  # compiles what is not compiled yet
+            took.append(_timed(call) / len(windows))
+        print(f"{f'drawn machines, {label}':<38} configuration {_figures(took)}")
 
 
 def recorded(count: int) -> list[Window]:

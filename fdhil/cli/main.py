@@ -50,9 +50,6 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "export": ("fdhil.cli.records:export", "Write a recording, or a log of the bus, in another file format."),
 }
 
-# the matrices of a window are small: threads of the numeric libraries only spin, and this PC has an NC beside it
-BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-
 
 class LazyGroup(click.Group):
     """A group that imports a command's module when that command is called."""
@@ -102,8 +99,6 @@ def cli() -> None:
 def main() -> None:
     """Run the command line; an error of fdhil is one sentence on stderr and its exit code."""
     prepare_streams()
-    for name in BLAS_THREADS:
-        os.environ.setdefault(name, "1")
     if not sys.warnoptions:  # advice of libraries is for developers, who ask for it with -W
         warnings.simplefilter("ignore")
         os.environ.setdefault("PYTHONWARNINGS", "ignore")  # of the processes started from here, too

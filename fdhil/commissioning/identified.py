@@ -7,7 +7,8 @@ from typing import Any
 
 from fdhil.config import Identification, MachineConfig
 from fdhil.errors import DriveFault
-from fdhil.identification.estimators.maximum_likelihood import delay_score, fit_windows
+from fdhil.identification.delay import delay_score
+from fdhil.identification.estimators.maximum_likelihood import fit_windows
 from fdhil.pipeline import AxisPipeline, Known, Record
 from fdhil.records import PARAMETERS, Outcome, ParameterSet, Skill, WindowOutcome, unit_of
 

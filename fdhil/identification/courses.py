@@ -18,26 +18,33 @@ def any_voltage(motion: Motion) -> bool:
 
 def load_nm(motion: Motion, theta: Float) -> Float:
     """Return dry friction and the torque of the terms (n,) against the positive direction over each interval."""
-    return _known(_added(theta[CD] * motion.mode, motion, theta, LOAD), motion, LOAD)
+    return np.asarray(loads_nm(motion, theta[None])[0])
+
+
+def loads_nm(motion: Motion, thetas: Float) -> Float:
+    """Return the same (q, n) for the rows of ``thetas`` (q, k)."""
+    return _known(_added(thetas[:, CD, None] * motion.mode, motion, thetas, LOAD), motion, LOAD)
 
 
 def terms_nm(motion: Motion, theta: Float) -> Float:
     """Return the torque of the terms (n,) alone."""
-    return _added(np.zeros(motion.n), motion, theta, LOAD)
+    return np.asarray(_added(np.zeros((1, motion.n)), motion, theta[None], LOAD)[0])
 
 
 def voltage_v(motion: Motion, theta: Float) -> Float:
     """Return the mean voltage (n,) that reaches the motor over each interval, without its delay."""
-    return _known(_added(motion.delayed(float(theta[DELAY])), motion, theta, VOLTAGE), motion, VOLTAGE)
+    (added,) = _added(motion.delayed(float(theta[DELAY]))[None], motion, theta[None], VOLTAGE)
+    return _known(np.asarray(added), motion, VOLTAGE)
 
 
 def voltage_terms_v(motion: Motion, theta: Float) -> Float:
     """Return what the terms add to the voltage (n,) over each interval."""
-    return _added(np.zeros(motion.n), motion, theta, VOLTAGE)
+    return np.asarray(_added(np.zeros((1, motion.n)), motion, theta[None], VOLTAGE)[0])
 
 
-def _added(values: Float, motion: Motion, theta: Float, kind: int) -> Float:
-    for course, amplitude in zip(motion.courses, theta[FIRST_COURSE:], strict=False):
+def _added(values: Float, motion: Motion, thetas: Float, kind: int) -> Float:
+    amplitudes = thetas[:, FIRST_COURSE:].T[:, :, None]
+    for course, amplitude in zip(motion.courses, amplitudes, strict=False):
         if course.kind == kind:
             values = values + amplitude * course.values
     return values

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from fdhil.identification.filtering import quick_size, through
 from fdhil.identification.normal import root_of, solve
 from fdhil.records import Float, VoltageSampling
 
+Complex = npt.NDArray[np.complex128]
 TESTED_LAGS = 25
 SUMMED_LAGS = 50  # rows over which innovations may hang together
 COLOUR_ROWS = 10  # rows before that foretell an innovation: a window of 0.1 s tells no more weights
@@ -114,33 +117,39 @@ def robust(information: Float, scores: Sequence[Float], rows: Sequence[tuple[Flo
 
 def summed(scores: Float) -> Float:
     """Return the variance (k, k) of the sum of ``scores`` (n, k) that hang together, with Bartlett's weights."""
-    meat = scores.T @ scores
-    for lag in range(1, min(SUMMED_LAGS, len(scores) // 4) + 1):
-        shifted = scores[lag:].T @ scores[:-lag]
-        meat += (1.0 - lag / (SUMMED_LAGS + 1)) * (shifted + shifted.T)
+    span = min(SUMMED_LAGS, len(scores) // 4) + 1
+    sums = np.zeros((len(scores) + 2 * span, scores.shape[1]))
+    np.cumsum(scores, axis=0, out=sums[span : span + len(scores)])
+    sums[span + len(scores) :] = sums[span + len(scores) - 1]
+    moving = sums[span:] - sums[:-span]  # the mean square of moving sums has these weights
+    meat: Float = moving.T @ moving / span
     return meat
 
 
-def _spectrum(innovations: Float, size: int) -> Float:
-    """Return the spectrum (size // 2 + 1, 2, 2) of innovations (n, 2) by an autoregression of ``COLOUR_ROWS`` rows."""
+def _spectrum(innovations: Float, size: int) -> Complex:
+    """Return a root (2, 2, size // 2 + 1) of the spectrum of innovations (n, 2), by an autoregression of few rows."""
     n = len(innovations)
     before = np.hstack([innovations[COLOUR_ROWS - lag : n - lag] for lag in range(1, COLOUR_ROWS + 1)])
     weights, _ = solve(before, innovations[COLOUR_ROWS:])
     left = innovations[COLOUR_ROWS:] - before @ weights
     news = left.T @ left / (n - 3 * COLOUR_ROWS)
     filters = np.concatenate([np.eye(2)[None], -weights.reshape(COLOUR_ROWS, 2, 2).transpose(0, 2, 1)])
-    answer = np.linalg.inv(np.fft.rfft(filters, size, axis=0))
-    spectrum: Float = answer @ news @ answer.conj().transpose(0, 2, 1)
-    return spectrum
+    (a, b), (c, d) = np.fft.rfft(filters, size, axis=0).transpose(1, 2, 0)
+    root = np.linalg.cholesky(news)
+    rows = np.array([[d, -b], [-c, a]]) / (a * d - b * c)
+    answer: Complex = np.einsum("abf,bc->acf", rows, root)
+    return answer
 
 
-def _coloured(slopes: Float, spectrum: Float) -> Float:
-    """Return the variance (k, k) of the sum of slopes (n, 2, k) times innovations of that ``spectrum``."""
-    size = 2 * (len(spectrum) - 1)
-    turned = np.fft.rfft(slopes, size, axis=0)
-    weights = np.full(len(spectrum), 2.0)
-    weights[[0, -1]] = 1.0
-    variance: Float = np.einsum("f,far,fas->rs", weights, turned.conj(), spectrum @ turned).real / size
+def _coloured(slopes: Float, root: Complex) -> Float:
+    """Return the variance (k, k) of the sum of slopes (n, 2, k) times innovations with that ``root`` of a spectrum."""
+    size = 2 * (root.shape[2] - 1)
+    of_current, of_speed = np.fft.rfft(slopes.transpose(1, 2, 0), size)  # (k, f)
+    weight = np.full(root.shape[2], math.sqrt(2.0))
+    weight[[0, -1]] = 1.0
+    answers = [(a.conj() * of_current + b.conj() * of_speed) * weight for a, b in root.transpose(1, 0, 2)]
+    whole = np.concatenate([part for answer in answers for part in (answer.real, answer.imag)], axis=1)
+    variance: Float = whole @ whole.T / size
     return variance
 
 

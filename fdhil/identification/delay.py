@@ -1,22 +1,33 @@
-"""Finds the delay of the voltage against current and speed, in whole samples, from the electrical equation alone."""
+"""Finds the delay of the voltage against current and speed: whole rows from [1], less from innovations."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from fdhil.identification.derivatives import derivative
 from fdhil.identification.estimators.least_squares import Signals
-from fdhil.identification.normal import inverse_gram
+from fdhil.identification.fit import Fit, jacobian, typical
+from fdhil.identification.kalman import DELAY
+from fdhil.identification.normal import inverse_gram, solve
+from fdhil.identification.terms import WHOLE_DEAD_TIME
+from fdhil.records import Float
 
 SPAN_S = 0.025
-IMPROVEMENT = 1.5  # the residual's power must fall by this factor before another whole sample is believed
+# times that the power left must fall before a delay of whole rows is accepted: no voltage is early, but what the model
+# lacks of inverter and winding looks so
+LATER, EARLIER = 1.5, 9.0
+MOST_DELAY = 2.5  # rows, two with rounding: what resembles a longer delay, and is none of whole rows, is none
+LEAST_DELAY = 0.05  # of a row; a smaller delay cannot be told from the voltage's course within a row
+CHANCE = 2.0  # standard deviations of a delay that are chance, not doubt
 
 
 def coarse_delay(signals: Signals, dt_s: float) -> float:
     """Return by how many seconds, in whole samples, the voltage is late (early: negative); 0 unless it surely is.
 
-    [5] is fitted with the voltage moved by each number of samples; the best fit tells. Finer than a sample is the
-    business of the maximum-likelihood fit that starts here.
+    [5], with what an inverter's dead time takes, is fitted with the voltage moved by each number of samples; the best
+    fit tells. Up to ``MOST_DELAY`` a delay is the business of the maximum-likelihood fit: other things resemble it.
     """
     reach = min(max(3, round(SPAN_S / dt_s)), signals.speed.size // 8)
     slope = derivative(signals.current, dt_s)
@@ -24,13 +35,45 @@ def coarse_delay(signals: Signals, dt_s: float) -> float:
     kept = (signals.usable & np.isfinite(slope))[inside]
     if np.count_nonzero(kept) < 32:
         return 0.0
-    phi = np.where(kept, np.stack([slope, signals.current, signals.speed])[:, inside], 0.0)
+    lost = np.clip(signals.current / (WHOLE_DEAD_TIME * float(np.abs(signals.current).max())), -1.0, 1.0)
+    phi = np.where(kept, np.stack([slope, signals.current, signals.speed, lost])[:, inside], 0.0)
     inverse, _ = inverse_gram(phi.T)
     shifts = np.arange(-reach, reach + 1)
     pulls = np.stack([np.correlate(signals.voltage, column, "valid") for column in phi])
     power = np.correlate(signals.voltage**2, kept.astype(np.float64), "valid")
     costs = power - (pulls * (inverse @ pulls)).sum(axis=0)
     best = int(np.argmin(costs))
-    if not np.isfinite(costs).all() or costs[reach] <= IMPROVEMENT * max(costs[best], 0.0) or abs(shifts[best]) < 1:
+    near = costs[np.abs(shifts) <= MOST_DELAY].min()
+    if not np.isfinite(costs).all() or near <= (LATER if best > reach else EARLIER) * max(costs[best], 0.0):
         return 0.0
     return float(shifts[best]) * dt_s
+
+
+def delay_score(plain: Fit) -> tuple[float, float]:
+    """Return the delay (s) that one Newton step from a fit without delay would add, and its standard deviation."""
+    d = delay_direction(plain)
+    rest = d - plain.but_delay @ solve(plain.but_delay, d)[0]
+    weight = float(rest @ rest)
+    return (float(rest @ plain.residuals) / weight, weight**-0.5) if weight > 0 else (0.0, np.inf)
+
+
+def delay_direction(result: Fit) -> Float:
+    """Return minus the derivative (m,) of the innovations by the delay."""
+    if DELAY in result.free:
+        return result.jacobian[:, result.free.index(DELAY)]
+    sizes = typical(result.theta, result.problem.motions)
+    return jacobian(result.problem, result.theta, result.residuals, [DELAY], sizes)[:, 0]
+
+
+def with_delay_doubt(made: Fit) -> Fit:
+    """Return the fit with its doubt about a delay of the voltage.
+
+    Regulators act several times within a row, which looks like a delay of a few per cent of it, but moves L
+    otherwise. So a small delay is not taken out: what it would change is a doubt, and so it is about a larger one.
+    """
+    if DELAY in made.free:
+        return replace(made, delay_doubt_s=LEAST_DELAY / 2 * min(m.dt_s for m in made.problem.motions))
+    if not (made.converged and np.isfinite(made.residuals).all()):
+        return made
+    delay, std = delay_score(made)
+    return replace(made, delay_doubt_s=float(np.sqrt(max(0.0, delay**2 - (CHANCE * std) ** 2))))

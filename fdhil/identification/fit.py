@@ -88,7 +88,7 @@ class Problem:
         return np.concatenate([innovations(m, theta, f, emf_share=emf_share) for m, f in pairs])
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Fit:
     """The end of a fit: ``theta`` (7 + terms,), information (k, k) of the ``free`` entries, innovations (m,), noises.
 

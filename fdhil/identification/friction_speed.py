@@ -63,6 +63,8 @@ def sharpened(result: Fit) -> Fit:
         if not moved.converged:
             return result
         result = moved
+        if untold(result.problem.motions):
+            break
     return result
 
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fdhil.identification import kalman
-from fdhil.identification.courses import any_voltage, load_nm, voltage_v
-from fdhil.identification.kalman import CURRENT, DELAY, LOAD, SPEED, VOLTAGE, Readings
+from fdhil.identification.courses import FIRST_COURSE, any_voltage, load_nm, loads_nm, voltage_v
+from fdhil.identification.kalman import CD, CURRENT, DELAY, LOAD, SPEED, VOLTAGE, Readings
 from fdhil.identification.motion import Motion, Noise
 from fdhil.identification.slow_voltage import innovations_of
 from fdhil.records import Float
@@ -78,7 +78,8 @@ def _whitened(motion: Motion, thetas: Float, variances: Float, gains: Float) -> 
     told = thetas[:, DELAY:] if any_voltage(motion) else thetas[:, DELAY, None]
     together = bool((told == told[0]).all())
     voltages = np.array([voltage_v(motion, theta) for theta in (thetas[:1] if together else thetas)])
-    loads = np.array([load_nm(motion, theta) for theta in thetas])
+    frictions = thetas[:, [CD, *range(FIRST_COURSE, thetas.shape[1])]]
+    loads = loads_nm(motion, thetas[:1] if bool((frictions == frictions[0]).all()) else thetas)
     return kalman.whiten(thetas, variances, Readings.of(motion), voltages, loads, gains)
 
 

@@ -36,6 +36,7 @@ STATE_I, STATE_W, STATE_SLOPE, STATE_SUM = range(4)  # of the filter beside a sl
 STATE_U = 2  # of the filter whose voltage walks
 STATES = 4
 NO_SAMPLE = -1
+SETTLED, SETTLED_ROWS = 1e-12, 4  # relative change of a gain from row to row, and how often: from then on it stays
 LOG_ROWS = 16  # determinants, at most DIFFUSE^2 of the measurement's, that are multiplied before a logarithm is taken
 
 
@@ -156,36 +157,46 @@ def _whiten_one(
     unit = 1.0 / (vi * vw)
     p11, p12, p22 = DIFFUSE * vi, 0.0, DIFFUSE * vw
     i, w = current[0], speed[0]
-    logdet, product, counted = 0.0, 1.0, 0
+    logdet, product, counted, still = 0.0, 1.0, 0, 0
+    s11 = det = scale = root = g11 = g12 = g21 = g22 = before = 1.0
+    known = -1
     for k in range(mode.size):
         if not observed[k]:
-            white[k] = 0.0
+            white[k], still = 0.0, 0
         else:
-            s11, s22 = p11 + vi, p22 + vw
-            det = s11 * s22 - p12 * p12
-            part = 1.0 / det
+            if still < SETTLED_ROWS:
+                s11, s22 = p11 + vi, p22 + vw
+                det = s11 * s22 - p12 * p12
+                part = 1.0 / det
+                scale, root = 1.0 / np.sqrt(s11), np.sqrt(part / s11)
+                g11, g12 = (p11 * s22 - p12 * p12) * part, p12 * vi * part
+                g21, g22 = p12 * vw * part, (p22 * s11 - p12 * p12) * part
+                still = still + 1 if abs(g11 + g22 - before) <= SETTLED * before else 0
+                before = g11 + g22
+                white_iw, white_w = -p12 * root, s11 * root
             e1, e2 = current[k] - i, speed[k] - w
-            white[k, 0] = e1 / np.sqrt(s11)
-            white[k, 1] = (s11 * e2 - p12 * e1) * np.sqrt(part / s11)
-            g11, g12 = (p11 * s22 - p12 * p12) * part, p12 * vi * part
-            g21, g22 = p12 * vw * part, (p22 * s11 - p12 * p12) * part
+            white[k, 0] = e1 * scale
+            white[k, 1] = white_w * e2 + white_iw * e1
             if gains.size:
-                root = np.sqrt(part / s11)
                 gains[k, G_II], gains[k, G_IW], gains[k, G_WI], gains[k, G_WW] = g11, g12, g21, g22
-                gains[k, WHITE_I], gains[k, WHITE_IW], gains[k, WHITE_W] = 1.0 / np.sqrt(s11), -p12 * root, s11 * root
+                gains[k, WHITE_I], gains[k, WHITE_IW], gains[k, WHITE_W] = scale, white_iw, white_w
             i += g11 * e1 + g12 * e2
             w += g21 * e1 + g22 * e2
-            p11, p12, p22 = g11 * vi, g12 * vw, g22 * vw
             product *= det * unit
             counted += 1
             if counted % LOG_ROWS == 0:
                 logdet += np.log(product)
                 product = 1.0
         if mode[k] == BROKEN:
-            p11, p12, p22 = DIFFUSE * vi, 0.0, DIFFUSE * vw
+            p11, p12, p22, still = DIFFUSE * vi, 0.0, DIFFUSE * vw, 0
             continue
-        known = 0 if mode[k] == UNKNOWN else 1
-        p11, p12, p22 = _spread(steps, known, p11, p12, p22, vu, 0.0 if known else readings.walk)
+        was, known = known, 0 if mode[k] == UNKNOWN else 1
+        if known != was:
+            still = 0
+        if still < SETTLED_ROWS:  # else the gains change no more
+            if observed[k]:
+                p11, p12, p22 = g11 * vi, g12 * vw, g22 * vw
+            p11, p12, p22 = _spread(steps, known, p11, p12, p22, vu, 0.0 if known else readings.walk)
         rise = rise_v[k] if rise_v.size else 0.0
         i, w = _moved(steps, known, i, w, mean_v[k], load[k], rise)
     return float(logdet + np.log(product) - counted * np.log(unit))

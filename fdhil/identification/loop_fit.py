@@ -8,20 +8,20 @@ renewed between the rounds.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fdhil.config import Axis
-from fdhil.identification.covariance import SUMMED_LAGS
+from fdhil.identification.covariance import summed
 from fdhil.identification.loop_replay import Rapid, replay, with_regulators
 from fdhil.records import Float
 
 DELAY = "current_delay_cycles"
-ROUNDS = 4
-STEPS = 12
-CONVERGED = 1e-4  # of the squares' sum
+STEPS, TRIALS = 24, 8
+CONVERGED, ENOUGH = 1e-4, 0.05  # of the squares' sum: a step that gains less is the last, or asks for new slopes
+ROUNDS, SETTLED = 4, 1e-3  # in which the scale is renewed, until what is left changes by less
 SYSTEMATIC = 0.005  # of a gain: what rounding of the demand and a start that is not quite at rest do to all rapids
 LEAST_POSITION_MM, LEAST_CURRENT_A = 1e-5, 1e-4
 
@@ -126,7 +126,8 @@ class Fit:
     @property
     def deviance(self) -> float:
         """Minus twice the logarithm of the likelihood for each row, but for what all fits of the rapids share."""
-        return float(2.0 * np.log(scale_of(self.problem, self.left)).sum())
+        scale, spread = scale_of(self.problem, self.left), spread_of(self.problem, self.left)
+        return float((2.0 * np.log(scale) + (spread / scale) ** 2).sum())
 
     @property
     def values(self) -> dict[str, float]:
@@ -141,7 +142,12 @@ class Fit:
     def squares(self, scale: Float) -> float:
         """Return the sum of squares at some scale."""
         pairs = zip(self.left, self.problem.rapids, strict=True)
-        return float(sum((((r / scale[:, None]) ** 2).sum(axis=0)[one.known]).sum() for r, one in pairs))
+        return float(sum(np.square((left / scale[:, None])[:, one.known]).sum() for left, one in pairs))
+
+    def answers(self) -> list[Float]:
+        """Return position and current (2, n) of the closed loop, for each rapid."""
+        pairs = zip(self.problem.rapids, self.left, strict=True)
+        return [np.stack((rapid.position_mm, rapid.current_a)) - left for rapid, left in pairs]
 
 
 def left_of(problem: Problem, coordinates: Float) -> tuple[tuple[Float, ...], list[Float]]:
@@ -162,49 +168,62 @@ def scale_of(problem: Problem, left: Sequence[Float]) -> Float:
     return np.maximum(spread_of(problem, left), (LEAST_POSITION_MM, LEAST_CURRENT_A))
 
 
-def fit(problem: Problem, start: Float | None = None, rounds: int = ROUNDS) -> Fit:
+def fit(problem: Problem, start: Float | None = None) -> Fit:
     """Return the regulators that explain position and current best, from the axis as it is or from ``start``."""
     at = problem.start() if start is None else start
-    prior = at.copy()
     left, _ = left_of(problem, at)
-    made = Fit(problem, at, left, scale_of(problem, left))
-    for _ in range(rounds):
-        before = made
+    made, prior = Fit(problem, at, left, scale_of(problem, left)), at.copy()
+    for _ in range(ROUNDS):
+        before = made.unexplained_um
         made = _descend(made, prior)
-        settled = abs(made.unexplained_um - before.unexplained_um) < 1e-3 * before.unexplained_um
         made = replace(made, scale=scale_of(problem, made.left))
-        if settled:
+        if abs(made.unexplained_um - before) < SETTLED * before:
             break
     return made
 
 
 def _descend(made: Fit, prior: Float) -> Fit:
     """Go down at one scale."""
-    problem, weights = made.problem, 1.0 / made.problem.doubt() ** 2
-    low, high = problem.bounds()
-    damping = 1e-3
+    problem, damping, answers = made.problem, 1e-3, made.answers()
+    weights, (low, high) = 1.0 / problem.doubt() ** 2, problem.bounds()
 
     def cost(of: Fit) -> float:
         return of.squares(made.scale) + float(weights @ (of.coordinates - prior) ** 2)
 
-    now, current = cost(made), made
+    now, slopes, fresh = cost(made), problem.slopes(made.coordinates, answers), True
     for _ in range(STEPS):
-        information, score, _ = normal(current)
-        score = score - weights * (current.coordinates - prior)
-        before = now
-        for _ in range(8):
+        information, score = normal(made, slopes)
+        score = score - weights * (made.coordinates - prior)
+        before = made, now, answers
+        for _ in range(TRIALS if fresh else 1):
             matrix = information + np.diag(weights + damping * np.diag(information))
-            step = _free_step(matrix, score, current.coordinates, low, high)
-            at = np.clip(current.coordinates + step, low, high)
-            trial = replace(current, coordinates=at, left=left_of(problem, at)[0])
+            step = _free_step(matrix, score, made.coordinates, low, high)
+            at = np.clip(made.coordinates + step, low, high)
+            left, reached = left_of(problem, at)
+            trial = replace(made, coordinates=at, left=left)
             value = cost(trial)
             if np.isfinite(value) and value < now:
-                now, current, damping = value, trial, max(damping / 10, 1e-9)
+                now, made, answers, damping = value, trial, reached, max(damping / 10, 1e-9)
                 break
             damping *= 8
-        if before - now < CONVERGED * before:
+        gained = before[1] - now
+        if fresh and gained < CONVERGED * before[1]:
             break
-    return current
+        fresh = gained < ENOUGH * before[1]
+        if fresh:
+            slopes = problem.slopes(made.coordinates, answers)
+        else:
+            slopes = _turned(slopes, made.coordinates - before[0].coordinates, answers, before[2], information)
+    return made
+
+
+def _turned(
+    slopes: Sequence[Float], step: Float, after: Sequence[Float], before: Sequence[Float], metric: Float
+) -> list[Float]:
+    """Return slopes (2, n, k) that agree with what a ``step`` did (Broyden 1965): they cost as much as all else."""
+    share = np.diag(metric) * step
+    share = share / max(float(share @ step), 1e-300)
+    return [own + (a - b - own @ step)[..., None] * share for own, a, b in zip(slopes, after, before, strict=True)]
 
 
 def _free_step(matrix: Float, score: Float, at: Float, low: Float, high: Float) -> Float:
@@ -216,39 +235,62 @@ def _free_step(matrix: Float, score: Float, at: Float, low: Float, high: Float) 
     return step
 
 
-def normal(made: Fit) -> tuple[Float, Float, Float]:
-    """Return information (k, k), score (k,), and the score's covariance (k, k) of residuals that hang together.
-
-    The last is Newey and West's (1987), a window at a time: what the model does not have is no white noise.
-    """
-    problem, k = made.problem, len(made.problem.names)
-    information, score, meat = np.zeros((k, k)), np.zeros(k), np.zeros((k, k))
-    pairs = zip(problem.rapids, made.left, strict=True)
-    answers = [np.stack((rapid.position_mm, rapid.current_a)) - left for rapid, left in pairs]
-    for j, slope in enumerate(problem.slopes(made.coordinates, answers)):
-        known = problem.rapids[j].known
-        phi = slope[:, known] / made.scale[:, None, None]
-        rest = made.left[j][:, known] / made.scale[:, None]
-        rows = np.einsum("cnk,cn->nk", phi, rest)
-        information += np.einsum("cnj,cnk->jk", phi, phi)
-        score += rows.sum(axis=0)
-        meat += _hanging(rows)
-    return information, score, meat
+def normal(made: Fit, slopes: Sequence[Float]) -> tuple[Float, Float]:
+    """Return information (k, k) and score (k,) of a fit with the ``slopes`` (2, n, k) of each rapid."""
+    k = slopes[0].shape[2]
+    information, score = np.zeros((k, k)), np.zeros(k)
+    for phi, rest in _weighed(made, slopes):
+        flat = phi.reshape(-1, k)
+        information += flat.T @ flat
+        score += flat.T @ rest.ravel()
+    return information, score
 
 
-def _hanging(rows: Float) -> Float:
-    meat: Float = rows.T @ rows
-    for lag in range(1, min(SUMMED_LAGS, len(rows) // 4) + 1):
-        shifted = rows[lag:].T @ rows[:-lag]
-        meat = meat + (1.0 - lag / (SUMMED_LAGS + 1)) * (shifted + shifted.T)
-    return meat
+def _weighed(made: Fit, slopes: Sequence[Float]) -> Iterator[tuple[Float, Float]]:
+    """Yield slopes (2, m, k) and what is left (2, m) of each rapid's whole rows, in units of the scale."""
+    for rapid, left, slope in zip(made.problem.rapids, made.left, slopes, strict=True):
+        known = rapid.known
+        yield slope[:, known] / made.scale[:, None, None], left[:, known] / made.scale[:, None]
 
 
 def covariance_of(made: Fit) -> Float:
     """Return the covariance (k, k) of the keys' coordinates: the larger of the information's and the sandwich's."""
-    information, _, meat = normal(made)
+    slopes = made.problem.slopes(made.coordinates, made.answers())
+    information, _ = normal(made, slopes)
+    # what the model does not have is no white noise (Newey and West 1987)
+    meat = sum(summed(np.einsum("cnk,cn->nk", phi, rest)) for phi, rest in _weighed(made, slopes))
     inverse = np.linalg.inv(information + np.diag(1.0 / made.problem.doubt() ** 2))
     sandwich = inverse @ meat @ inverse
     wider = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(inverse), 1.0))
     floor = np.diag([(SYSTEMATIC if KEYS[name].scale == 0.0 else 0.0) ** 2 for name in made.problem.names])
     return np.asarray((inverse * np.outer(wider, wider)) + floor)
+
+
+def likeliest(made: Fit, options: Sequence[tuple[str, ...]]) -> list[Fit]:
+    """Return where fits with further keys begin, the likeliest first.
+
+    Each of the ``options`` goes as far as the slopes lead in a straight line, from the end of the fit without and from
+    where that began: a lack bends what is there.
+    """
+    begun = made.problem.start()
+    left, _ = left_of(made.problem, begun)
+    starts = (made, Fit(made.problem, begun, left, scale_of(made.problem, left)))
+    found = [one for start in starts for one in _ahead(start, options)]
+    return sorted((one for one in found if math.isfinite(one.deviance)), key=lambda one: one.deviance)
+
+
+def _ahead(start: Fit, options: Sequence[tuple[str, ...]]) -> Iterator[Fit]:
+    """Yield for each of the ``options``, begun at its usual value, where one step leads from ``start``."""
+    slopes = start.problem.slopes(start.coordinates, start.answers())
+    for option in options:
+        wider = replace(start.problem, names=(*start.problem.names, *option))
+        at = np.append(start.coordinates, [KEYS[name].usual for name in option])
+        left, answers = left_of(wider, at)
+        own = replace(wider, axis=start.axis(), names=option).slopes(at[-len(option) :], answers)
+        both = [np.concatenate(pair, axis=2) for pair in zip(slopes, own, strict=True)]
+        information, score = normal(Fit(wider, at, left, scale_of(wider, left)), both)
+        low, high = wider.bounds()
+        at = np.clip(at + np.linalg.solve(information + np.diag(1.0 / wider.doubt() ** 2), score), low, high)
+        if (at[-len(option) :] > 0.0).all():
+            left, _ = left_of(wider, at)
+            yield Fit(wider, at, left, scale_of(wider, left))

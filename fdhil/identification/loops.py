@@ -19,6 +19,7 @@ from pydantic import ValidationError
 
 from fdhil.config import Axis, Identification, Regulators
 from fdhil.identification import loop_fit
+from fdhil.identification.demand_lead import with_demand_on_time
 from fdhil.identification.loop_fit import DELAY, KEYS, Fit, Problem
 from fdhil.identification.loop_replay import Rapid, fitting_periods, rapid_of, with_regulators
 from fdhil.identification.loop_start import CASCADE, begun_anew, made_up_axis
@@ -27,7 +28,7 @@ from fdhil.records import INTERVAL_95, LoopEstimate, Parameters, Reason, Verdict
 WORTH, WORTH_LEFT = 0.1, 0.1  # of the tolerance, or of what is left: what a key must explain to join
 LEAST_UM = 0.02
 WELL, NOTHING_UM = 0.25, 0.1  # of the tolerance, and in um: with less left nothing is missing
-MOST_WINDOWS = 4
+MOST_WINDOWS, MOST_TRIED = 4, 4
 DIFFER = "LoopsDiffer"
 LOOSE = 0.25  # relative standard deviation above which a gain is not known
 PID = ("position_gain_per_s", "speed_feedforward", "speed_kp", "position_ki_per_s2")
@@ -66,7 +67,8 @@ def identify_loops(
     without it the search begins from the demand alone. Set-points come every ``sync_period_s`` (left out: each row).
     Without ``growing`` the keys that are configured are found anew, and no others are tried: that takes no time.
     """
-    pairs = list(zip(windows, mechanics, strict=True))[-MOST_WINDOWS:]
+    on_time = [with_demand_on_time(window, axis, sync_period_s)[0] for window in windows[-MOST_WINDOWS:]]
+    pairs = list(zip(on_time, mechanics[-MOST_WINDOWS:], strict=True))
     told = [(rapid, own) for w, own in pairs if (rapid := rapid_of(w, own, sync_period_s)) is not None]
     if not told:
         return None
@@ -147,17 +149,15 @@ def _best(problem: Problem, tolerance_um: float, configured: bool) -> Fit:
 
 
 def _grown(made: Fit, tolerance_um: float) -> Fit:
-    """Let keys join, the best of all first, as long as it is worth it; two at once where that is worth more."""
+    """Let keys join, the likeliest first, as long as it is worth it; two at once where that is worth more."""
     while beyond_rounding_um(made) > enough_um(tolerance_um):
-        best = made
-        for options in (SINGLE_KEYS, FILTERS):
-            free = [option for option in options if not {*option} & {*made.problem.names}]
-            grown = min((_with(made, option) for option in free), key=lambda fit: fit.deviance, default=best)
-            if best.unexplained_um - grown.unexplained_um > worth_um(best, tolerance_um):
-                best = grown
-        if best is made:
+        options = [option for option in (*SINGLE_KEYS, *FILTERS) if not {*option} & {*made.problem.names}]
+        starts = loop_fit.likeliest(made, options)[:MOST_TRIED] if options else []
+        fits = (loop_fit.fit(start.problem, start.coordinates) for start in starts)
+        grown = min(fits, key=lambda f: f.deviance, default=made)
+        if not made.unexplained_um - grown.unexplained_um > worth_um(made, tolerance_um):
             break
-        made = best
+        made = grown
     return made
 
 
@@ -175,16 +175,6 @@ def enough_um(tolerance_um: float) -> float:
 def worth_um(made: Fit, tolerance_um: float) -> float:
     """Return by how much another key, or another structure, must explain more than this fit does."""
     return max(LEAST_UM, min(WORTH * tolerance_um, WORTH_LEFT * made.unexplained_um))
-
-
-def _with(made: Fit, option: tuple[str, ...]) -> Fit:
-    """Return the fit with further keys, begun where it was without, and where all began: a lack bends what is there."""
-    wider = replace(made.problem, names=(*made.problem.names, *option))
-    starts = [
-        np.append(made.coordinates, [KEYS[name].step for name in option]),
-        np.append(made.problem.start(), [KEYS[name].usual for name in option]),
-    ]
-    return min((loop_fit.fit(wider, start) for start in starts), key=lambda fit: fit.deviance)
 
 
 def _other_structure(made: Fit) -> Problem | None:

@@ -15,6 +15,7 @@ import numpy as np
 from fdhil.identification.between import Between, Member
 from fdhil.identification.covariance import aliasing
 from fdhil.identification.ripple_parts import as_amplitude, as_parts
+from fdhil.identification.slow_rows import leaves_steps_open
 from fdhil.records import PARAMETERS, Estimate, Float, Int, Window, frozen
 
 # of a doubt that windows of one drive share, what may still differ between them: its size depends on the regulators,
@@ -217,9 +218,15 @@ def difference_covariance(one: tuple[Window, Estimate], other: tuple[Window, Est
     wide = max(systematic.shape[1], its_systematic.shape[1])
     systematic, its_systematic = (np.pad(s, ((0, 0), (0, wide - s.shape[1]))) for s in (systematic, its_systematic))
     apart = systematic - its_systematic
-    unshared = systematic @ systematic.T + its_systematic @ its_systematic.T + np.diag(alias**2 + its_alias**2)
+    part, its_part = _unshared(one[0], systematic), _unshared(other[0], its_systematic)
+    unshared = part @ part.T + its_part @ its_part.T + np.diag(alias**2 + its_alias**2)
     covariance: Float = own + its_own + apart @ apart.T + np.diag((alias - its_alias) ** 2) + UNSHARED**2 * unshared
     return covariance
+
+
+def _unshared(window: Window, systematic: Float) -> Float:
+    """Return the doubts (k, q) that windows of one drive may have in part for themselves: not how set-points step."""
+    return systematic[:, :2] if leaves_steps_open(window) else systematic
 
 
 def _of_six(own: Float, systematic: Float, alias: Float) -> tuple[Float, Float, Float]:

@@ -1,9 +1,10 @@
 """Lets terms join the six where the data surely show them: forward selection on a fit's own innovations.
 
 The innovations are linear in the terms and nearly so in the six, so what each would explain beyond all that are free
-is told without another fit. A term joins where minus twice the log likelihood falls by more than its price: the
-Bayesian criterion, extended by the number of terms that were tried (Chen and Chen 2008), with as many rows as are
-independent; where it is worth it; and where the six stay told. Then all are fitted once more.
+follows from one Gram matrix, without another fit. A term joins where minus twice the log likelihood falls by more than
+its price: the Bayesian criterion, extended by the number of terms that were tried (Chen and Chen 2008), with as many
+rows as are independent; where it is worth it; and where the six stay identifiable. Then all are fitted once more, from
+where the straight line leads.
 """
 
 from __future__ import annotations
@@ -18,9 +19,12 @@ import numpy.typing as npt
 
 from fdhil.identification import friction_speed
 from fdhil.identification.covariance import SUMMED_LAGS
+from fdhil.identification.delay import LEAST_DELAY, MOST_DELAY, delay_direction, with_delay_doubt
 from fdhil.identification.fit import Fit, fit
+from fdhil.identification.identifiability import admissible
 from fdhil.identification.kalman import DELAY, LOAD
 from fdhil.identification.motion import Course, Motion
+from fdhil.identification.noise import fit_noise
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.slow_voltage import in_order
 from fdhil.identification.terms import Candidate, candidates
@@ -36,23 +40,26 @@ WORTH = 0.005  # of the motor's torque (RMS): a tenth of the share of the follow
 SHIFT = 1.0  # standard deviations of one of the six: a smaller shift is within its interval anyway
 SIX = 6
 LEAST_SURE = 3.5  # standard deviations of a term, colour and all else that was chosen included
+LATE = "late"  # the candidate that is a delay of the voltage, and no term
+SURE_DELAY = 5.0  # standard deviations beyond which a delay is accepted
 
 
-def joined(base: Fit, command: bool, told: Callable[[Fit], Estimate]) -> Fit:
+def add_terms(base: Fit, command: bool, estimate_of: Callable[[Fit], Estimate], *, delayed: bool = False) -> Fit:
     """Return the fit with the terms that its windows surely show; itself where there are none.
 
-    ``command`` says whether the voltage may be a commanded one, ``told`` makes an estimate of a fit.
+    ``command`` says whether the voltage may be a commanded one, ``estimate_of`` makes an estimate of a fit. Where the
+    voltage may be ``delayed``, its delay is one of the candidates: dead time and others resemble it.
     """
     result, left = base, candidates(base.problem.motions, command)
-    untold = None
+    if delayed and DELAY not in base.free:
+        left.append(Candidate(LATE, tuple(() for _ in base.problem.motions)))
     for _ in range(ROUNDS):
         if not result.converged or not np.isfinite(result.residuals).all():
             return result
-        chosen = _chosen(result, left)
+        bench, chosen = _chosen(result, left, delayed)
         while chosen:
-            wider = _with(result, chosen)
-            untold = set(told(base).missing) if untold is None else untold
-            weak = _weak(told(wider), chosen, untold) if wider.converged else {chosen[-1].family}
+            wider = _with(result, chosen, bench)
+            weak = _weak(wider, chosen, base, estimate_of) if wider.converged else {chosen[-1].family}
             if friction_speed.untold(wider.problem.motions):
                 weak |= {"stribeck"} & {c.family for c in chosen}
             if not weak:
@@ -66,19 +73,36 @@ def joined(base: Fit, command: bool, told: Callable[[Fit], Estimate]) -> Fit:
     return result
 
 
-def _weak(estimate: Estimate, chosen: Sequence[Candidate], untold: set[str]) -> set[str]:
+def _weak(wider: Fit, chosen: Sequence[Candidate], base: Fit, estimate_of: Callable[[Fit], Estimate]) -> set[str]:
     """Return the families of what is not sure beside all else; the last chosen where the six are told no more.
 
     Friction that pushes is none: what makes it so stands for something else.
     """
-    if not set(estimate.missing) <= untold or chosen[-1].family not in estimate.names:
+    estimate = estimate_of(wider)
+    terms = [c.family for c in chosen if c.family != LATE]
+    lost = bool(estimate.missing) and not set(estimate.missing) <= set(estimate_of(base).missing)
+    if lost or not set(terms) <= set(estimate.names):
         return {chosen[-1].family}
-    weak = {c.family for c in chosen if not abs(estimate.value(c.family)) > LEAST_SURE * _std(estimate, c.family)}
+    weak = {name for name in terms if not abs(estimate.value(name)) > LEAST_SURE * _std(estimate, name)}
+    if len(terms) < len(chosen) and not _surely_late(wider, estimate):
+        weak.add(LATE)
     low = estimate.value("stribeck") if "stribeck" in estimate.names else 0.0
     friction = {"Cd": estimate.value("Cd"), "stribeck": low}
     if low and any(bound.beyond(friction) > 0.0 for bound in bounds(tuple(friction))):
-        weak.add("stribeck" if any(c.family == "stribeck" for c in chosen) else chosen[-1].family)
+        weak.add("stribeck" if "stribeck" in terms else chosen[-1].family)
     return weak
+
+
+def _surely_late(wider: Fit, estimate: Estimate) -> bool:
+    """Return whether a fit's delay is surely there, and one that data of these rows can tell."""
+    if estimate.delay_s is None or estimate.delay_std_s is None or not _may_be_late(wider, estimate.delay_s):
+        return False
+    alone = not wider.problem.motions[0].courses
+    return alone or abs(estimate.delay_s) >= SURE_DELAY * estimate.delay_std_s
+
+
+def _may_be_late(base: Fit, delay_s: float) -> bool:
+    return LEAST_DELAY <= abs(delay_s) / min(m.dt_s for m in base.problem.motions) <= MOST_DELAY
 
 
 def _std(estimate: Estimate, family: str) -> float:
@@ -90,37 +114,56 @@ def _std(estimate: Estimate, family: str) -> float:
     return math.sqrt(covariance[k, k] - covariance[k, speed] ** 2 / covariance[speed, speed])
 
 
-def _with(base: Fit, chosen: Sequence[Candidate]) -> Fit:
-    """Return the windows fitted with the chosen terms too."""
+def _with(base: Fit, chosen: Sequence[Candidate], bench: _Bench) -> Fit:
+    """Return the windows fitted with the chosen terms too, from where the straight line leads."""
     motions = []
     for k, motion in enumerate(base.problem.motions):
         more = tuple(course for candidate in chosen for course in candidate.courses[k])
         motions.append(replace(motion, courses=motion.courses + more))
-    added = sum(len(candidate.courses[0]) for candidate in chosen)
-    start = np.append(base.theta, np.zeros(added))
-    free = (*base.free, *range(base.theta.size, base.theta.size + added))
-    return friction_speed.sharpened(replace(fit(motions, start, free), delay_doubt_s=base.delay_doubt_s))
+    late = [DELAY] if any(c.family == LATE for c in chosen) else []
+    terms = range(base.theta.size, base.theta.size + sum(len(c.courses[0]) for c in chosen))
+    free = sorted({*base.free, *late, *terms})
+    start = np.append(base.theta, np.zeros(len(terms)))
+    ahead = start.copy()
+    ahead[[*base.free, *(j for c in chosen for j in _entries(c, chosen, base.theta.size))]] += bench.step(chosen)
+    start = ahead if admissible(ahead) else start
+    noises = [fit_noise(m, start, m.noise) for m in motions]
+    made = friction_speed.sharpened(fit(motions, start, free, noises))
+    return with_delay_doubt(made) if bench.delayed else replace(made, delay_doubt_s=base.delay_doubt_s)
 
 
-def _chosen(base: Fit, left: Sequence[Candidate]) -> list[Candidate]:
-    """Return the candidates that join this fit, the surest first."""
+def _entries(candidate: Candidate, chosen: Sequence[Candidate], first: int) -> list[int]:
+    """Return the entries of theta of one of the ``chosen``, of which the ``first`` begins the new ones."""
+    if candidate.family == LATE:
+        return [DELAY]
+    before = sum(len(c.courses[0]) for c in chosen[: list(chosen).index(candidate)])
+    return [first + before + k for k in range(len(candidate.courses[0]))]
+
+
+def _chosen(base: Fit, left: Sequence[Candidate], delayed: bool) -> tuple[_Bench, list[Candidate]]:
+    """Return the candidates that join this fit, the surest first, and the bench on which they were tried."""
     number, room = len(left), MOST - len(base.problem.motions[0].courses)
-    bench = _Bench.of(base, left) if left else None
+    bench = begun = _Bench.of(base, left, delayed)
     found: list[Candidate] = []
-    while bench is not None and len(found) < room:
+    while bench.left.size and len(found) < room:
         scores = bench.scores()
         plain = scores.gains - _price(scores.freedom, bench.rows, number)
         hopeful = np.flatnonzero(plain > 0.0)  # were all innovations independent
+        if not hopeful.size:
+            break
         colour = bench.colour(scores, hopeful)
         sure = scores.gains[hopeful] / colour - _price(scores.freedom[hopeful], bench.rows / colour, number)
-        if not (sure.size and sure.max() > 0.0):
+        if delayed and (found or base.problem.motions[0].courses):
+            late = [left[bench.left[k]].family == LATE for k in hopeful]
+            sure[late & (scores.gains[hopeful] < SURE_DELAY**2 * colour)] = -np.inf
+        if not sure.max() > 0.0:
             break
         best = int(hopeful[int(np.argmax(sure))])
         worth = _worth(bench, scores, best)
         if worth:
-            found.append(bench.left[best])
+            found.append(left[bench.left[best]])
         bench = bench.without(best, hopeful, worth)
-    return found
+    return begun, found
 
 
 def _price(freedom: Float, rows: float | Float, number: int) -> Float:
@@ -131,11 +174,10 @@ def _price(freedom: Float, rows: float | Float, number: int) -> Float:
 class _Scores(NamedTuple):
     """What each of c candidates, of one course or two, explains beyond all that is free.
 
-    ``beyond`` (2, m, c) are the courses' columns without what is free of them, ``shares`` (2, k, c); ``powers`` (2, c)
-    their squares, ``amplitudes`` (2, c), and ``gains`` (c,) the fall of minus twice the log likelihood.
+    ``shares`` (k, 2, c) are of the free entries in the courses; ``powers`` (2, c) the squares of what is beyond them,
+    ``amplitudes`` (2, c), and ``gains`` (c,) the fall of minus twice the log likelihood.
     """
 
-    beyond: Float
     shares: Float
     powers: Float
     amplitudes: Float
@@ -145,46 +187,70 @@ class _Scores(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Bench:
-    """A fit with the candidates that are ``left``, their ``columns`` (2, m, c): the second is nil where there is one.
+    """A fit with the ``candidates`` for it, of which those ``left`` (c,) are tried.
 
-    ``basis`` (m, k) is all that is free, after the ``doubts`` about the voltage's course, and ``inverse`` (k, k) the
-    covariance of that.
+    ``columns`` (m, p) are ``doubts`` about the voltage's course, the jacobian, and the courses of the candidates,
+    the two of each at ``places`` (2, candidates): the last column, which is nil, where there is no second. ``gram``
+    (p, p), as far as it is asked for, and ``pulls`` (p,) are their products, the doubts' expected sizes included;
+    ``free`` are those that are fitted.
     """
 
     fit: Fit
-    left: Sequence[Candidate]
+    candidates: Sequence[Candidate]
     columns: Float
-    basis: Float
+    gram: Float
+    pulls: Float
     doubts: int
-    inverse: Float
+    places: Rows
+    left: Rows
+    free: list[int]
+    delayed: bool
 
     @classmethod
-    def of(cls, base: Fit, left: Sequence[Candidate]) -> _Bench:
-        """Return the bench of a fit."""
-        motions = range(len(base.problem.motions))
-        pairs = [k for k, c in enumerate(left) if len(c.courses[0]) == 2]
-        courses = [[c.courses[k][0] for c in left] + [left[p].courses[k][1] for p in pairs] for k in motions]
-        answer = base.problem.answer(base.theta, courses)
-        columns = np.zeros((2, answer.shape[0], len(left)))
-        columns[0], columns[1][:, pairs] = answer[:, : len(left)], answer[:, len(left) :]
+    def of(cls, base: Fit, left: Sequence[Candidate], delayed: bool) -> _Bench:
+        """Return the bench of a fit, whose voltage may be ``delayed`` by what is to be found."""
         doubts = base.problem.course_effects(base.theta)
-        basis = np.column_stack([doubts, base.jacobian])
-        return cls(base, left, columns, basis, doubts.shape[1], _inverse(basis, doubts.shape[1]))
+        begin = doubts.shape[1] + base.jacobian.shape[1]
+        motions = range(len(base.problem.motions))
+        answer = base.problem.answer(base.theta, [[x for c in left for x in c.courses[k]] for k in motions])
+        late = [delay_direction(base)] if any(c.family == LATE for c in left) else []
+        columns = np.column_stack([doubts, base.jacobian, answer, *late, np.zeros(len(base.residuals))])
+        sizes = [len(c.courses[0]) for c in left]
+        first = begin + np.cumsum([0, *sizes])[:-1]
+        nil = columns.shape[1] - 1
+        places = np.array([first, np.where(np.array(sizes) == 2, first + 1, nil)], dtype=np.intp)
+        places[0, [c.family == LATE for c in left]] = nil - 1
+        rows, free = np.arange(len(left)), list(range(begin))
+        gram = np.diag(np.einsum("mp,mp->p", columns, columns))
+        gram[tuple(places)] = gram[tuple(places[::-1])] = np.einsum("mc,mc->c", *(columns[:, p] for p in places))
+        pulls = columns.T @ base.residuals
+        made = cls(base, left, columns, gram, pulls, doubts.shape[1], places, rows, free, delayed)
+        made._fill(free)
+        gram[range(doubts.shape[1]), range(doubts.shape[1])] += 1.0  # one deviation of them is all that is expected
+        return made
+
+    def _fill(self, rows: list[int]) -> None:
+        """Fill in the Gram matrix's ``rows``: those of candidates are asked for when they join."""
+        products = self.columns[:, rows].T @ self.columns
+        self.gram[rows], self.gram[:, rows] = products, products.T
 
     def without(self, taken: int, kept: Rows, joins: bool) -> _Bench:
         """Return the bench of those ``kept`` that are of another family than the ``taken``, which ``joins`` or not."""
-        family = self.left[taken].family
-        others = [int(k) for k in kept if self.left[k].family != family]
-        more = [c[:, taken] for c in self.columns if c[:, taken].any()] if joins else []
-        basis = np.column_stack([self.basis, *more])
-        return _Bench(
-            self.fit,
-            [self.left[k] for k in others],
-            self.columns[:, :, others],
-            basis,
-            self.doubts,
-            _inverse(basis, self.doubts),
-        )
+        family = self.candidates[self.left[taken]].family
+        others = [k for k in self.left[kept] if self.candidates[k].family != family]
+        more = self._columns_of(int(self.left[taken])) if joins else []
+        if more:
+            self._fill(more)
+        return replace(self, left=np.array(others, dtype=np.intp), free=[*self.free, *more])
+
+    def _columns_of(self, candidate: int) -> list[int]:
+        return [int(p) for p in self.places[:, candidate] if p < self.columns.shape[1] - 1]
+
+    def step(self, chosen: Sequence[Candidate]) -> Float:
+        """Return by how much the fit's free entries, and those of the ``chosen``, move with all of them (k,)."""
+        free = self.free + [p for c in chosen for p in self._columns_of(list(self.candidates).index(c))]
+        moved: Float = inverse_of(self.gram[np.ix_(free, free)])[0] @ self.pulls[free]
+        return moved[self.doubts :]
 
     @property
     def rows(self) -> float:
@@ -192,24 +258,26 @@ class _Bench:
         return 2.0 * sum(int(np.count_nonzero(np.abs(m.mode) == 1)) for m in self.fit.problem.motions)
 
     @property
-    def rest(self) -> Float:
-        """The innovations (m,) without what all that is free could explain of them."""
-        e = self.fit.residuals
-        left: Float = e - self.basis @ (self.inverse @ (self.basis.T @ e))
-        return left
+    def inverse(self) -> Float:
+        """The covariance (k, k) of all that is free."""
+        return inverse_of(self.gram[np.ix_(self.free, self.free)])[0]
 
     def scores(self) -> _Scores:
         """Return what each candidate explains."""
-        shares = self.inverse @ (self.basis.T @ self.columns)
-        beyond = self.columns - self.basis @ shares
-        whole, powers = (np.einsum("pmc,pmc->pc", part, part) for part in (self.columns, beyond))
+        free, inverse = self.free, self.inverse
+        first, second = places = self.places[:, self.left]
+        across = self.gram[free][:, places]  # (k, 2, c)
+        shares = np.tensordot(inverse, across, 1)
+        whole = self.gram[places, places]
+        powers = whole - np.einsum("kpc,kpc->pc", across, shares)
         seen = powers > IMITATED * whole
-        beyond, powers = np.where(seen[:, None], beyond, 0.0), np.where(seen, powers, 1.0)
-        s = beyond.transpose(0, 2, 1) @ self.rest
-        both = np.einsum("mc,mc->c", *beyond)
+        powers = np.where(seen, powers, 1.0)
+        both = self.gram[first, second] - np.einsum("kc,kc->c", across[:, 0], shares[:, 1])
+        both = np.where(seen.all(axis=0), both, 0.0)
+        s = np.where(seen, self.pulls[places] - np.tensordot(self.pulls[free], shares, 1), 0.0)
         determinant = np.maximum(powers[0] * powers[1] - both**2, IMITATED * powers[0] * powers[1])
         amplitudes = (powers[::-1] * s - both * s[::-1]) / determinant
-        return _Scores(beyond, shares, powers, amplitudes, (amplitudes * s).sum(axis=0), seen.sum(axis=0) * 1.0)
+        return _Scores(shares, powers, amplitudes, (amplitudes * s).sum(axis=0), seen.sum(axis=0) * 1.0)
 
     def colour(self, scores: _Scores, asked: Rows) -> Float:
         """Return by how much the scores of those ``asked`` (c,) vary more than were innovations independent.
@@ -217,33 +285,38 @@ class _Bench:
         After Newey and West (1987), by rows, of what is left with the candidate: what it explains is no colour.
         Bartlett's weights over lags are the mean square of moving sums.
         """
-        beyond, amplitudes = scores.beyond[:, :, asked], scores.amplitudes[:, asked]
-        left = self.rest[:, None] - np.einsum("pmc,pc->mc", beyond, amplitudes)
+        basis = self.columns[:, self.free]
+        rest = self.fit.residuals - basis @ (self.inverse @ self.pulls[self.free])
+        amplitudes, left = scores.amplitudes[:, asked], rest[:, None]
+        beyond = []
+        for own, place in enumerate(self.places[:, self.left[asked]]):
+            beyond.append(self.columns[:, place] - basis @ scores.shares[:, own, asked])
+            left = left - beyond[own] * amplitudes[own]
         meat = np.zeros(amplitudes.shape)
         for own, signal in enumerate(beyond):
             for motion, part in zip(self.fit.problem.motions, self.fit.by_window(signal * left), strict=True):
                 by_row = in_order(motion, float(self.fit.theta[DELAY]), part)
                 sums = np.cumsum(np.pad(by_row, ((SUMMED_LAGS + 1, SUMMED_LAGS), (0, 0))), axis=0)
                 moving = sums[SUMMED_LAGS + 1 :] - sums[: -SUMMED_LAGS - 1]
-                meat[own] += np.square(moving).sum(axis=0) / (SUMMED_LAGS + 1)
+                meat[own] += np.einsum("mc,mc->c", moving, moving) / (SUMMED_LAGS + 1)
         colour: Float = np.maximum(1.0, (meat / scores.powers[:, asked]).max(axis=0, initial=1.0))
         return colour
 
 
-def _inverse(basis: Float, doubts: int) -> Float:
-    gram = basis.T @ basis
-    gram[range(doubts), range(doubts)] += 1.0  # one deviation of the voltage's course is all that is expected of it
-    return inverse_of(gram)[0]
-
-
 def _worth(bench: _Bench, scores: _Scores, k: int) -> bool:
-    """Return whether a term's torque matters to the path, or without it one of the six is beyond its interval."""
+    """Return whether a term's torque matters to the path, or without it one of the six is beyond its interval.
+
+    A delay must be one that the rows can tell.
+    """
     amplitudes, six = scores.amplitudes[:, k], slice(bench.doubts, bench.doubts + SIX)
-    moved = np.einsum("pk,p->k", scores.shares[:, :, k], amplitudes)[six]
+    candidate = bench.candidates[bench.left[k]]
+    if candidate.family == LATE and not _may_be_late(bench.fit, float(amplitudes[0])):
+        return False
+    moved = (scores.shares[:, :, k] @ amplitudes)[six]
     if (np.abs(moved) > SHIFT * np.sqrt(np.diag(bench.inverse)[six])).any():
         return True
-    courses, base = bench.left[k].courses, bench.fit
-    if courses[0][0].kind != LOAD:
+    courses, base = candidate.courses, bench.fit
+    if candidate.family == LATE or courses[0][0].kind != LOAD:
         return False
     torque = sum(float(np.square(_torque(own, amplitudes)).sum()) for own in courses)
     whole = sum(float(np.square(base.theta[2] * _sure(m)).sum()) for m in base.problem.motions)

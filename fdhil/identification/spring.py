@@ -7,6 +7,7 @@ s of the inertia about the values found so far, so both are entries of the fit, 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from fdhil.config import Axis
 from fdhil.identification.fit import Fit, fit, pose
 from fdhil.identification.innovations import whiten
 from fdhil.identification.kalman import LOAD
-from fdhil.identification.motion import BROKEN, UNKNOWN, Course, Modes, Motion
+from fdhil.identification.motion import BROKEN, UNKNOWN, Course, Modes, Motion, Noise
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.spring_torques import LEAST_SHARE, MOST_OF_ROWS, MOST_SHARE, Spring, Torques
 from fdhil.records import Float
@@ -115,11 +116,12 @@ def _turned(base: Fit, spring: Spring, told: Told) -> tuple[Fit, float] | None:
     """Return the fit with the spring, and minus twice its log likelihood; None where it tells none."""
     plain, theta = base.problem.motions[0], base.theta
     free = (*base.free, theta.size, theta.size + 1)
+    noises: Sequence[Noise] = ()
     for _ in range(TURNS):
-        made = fit([_bent(plain, theta, spring)], np.append(theta, [0.0, 0.0]), free)
+        made = fit([_bent(plain, theta, spring)], np.append(theta, [0.0, 0.0]), free, noises)
         if not made.converged or not np.isfinite(made.residuals).all():
             return None
-        made = _with_prior(made, spring, told)
+        made, noises = _with_prior(made, spring, told), made.problem.noises
         theta, before = made.theta[:-2], spring
         spring = spring.moved(*made.theta[-2:])
         if not told.allows(spring):

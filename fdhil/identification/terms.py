@@ -28,7 +28,7 @@ LEAST_TURN = 1e-9  # rad in an interval
 PHASE = "_phase"  # ends the name of a ripple's cosine, as of its phase
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
     """A term that may join: for each window its courses, one or a pair, which no other of its ``family`` may follow."""
 

@@ -312,6 +312,7 @@ def _leapt(
 @compiled
 def _run_leaping(
     reference: Float,
+    current_offset: Float,
     first: int,
     plant: Float,
     leap: Float,
@@ -321,7 +322,7 @@ def _run_leaping(
     state: Float,
     out: Float,
 ) -> None:
-    """Run a cascade without delay and offsets as :func:`run` does, each speed cycle in one leap where it is linear.
+    """Run a cascade without delay and speed offsets as :func:`run` does, in one leap a speed cycle where it is linear.
 
     With terms a leap takes the mean of their torque; a constant voltage that is lost comes to a change of the integral.
     ``out`` (1 + kept, rows) is written. All that a cycle changes is in plain variables: memory would take most of it.
@@ -370,6 +371,8 @@ def _run_leaping(
             error = kv * lag + place + kff * rate - seen
             candidate = speeds + speed_ki * error
             raw = speed_kp * error + candidate + forward
+            if current_offset.size > 0:
+                raw += _between(current_offset, k, part)
             demand_a = min(max(raw, -current_max), current_max)
             if demand_a == raw:
                 speeds, places = candidate, place
@@ -433,8 +436,8 @@ def run(
     law, kept, n_speed, n_current, order, delay = shape
     last = reference.size - 1
     out = np.empty((ROW_STATE + kept, rows))
-    if law == CASCADE and leap.size > 0 and speed_offset.size + current_offset.size == 0:
-        _run_leaping(reference, first, plant, leap, gains, terms, shape, state, out)
+    if law == CASCADE and leap.size > 0 and speed_offset.size == 0:
+        _run_leaping(reference, current_offset, first, plant, leap, gains, terms, shape, state, out)
         return out
     kff, period, current_max, filtered = gains[KFF], gains[PERIOD], gains[CURRENT_MAX], gains[SPEED_DECAY] > 0.0
     for row in range(rows):

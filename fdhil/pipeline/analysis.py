@@ -10,6 +10,7 @@ import numpy as np
 
 from fdhil.config import Axis, Identification
 from fdhil.identification.compliance import beside_the_config, compliance, joined
+from fdhil.identification.demand_lead import with_demand_on_time
 from fdhil.identification.estimators import chosen, maximum_likelihood
 from fdhil.identification.identifiability import empty_estimate
 from fdhil.identification.signals import mended
@@ -18,7 +19,8 @@ from fdhil.identification.without_voltage import told
 from fdhil.records import Estimate, Parameters, Reason, Result, Verdict, Window, WindowOutcome
 from fdhil.validation import BEFORE_ANY_FIT, LEAST_ROWS, OF_THE_FIT, WEIGHED, Evidence, Findings, ask
 from fdhil.validation.at_the_table import at_the_table
-from fdhil.validation.data_sheet import gain_error
+from fdhil.validation.checks import PLATEAU
+from fdhil.validation.data_sheet import gain_error, scale_convention
 from fdhil.validation.signal_consistency import table_faults
 
 # what solvers raise; scipy's raise ValueError for what is not finite
@@ -39,9 +41,19 @@ def analyse(
     ``axis``' section the rapid is replayed through the closed loop, whose set-points come every ``sync_period_s``
     (left out: with every row).
     """
-    at_instants = mended(window, settings.speed_source)
-    signals = Evidence(at_instants, settings, axis=own(window, axis), sync_period_s=sync_period_s, recorded=window)
-    return replace(_with_table(_analysed(signals), signals), window=window)
+    axis = own(window, axis)
+    at_instants, cycles = with_demand_on_time(mended(window, settings.speed_source), axis, sync_period_s)
+    signals = Evidence(at_instants, settings, axis=axis, sync_period_s=sync_period_s, recorded=window)
+    outcome = replace(_with_table(_analysed(signals), signals), window=window)
+    return _with_lead(outcome, cycles) if cycles else outcome
+
+
+def _with_lead(outcome: WindowOutcome, cycles: int) -> WindowOutcome:
+    """Return the outcome with the lead of the recorded set-point as a warning."""
+    text = f"the recorded set-point is {cycles} cycles ahead of the one that the drive follows, and was taken later"
+    reason = Reason("SampleTiming", text, "record the drive's own set-point, or leave it: nothing else depends on it")
+    verdict = replace(outcome.verdict, warnings=(*outcome.verdict.warnings, reason))
+    return replace(outcome, verdict=verdict)
 
 
 def _with_table(outcome: WindowOutcome, signals: Evidence) -> WindowOutcome:
@@ -162,6 +174,14 @@ def _speed_lag(window: Window) -> Reason | None:
     return Reason("SampleTiming", text, "take speed and position from one SYNC, or set [identification] speed_source")
 
 
+def _convention(evidence: Evidence) -> list[Reason]:
+    """Return how the drive scales current and voltage, where the data sheet shows that it is not as the model's."""
+    if evidence.axis is None or evidence.estimate is None or evidence.estimate.missing:
+        return []
+    found = scale_convention(evidence.estimate, Parameters(**evidence.axis.nominal.model_dump()))
+    return [] if found is None else [found]
+
+
 def _gain(evidence: Evidence) -> Iterator[Reason]:
     """Yield the signal whose gain may be why the configured loops do not explain the rapid."""
     if evidence.axis is not None and evidence.estimate is not None:
@@ -172,8 +192,10 @@ def _gain(evidence: Evidence) -> Iterator[Reason]:
 
 def _outcome(evidence: Evidence, found: Findings) -> WindowOutcome:
     """Return the verdict: what is weighed refuses only where it does harm at the table, and warns else."""
-    weight, weighed = evidence.weight, [r for name, told in found.items() if name in WEIGHED for r in told]
-    reasons = [r for name, told in found.items() if name not in WEIGHED for r in told]
+    weight = evidence.weight
+    names = WEIGHED | {PLATEAU} if weight is not None and weight.through == "replay" else WEIGHED
+    weighed = [r for name, told in found.items() if name in names for r in told]
+    reasons = [r for name, told in found.items() if name not in names for r in told]
     # through ordinary loops only a share is known: what has a name says more
     if weight is not None and not weight.believed and (weight.in_um or not (reasons or weighed)):
         reasons += [weight.reason(), *_gain(evidence)]
@@ -181,6 +203,7 @@ def _outcome(evidence: Evidence, found: Findings) -> WindowOutcome:
         reasons, weighed = [*reasons, *weighed], []
     if reasons and (lag := _speed_lag(evidence.window)) is not None:
         reasons.append(lag)
+    weighed += _convention(evidence)
     unexplained = weight.unexplained_um if weight is not None and weight.in_um else None
     verdict = Verdict(not reasons, evidence.fit_percent, tuple(reasons), unexplained, tuple(weighed))
     return WindowOutcome(evidence.window, evidence.told, verdict)

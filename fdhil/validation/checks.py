@@ -12,7 +12,7 @@ from fdhil.records import Reason, Result
 from fdhil.validation.agreement import values_apart
 from fdhil.validation.evidence import LEAST_ROWS, Evidence
 from fdhil.validation.interruptions import interruptions
-from fdhil.validation.plausibility import clipped, gaps, missing_stages, not_finite, position_parted
+from fdhil.validation.plausibility import clipped, gaps, missing_plateau, missing_stages, not_finite, position_parted
 from fdhil.validation.rest import friction_at_rest, rest_faults
 from fdhil.validation.signal_consistency import copied_signals, dead_signals, unrelated_signals
 from fdhil.validation.simulation import expected_fit_percent
@@ -24,6 +24,7 @@ from fdhil.validation.timing import timing_faults, voltage_late
 from fdhil.validation.without_voltage import load_comes_and_goes, torque_late, torque_unexplained
 
 NEVER_NEGATIVE = ("dead_time",)
+PLATEAU = "plateau"  # weighed where the rapid was run through the closed loop
 SURE = 3.0  # standard deviations
 
 Findings = dict[str, list[Reason]]
@@ -199,6 +200,7 @@ MODEL = (
 BEFORE_ANY_FIT: Sequence[Check] = (
     Check("finite", not_finite),
     Check("stages", missing_stages),
+    Check(PLATEAU, missing_plateau),
     Check("gaps", gaps, _enough_rows, ("finite",)),
     Check("range", clipped, _enough_rows, ("finite",)),
     Check("dead signal", dead_signals, _enough_rows, ("finite",)),
@@ -210,7 +212,7 @@ BEFORE_ANY_FIT: Sequence[Check] = (
     Check("play", _play, _enough_rows, ("finite",)),
     Check("slow readings", slow_voltage_faults),
     Check("voltage", _no_voltage),
-    Check("rows", _few_rows, unless=("finite", "stages", "slow readings", "voltage")),
+    Check("rows", _few_rows, unless=("finite", "stages", PLATEAU, "slow readings", "voltage")),
 )
 OF_THE_FIT: Sequence[Check] = (
     Check("stuck", stuck_values),

@@ -19,6 +19,13 @@ TOLERANCE = 0.15  # of a data sheet's R (cold), L, K, and of an inertia that was
 FRICTION_TOLERANCE = 0.30  # the same, where friction has to tell too
 WINDING, TORQUES = ("R", "L", "K"), ("Jt", "ft", "Cd")
 COMPARED = (*WINDING, "Jt")  # friction is no value of a data sheet
+# what K and Jt are multiplied by, and of which values
+CONVENTIONS = (
+    (2 / 3, "peak values of a phase, or dq values of the same amplitude"),
+    (3 / 2, "larger than those that keep the power, by 1.22 each"),
+    (1 / 3, "RMS values of a phase"),
+)
+CONVENTION_TOLERANCE = 0.08  # to which a data sheet's K agrees with one of them
 LEAST_BEYOND = 2  # one alone is a warm winding, a saturated core, another load
 
 
@@ -52,6 +59,32 @@ def gain_error(estimate: Estimate, nominal: Parameters) -> Reason | None:
     read = " and ".join(f"the {s} is read {g:.2f} times as large as it is" for s, g in zip(signals, gains, strict=True))
     text = f"{read}: that alone explains {shifts} against the data sheet, which may be {tolerance:.0%} off"
     advice = f"check the scale of the {' and the '.join(signals)}, or correct the nominal values"
+    return Reason("CalibrationSuspect", text, advice)
+
+
+def scale_convention(estimate: Estimate, nominal: Parameters) -> Reason | None:
+    """Return by which convention current and voltage of a three-phase motor are recorded, where it is not the model's.
+
+    The torque of a motor is its power over its speed, so that K of [1] is K of [2], in values that keep the power. Peak
+    values of a phase, or RMS ones, do not: K, Jt, ft and Cd are then off by one factor, and R and L by none.
+    """
+    told = [name for name in COMPARED if name not in estimate.given and getattr(nominal, name) > 0]
+    apart = {name: estimate.value(name) / getattr(nominal, name) for name in told}
+    if set(told) != set(COMPARED) or not all(ratio > 0.0 for ratio in apart.values()):
+        return None
+    share, inertia = math.log(apart["K"]), math.log(apart["Jt"])
+    if abs(share) < math.log1p(TOLERANCE) or abs(share - inertia) > math.log1p(TOLERANCE):
+        return None
+    if any(abs(math.log(apart[name])) > math.log1p(FRICTION_TOLERANCE) for name in ("R", "L")):
+        return None
+    factor, which = min(CONVENTIONS, key=lambda one: abs(share - math.log(one[0])))
+    if abs(share - math.log(factor)) > math.log1p(CONVENTION_TOLERANCE):
+        return None
+    text = (
+        f"K and Jt are {apart['K']:.2f} and {apart['Jt']:.2f} times those of the data sheet, R and L are as there: "
+        f"current and voltage are {which}, and K, Jt, ft and Cd are {factor:.3g} times what they are"
+    )
+    advice = "predictions hold all the same; set the scales of current and voltage so that their product is the power"
     return Reason("CalibrationSuspect", text, advice)
 
 

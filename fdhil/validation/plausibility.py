@@ -77,12 +77,19 @@ def not_finite(evidence: Evidence) -> Iterator[Reason]:
 
 
 def missing_stages(evidence: Evidence) -> Iterator[Reason]:
-    """Yield a reason for each stage that the move lacks."""
+    """Yield a reason where the move does not begin or end at rest."""
     stages = evidence.window.stages
-    for name, stage in (("accel", stages.accelerate), ("cruise", stages.cruise), ("brake", stages.brake)):
+    for name, stage in (("accel", stages.accelerate), ("brake", stages.brake)):
         if stage is None:
-            what = {"accel": "acceleration", "cruise": "100 ms of constant speed", "brake": "braking to rest"}[name]
+            what = {"accel": "acceleration", "brake": "braking to rest"}[name]
             yield Reason(f"MissingStage({name})", f"the move has no {what}", "record the whole of a longer rapid")
+
+
+def missing_plateau(evidence: Evidence) -> Iterator[Reason]:
+    """Yield a reason where the speed is constant nowhere: friction and inertia then are told apart by noise alone."""
+    if evidence.window.stages.cruise is None:
+        text = "the move has no 100 ms of constant speed"
+        yield Reason("MissingStage(cruise)", text, "record the whole of a longer rapid")
 
 
 def gaps(evidence: Evidence) -> Iterator[Reason]:

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from fdhil.identification.courses import FIRST_COURSE
-from fdhil.identification.estimators.maximum_likelihood import delay_direction
+from fdhil.identification.delay import delay_direction
 from fdhil.identification.fit import Fit
 from fdhil.identification.kalman import DELAY
 from fdhil.identification.normal import solve

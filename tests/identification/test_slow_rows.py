@@ -17,6 +17,7 @@ from fdhil.records import Estimate, Float, Parameters, Recording, Window, frozen
 from fdhil.sim.drive.physics import Physics
 from studies.bench import shuttle
 from tests.bench import bench_config
+from tests.identification.realistic import rapids
 
 AXIS = bench_config("X").axis["X"]
 TRUTH = Parameters(0.5, 0.005, 0.8, 0.075, 0.05, 5.0)
@@ -97,7 +98,7 @@ def test_loops_that_are_not_these_are_not_believed() -> None:
 
 
 def test_short_rows_have_nothing_open() -> None:
-    (window, _) = _windows(0.002)
+    (window, _) = _windows(0.001)
     motion = prepare(window)
     theta = np.append(VALUES, 0.0)
     assert with_open_course(motion, theta) is motion
@@ -109,3 +110,15 @@ def test_what_a_current_does_within_its_rows_grows_with_them() -> None:
         float(np.abs(beyond_line_a(theta, AXIS, _windows(ms * 1e-3)[0].demand_mm, ms * 1e-3)).max()) for ms in (2, 4, 8)
     ]
     assert most[0] < most[1] / 2 < most[2] / 4
+
+
+def test_rows_of_2_ms_leave_the_inertia_open_and_those_of_1_ms_do_not() -> None:
+    """A drive whose fed-forward speed steps at every SYNC makes 15 % of the inertia in rows of 2 ms."""
+    stds = {}
+    for row_ms in (1, 2):
+        (window,) = rapids(dt_s=1e-3 * row_ms)
+        estimate = maximum_likelihood.estimate([window], SETTINGS)
+        stds[row_ms] = estimate.std("Jt") / estimate.value("Jt")
+        assert abs(estimate.value("K") / 0.8 - 1.0) < 4 * estimate.std("K")
+    assert stds[1] < 0.01
+    assert 0.05 < stds[2] < 0.1

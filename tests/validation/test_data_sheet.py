@@ -18,7 +18,7 @@ from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse
 from fdhil.records import PARAMETERS, Estimate, Parameters, Result, frozen
 from fdhil.store.recording_csv import parse_recording
-from fdhil.validation.data_sheet import TOLERANCE, gain_error
+from fdhil.validation.data_sheet import TOLERANCE, gain_error, scale_convention
 from studies import bench
 from tests.bench import bench_toml
 from tests.identification.recorded import signals
@@ -140,3 +140,15 @@ def test_a_coarse_estimate_or_one_without_r_and_l_says_nothing() -> None:
     values = found.values.copy()
     values[:3] = np.nan
     assert gain_error(replace(found, values=frozen(values)), NOMINAL) is None
+
+
+@pytest.mark.parametrize("share", [2 / 3, 1.5, 1 / 3])
+def test_scale_of_three_phase_values_is_named(share: float) -> None:
+    found = scale_convention(estimate(R=1.1, L=0.9, K=share, Jt=1.05 * share, ft=share, Cd=share), NOMINAL)
+    assert found is not None
+    assert f"{share:.3g} times what they are" in found.text
+
+
+@pytest.mark.parametrize("factors", [{}, {"K": 0.667}, {"K": 0.667, "Jt": 0.667, "R": 0.667}, {"K": 0.8, "Jt": 0.8}])
+def test_other_differences_from_the_data_sheet_are_no_scale(factors: dict[str, float]) -> None:
+    assert scale_convention(estimate(**factors), NOMINAL) is None

@@ -11,19 +11,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
 from fdhil.config import Axis, Identification
 from fdhil.identification.covariance import TESTED_LAGS, aliasing, robust, suspicious
-from fdhil.identification.delay import coarse_delay
+from fdhil.identification.delay import MOST_DELAY, coarse_delay, delay_direction, with_delay_doubt
 from fdhil.identification.estimators import least_squares
 from fdhil.identification.fit import Fit, but_delay, descend, fit, jacobian, pose, typical, with_delay
 from fdhil.identification.identifiability import admissible, judge
 from fdhil.identification.kalman import DELAY, JT, K, L, R
 from fdhil.identification.motion import UNKNOWN, Motion, prepare
 from fdhil.identification.normal import inverse_of, solve
-from fdhil.identification.selection import joined
+from fdhil.identification.selection import add_terms
 from fdhil.identification.signals import mended
 from fdhil.identification.slow_descent import Likelihood, likelier_delay
 from fdhil.identification.slow_rows import left_at_the_table_mm, told_by_loops, with_known_course, with_open_course
@@ -34,10 +35,8 @@ from fdhil.records import PARAMETERS, Estimate, Float, Result, Window
 
 __all__ = ["Fit", "descend", "estimate", "fit", "fit_windows", "jacobian", "pose", "typical"]
 NAME = "maximum_likelihood"
-SURE = 5.0  # standard deviations beyond which a delay is believed
-LEAST_DELAY = 0.05  # of a sample; smaller ones cannot be told from the voltage's course within a sample
-CHANCE = 2.0  # standard deviations of a delay that are chance, not doubt
 INSTANT_DELAY = 0.5  # of a row
+RESEMBLING = 0.5  # of a delay that was found may be something else: dead time, axes d and q that are not parted
 TURNS = 2  # in which what loops do within rows follows the parameters
 FLOORS = np.array([1e-4, 1e-4, 1e-9])  # of R, K and Jt
 LEAST_TIME_CONSTANT_S = 1e-4  # of the winding: noise may drive the starting L below 0
@@ -71,9 +70,9 @@ def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | No
     delays = [coarse_delay(s, w.dt_s) for s, w in zip(signals, usable, strict=True)]
     command = settings.voltage_source != "terminals"
     if any(w.voltage_delay_s is not None for w in usable):
-        return joined(_fit_separate(motions, start, delays), command, finish)
+        return add_terms(_fit_separate(motions, start, delays), command, finish)
     start[DELAY] = float(np.median(delays))
-    return _with_terms(_fit_together(motions, start), command, searched=start[DELAY] == 0.0)
+    return _with_terms(_fit_together(motions, start), command)
 
 
 def with_loops(base: Fit, window: Window, settings: Identification, axis: Axis, sync_period_s: float | None) -> Fit:
@@ -92,7 +91,7 @@ def with_loops(base: Fit, window: Window, settings: Identification, axis: Axis, 
         result = fit([motion], with_delay(result.theta[: DELAY + 1], 0.0), range(DELAY))
         if not result.converged:
             return base
-    result = _with_terms(_delay_told(result), settings.voltage_source != "terminals", searched=True)
+    result = _with_terms(result, settings.voltage_source != "terminals")
     missed, missed_before = (left_at_the_table_mm(f.theta, axis, window) for f in (result, base))
     return result if missed < missed_before else base
 
@@ -100,44 +99,15 @@ def with_loops(base: Fit, window: Window, settings: Identification, axis: Axis, 
 def _fit_together(motions: Sequence[Motion], start: Float) -> Fit:
     """Fit windows whose voltage comes with current and speed, by the drive's own clock.
 
-    Regulators act several times within a sample, which looks like a delay of a few per cent of it, but moves L
-    otherwise. So a small delay is not taken out: what it would change is a doubt, and so it is about a larger one.
+    Where no delay of whole rows shows, a shorter one is a candidate like the terms, which it resembles.
     """
-    if start[DELAY] == 0.0:
-        return _delay_told(fit(motions, start, range(6)))
-    return replace(fit(motions, start, range(7)), delay_doubt_s=_least_delay_s(motions) / 2)
+    free = range(6) if start[DELAY] == 0.0 else range(7)
+    return fit(motions, start, free)
 
 
-def _least_delay_s(motions: Sequence[Motion]) -> float:
-    return LEAST_DELAY * min(m.dt_s for m in motions)
-
-
-def _delay_told(plain: Fit) -> Fit:
-    """Return a fit without delay with its doubt about one, or the fit with the delay that the data surely show."""
-    motions = plain.problem.motions
-    least = _least_delay_s(motions)
-    delay, std = delay_score(plain)
-    if abs(delay) >= max(SURE * std, least):
-        free = sorted({*plain.free, DELAY})
-        late = replace(fit(motions, with_delay(plain.theta, delay), free), delay_doubt_s=least / 2)
-        if not motions[0].courses:
-            return late
-        told = finish(late)  # with as much colour as is left beside terms
-        if told.delay_s is None or told.delay_std_s is None or abs(told.delay_s) >= SURE * told.delay_std_s:
-            return late
-    beyond = np.sqrt(max(0.0, delay**2 - (CHANCE * std) ** 2))
-    return replace(plain, delay_doubt_s=float(beyond))
-
-
-def _with_terms(base: Fit, command: bool, searched: bool) -> Fit:
-    """Return the fit with the terms that join it; a delay that was ``searched`` for is told anew, they look alike."""
-    result = joined(base, command, finish)
-    if result is base or not searched:
-        return result
-    if DELAY in result.free:
-        motions, free = result.problem.motions, but_delay(result.free)
-        result = fit(motions, with_delay(result.theta, 0.0), free, result.problem.noises)
-    return _delay_told(result)
+def _with_terms(base: Fit, command: bool) -> Fit:
+    """Return the fit with the terms that join it, and with the delay that the data surely show."""
+    return add_terms(with_delay_doubt(base), command, finish, delayed=True)
 
 
 def _fit_separate(motions: Sequence[Motion], start: Float, delays: Sequence[float]) -> Fit:
@@ -190,22 +160,6 @@ def _fit_slow(windows: Sequence[Window], settings: Identification) -> Fit | None
     return _fit_separate(walking, theta, delays)
 
 
-def delay_score(plain: Fit) -> tuple[float, float]:
-    """Return the delay (s) that one Newton step from a fit without delay would add, and its standard deviation."""
-    d = delay_direction(plain)
-    rest = d - plain.but_delay @ solve(plain.but_delay, d)[0]
-    weight = float(rest @ rest)
-    return (float(rest @ plain.residuals) / weight, weight**-0.5) if weight > 0 else (0.0, np.inf)
-
-
-def delay_direction(result: Fit) -> Float:
-    """Return minus the derivative (m,) of the innovations by the delay."""
-    if DELAY in result.free:
-        return result.jacobian[:, result.free.index(DELAY)]
-    sizes = typical(result.theta, result.problem.motions)
-    return jacobian(result.problem, result.theta, result.residuals, [DELAY], sizes)[:, 0]
-
-
 def doubts(result: Fit, inverse: Float) -> Float:
     """Return what noise cannot explain: one standard deviation (k, q) of the entries of theta.
 
@@ -222,9 +176,16 @@ def doubts(result: Fit, inverse: Float) -> Float:
         columns = np.column_stack([columns, _known_before(result, inverse)])
     if result.delay_doubt_s > 0.0:
         others = but_delay(free)
-        columns[others, 1] = -result.delay_doubt_s * solve(result.but_delay, delay_direction(result))[0]
+        unsure = max(result.delay_doubt_s, _resembled_s(result))
+        columns[others, 1] = -unsure * solve(result.but_delay, delay_direction(result))[0]
         columns[DELAY, 1] = result.delay_doubt_s
     return columns
+
+
+def _resembled_s(result: Fit) -> float:
+    """Return how much of a delay may be something else that resembles it; of one that shows in whole rows, nothing."""
+    delay_s, first = abs(float(result.theta[DELAY])), result.problem.motions[0]
+    return RESEMBLING * delay_s if first.slow is None and delay_s <= MOST_DELAY * first.dt_s else 0.0
 
 
 def _known_before(result: Fit, inverse: Float) -> Float:
@@ -269,6 +230,7 @@ def robust_inverse(result: Fit, inverse: Float) -> Float:
     return robust(result.information, scores, plain)
 
 
+@lru_cache(maxsize=4)
 def finish(result: Fit) -> Estimate:
     """Return the fit as an estimate with its covariance."""
     inverse, condition = inverse_of(result.information)
