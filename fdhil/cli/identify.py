@@ -186,6 +186,7 @@ def _file_document(result: FileResult, axes: Mapping[str, Axis], with_loops: boo
             "terms": _terms(result.pooled),
             "validated": result.verdict.accepted,
             "windows_used": _used(result),
+            "held_out": None if result.held_out is None else asdict(result.held_out),
             **_verdict(result.verdict),
         },
     }
