@@ -30,8 +30,12 @@ def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
     """Return what is made of every machine, by kind and seed."""
     chosen = [kind for kind in KINDS if options.kind in kind.name]
     tasks = [(kind, options.seed + k) for kind in chosen for k in range(options.draws)]
+    done = []
     with ProcessPoolExecutor(options.processes) as executor:
-        return list(executor.map(examine, *zip(*tasks, strict=True)))
+        for found in executor.map(examine, *zip(*tasks, strict=True)):
+            done.append(found)
+            print(f"{len(done)} of {len(tasks)}: {found['kind']}", flush=True)
+    return done
 
 
 def examine(kind: Kind, seed: int) -> dict[str, Any]:
