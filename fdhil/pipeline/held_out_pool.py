@@ -6,13 +6,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
+
 from fdhil.config import Axis, Identification
 from fdhil.identification.loops import identify_loops
 from fdhil.pipeline.analysis import own
 from fdhil.pipeline.own_loops import better_axis
 from fdhil.pipeline.pooling import pool
-from fdhil.records import Estimate, HeldOut, LoopEstimate, Verdict, WindowOutcome
-from fdhil.validation.agreement import is_of_winding
+from fdhil.records import Estimate, HeldOut, LoopEstimate, Verdict, WindowOutcome, frozen
+from fdhil.validation.agreement import WINDING, is_of_winding
 from fdhil.validation.held_out import Move, held_out_reason, is_predicted, predict_held_out, worst_of
 from fdhil.validation.presliding import with_presliding
 from fdhil.validation.replay import Replay
@@ -74,8 +76,20 @@ def pool_with_held_out(
     if reason is not None and verdict.accepted:
         verdict = replace(verdict, accepted=False, reasons=(reason,))
     elif held is not None and reason is None and all(map(is_of_winding, verdict.reasons)):
+        if verdict.reasons and estimate is not None:
+            estimate = _with_spread(estimate, outcomes)
         verdict = replace(verdict, accepted=True, reasons=(), warnings=(*verdict.warnings, *verdict.reasons))
     return HeldOutPool(outcomes, estimate, verdict, held, loops)
+
+
+def _with_spread(estimate: Estimate, outcomes: Sequence[WindowOutcome]) -> Estimate:
+    """Return the estimate with the spread of R and L between its windows added to their variances."""
+    covariance = estimate.covariance.copy()
+    for name in WINDING:
+        values = [o.estimate.value(name) for o in outcomes if o.verdict.accepted and o.estimate is not None]
+        k = estimate.names.index(name)
+        covariance[k, k] += float(np.nanvar(values))
+    return replace(estimate, covariance=frozen(covariance))
 
 
 def _judged(
