@@ -20,6 +20,7 @@ STUDIES = (
     "wrong_signals",
     "slow_sensor",
     "reality",
+    "zoo",
     "guard_invariants",
     "wires",
     "crash",

@@ -132,6 +132,7 @@ class Passes:
             **measured,
             "predicted": {key: summary["after"].get(key) for key in ("rms_um", "uncertainty_um")},
             "predicted_without": {"rms_um": summary["before"]["rms_um"]},
+            "gain": _gains(summary, measured),
         }
         lesson, notices = _learned(ended)
         text = _text(told) + ("" if lesson is None else _lesson_text(lesson))
@@ -316,12 +317,22 @@ def _common(axes: Sequence[Rows]) -> tuple[Float, Float]:
     return demand[whole], position[whole]
 
 
+def _gains(summary: Mapping[str, Any], measured: Mapping[str, Any]) -> dict[str, float | None]:
+    """Return the predicted gain of a pass, and the one that was measured; None where nothing is left."""
+    without_um, left = summary["before"]["rms_um"], {"predicted": summary["after"], "measured": measured["measured"]}
+    return {key: without_um / each["rms_um"] if each["rms_um"] > 0.0 else None for key, each in left.items()}
+
+
 def _text(told: Mapping[str, Any]) -> str:
     name, measured, half = Path(told["program"]).name, told["measured"], told["predicted"]["uncertainty_um"]
     spread = "" if half is None else f" {plus_minus(half, 2)}"
     text = f"pass {told['pass']} of {name}: contour error measured {measured['rms_um']:.2f} um RMS,"
     text += f" {measured['max_um']:.1f} at most (predicted {told['predicted']['rms_um']:.2f}{spread};"
-    text += f" without correction {told['predicted_without']['rms_um']:.1f} predicted)"
+    text += f" without correction {told['predicted_without']['rms_um']:.1f} predicted"
+    gain = told["gain"]
+    if gain["predicted"] is not None and gain["measured"] is not None:
+        text += f"; gain {gain['measured']:.3g}, predicted {gain['predicted']:.3g}"
+    text += ")"
     return text if told["ended_by"] == FINISHED else f"{text}; it was ended by {told['ended_by']}"
 
 

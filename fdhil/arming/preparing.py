@@ -22,7 +22,7 @@ from fdhil.correction import gate, online
 from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.identification.loops import regulators_of
 from fdhil.model.terms import with_resonance
-from fdhil.prediction.gain import Gain, skill_of
+from fdhil.prediction.gain import Gain, joint_held_out_um, worst_skill_um
 from fdhil.prediction.models import validated_models
 from fdhil.program import program_digest
 from fdhil.records import Parameters, Reason, Skill
@@ -190,7 +190,8 @@ def prepare_armament(
     facts |= _commissioned(stream.axes, checked.largest_um, config)
     half_um = checked.half_um
     if half_um is None:
-        half_um = skill_of({axis: found.skills for axis, found in known.items()}, stream.axes)
+        skills = worst_skill_um({axis: found.skills for axis, found in known.items()})
+        half_um = joint_held_out_um(skills, stream.axes)
     begin, first = stream.take(FIRST_S), None
     if checked.method == "inverse":
         first = FirstBlock(begin, request.program, request.models, request.config, request.program_digest)

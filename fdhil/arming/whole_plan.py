@@ -13,7 +13,7 @@ from fdhil.arming.preparing import ArmRequest, Refused
 from fdhil.arming.program_check import encoded
 from fdhil.config import MachineConfig
 from fdhil.errors import StoreError
-from fdhil.prediction.gain import gain
+from fdhil.prediction.gain import gain, worst_skill_um
 from fdhil.program import load_trajectory
 from fdhil.records import Correction, Float, Reason, rms
 
@@ -57,8 +57,8 @@ def _conclude(
     known: Mapping[str, AxisKnowledge],
 ) -> None:
     covariances = {axis: found.published.covariance for axis, found in known.items() if found.published is not None}
-    skills = {axis: found.skills for axis, found in known.items()}
-    checked.half_um = gain(planned, request.models, request.config, covariances, skills).half_um
+    held_out_um = worst_skill_um({axis: found.skills for axis, found in known.items()})
+    checked.half_um = gain(planned, request.models, request.config, covariances, held_out_um).half_um
     checked.method, checked.warnings = planned.method, planned.warnings + planned.before.reference.notes
     largest_um = max(float(np.abs(offset).max()) for offset in planned.offset_um.values())
     checked.conclude({**checked.errors, "largest_um": largest_um})

@@ -17,8 +17,8 @@ from fdhil.config import Axis, Identification, MachineConfig
 from fdhil.errors import FdhilError, RecordingError
 from fdhil.fleet.spread import Crew
 from fdhil.identification.windows import find_windows
-from fdhil.pipeline import analyse_windows, pool
-from fdhil.records import Estimate, LoopEstimate, Reason, Recording, Verdict, Window, WindowOutcome
+from fdhil.pipeline import analyse_windows, pool_with_held_out
+from fdhil.records import Estimate, HeldOut, LoopEstimate, Reason, Recording, Verdict, Window, WindowOutcome
 from fdhil.store import suffixes
 from fdhil.store.accelerometer_csv import with_accelerometer
 from fdhil.store.column_map import ColumnMap
@@ -38,7 +38,8 @@ _Numbered = tuple[int, Path]
 class FileResult:
     """One recording: its windows analysed, and their pool; one that cannot be read has an ``error`` and no axis.
 
-    ``loops`` are the drive's own, where the configured ones did not explain its rapids.
+    ``loops`` are the drive's own, where the configured ones did not explain its rapids. ``held_out`` is what the pool
+    leaves of moves that it was not identified on.
     """
 
     file: str
@@ -48,6 +49,7 @@ class FileResult:
     verdict: Verdict
     error: Mapping[str, Any] | None = None
     loops: LoopEstimate | None = None
+    held_out: HeldOut | None = None
 
 
 def unseen(share: float) -> None:
@@ -118,11 +120,13 @@ def analyse_file(
     period_s = None if machine is None else machine.machine.sync_period_s
     step = partial(progress, 1.0 / (len(windows) + 1))
     outcomes, loops = analyse_windows(windows, settings, axis, period_s, _outcomes, step)
-    estimate, verdict = pool(outcomes, settings)
+    outcomes, estimate, verdict, held_out, loops = pool_with_held_out(outcomes, settings, axis, loops, period_s)
     if not windows and isinstance(recorded, Recording) and (hidden := missing_move(recorded)) is not None:
         verdict = replace(verdict, reasons=(*verdict.reasons, hidden))
     step()
-    return FileResult(str(path), recorded.axis, tuple(outcomes), estimate, _of_reading(recorded, verdict), loops=loops)
+    return FileResult(
+        str(path), recorded.axis, tuple(outcomes), estimate, _of_reading(recorded, verdict), None, loops, held_out
+    )
 
 
 def _read(path: Path, accelerometer: Path | None, columns: ColumnMap | None) -> Recording | Window:

@@ -185,6 +185,7 @@ def _file_document(result: FileResult, axes: Mapping[str, Axis], with_loops: boo
             "terms": _terms(result.pooled),
             "validated": result.verdict.accepted,
             "windows_used": _used(result),
+            "held_out": None if result.held_out is None else asdict(result.held_out),
             **_verdict(result.verdict),
         },
     }
@@ -310,6 +311,11 @@ def _show(results: Sequence[FileResult], axes: Mapping[str, Axis], with_loops: b
         table.add_row(f"all {_used(result)}", *_cells(result.pooled, result.verdict, weighed), style="bold")
         console.print(table)
         _show_terms(console, result)
+        if (shown := result.held_out) is not None:
+            text = f"  of moves that it was not identified on the model leaves {shown.rms_um:.3g} um RMS at most"
+            console.print(
+                f"{text} ({shown.moves} moves, of {shown.following_um:.3g} um)", highlight=False, markup=False
+            )
         _show_table(console, result)
         _show_reasons(console, result)
         if with_loops or result.loops is not None:

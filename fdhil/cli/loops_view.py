@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from fdhil.config import Axis, Identification, MachineConfig, Regulators
     from fdhil.records import LoopEstimate
 
+ALL_FED = 0.01  # by which the share of the speed that is fed forward may differ from 1
 UNITS: Mapping[str, str] = {
     "position_gain_per_s": "1/s",
     "speed_feedforward": "1",
@@ -53,6 +54,7 @@ def compared(found: LoopEstimate | None, axis: Axis | None) -> dict[str, Any] | 
     return {
         "structure": found.structure,
         "configured_structure": None if regulators is None else regulators.structure,
+        "same_as": [dict(each) for each in equivalent_loops(found)],
         "gains": {n: {**told, "unit": UNITS[n], "configured": _configured(regulators, n)} for n, told in gains},
         **{key: document[key] for key in ("validated", "unexplained_um", "configured_um", "reasons", "warnings")},
     }
@@ -64,6 +66,29 @@ def loops_line(told: Mapping[str, Any]) -> str:
         return ""
     gains = ", ".join(f"{name} {figures['value']:.4g}" for name, figures in told["gains"].items())
     return f"loops {told['structure']}, {gains}; {'; '.join((*told['reasons'], *told['warnings']))}"
+
+
+def equivalent_loops(found: LoopEstimate) -> list[Mapping[str, float | str]]:
+    """Return the other sets of gains that are the same controller, speed_kp and the rest unchanged.
+
+    With the whole speed fed forward, a cascade of position gain a and speed_ki = b speed_kp and a PID of position gain
+    a + b and position_ki = a b ask for the same current, and so does the cascade with a and b exchanged. (The PID takes
+    that speed from its own set-points, half a SYNC cycle later.)
+    """
+    gains = dict(zip(found.names, found.values.tolist(), strict=True))
+    kp, fed = gains.get("speed_kp"), gains.get("speed_feedforward", 1.0)
+    if kp is None or "position_gain_per_s" not in gains or abs(fed - 1.0) > ALL_FED:
+        return []
+    first = gains["position_gain_per_s"]
+    if found.structure == "p_pi_pi" and "speed_ki" in gains:
+        a, b = first, gains["speed_ki"] / kp
+        pid = {"structure": "pid", "position_gain_per_s": a + b, "position_ki_per_s2": a * b}
+        return [pid, {"structure": "p_pi_pi", "position_gain_per_s": b, "speed_ki": a * kp}]
+    if found.structure == "pid" and (square := first**2 / 4 - gains.get("position_ki_per_s2", 0.0)) >= 0.0:
+        roots = first / 2 - math.sqrt(square), first / 2 + math.sqrt(square)
+        pairs = (roots, roots[::-1])
+        return [{"structure": "p_pi_pi", "position_gain_per_s": a, "speed_ki": b * kp} for a, b in pairs if a > 0.0]
+    return []
 
 
 def _each(found: LoopEstimate) -> list[tuple[str, float, float]]:
@@ -96,6 +121,9 @@ def show_loops(result: FileResult, axis: Axis | None, console: Any) -> None:
         shown = "-" if configured is None else f"{configured:.5g}"
         table.add_row(name, f"{value:.4g} ± {INTERVAL_95 * std:.2g}", shown, UNITS[name])
     console.print(table)
+    for same in equivalent_loops(found):
+        gains = ", ".join(f"{key} {value:.4g}" for key, value in same.items() if not isinstance(value, str))
+        console.print(f"  the same controller: {same['structure']}, {gains}", highlight=False, markup=False)
     left = found.verdict.unexplained_um
     text = f"  these loops leave {left:.3g} um of the following error"
     if found.configured_um is not None:

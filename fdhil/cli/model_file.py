@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,11 @@ def write_model(results: Sequence[FileResult], axes: Mapping[str, Axis], path: P
     if unchecked := sorted(valid.keys() - loops.keys() - axes.keys()):
         text = f"fdhil: {path} has no loops of axis {', '.join(unchecked)}: predict and correct will use the configured"
         click.echo(f"{text} regulators, which these recordings did not confirm; give --config or --loops", err=True)
-    document = {name: _model(name, pooled, axes.get(name)) | loops.get(name, {}) for name, pooled in valid.items()}
+    shown = {r.axis: {"held_out": asdict(r.held_out)} for r in results if r.axis and r.held_out is not None}
+    document = {
+        name: _model(name, pooled, axes.get(name)) | loops.get(name, {}) | shown.get(name, {})
+        for name, pooled in valid.items()
+    }
     with open_output(path) as file:
         file.write((json.dumps(document, indent=2, allow_nan=False) + "\n").encode())
 

@@ -29,7 +29,7 @@ def correction_document(
     program: str, planned: Correction, predicted: Gain, models: Mapping[str, Parameters]
 ) -> dict[str, Any]:
     """Return a correction: the prediction without it, what it leaves, its gain, and why it is refused where it is."""
-    before, after = contour(planned.before), contour(planned.after)
+    before, after = contour(planned.before), contour(planned.after) | {"rms_um": predicted.after_um}
     return {
         "schema": "fdhil-correct-1",
         "program": program,

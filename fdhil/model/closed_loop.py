@@ -152,6 +152,7 @@ def standing(parameters: Parameters, axis: Axis, position_mm: float, current_a: 
     voltage_v = parameters.R * held_a + terms.dead_time_v(parameters, axis, held_a)
     state[[kernels.CURRENT, kernels.CURRENT_DEMAND]] = held_a
     state[kernels.CURRENT_INTEGRAL] = state[kernels.WAITING :] = voltage_v
+    state[kernels.BRISTLE] = parameters.K * held_a - pull_nm
     if g.speed_ki > 0:
         state[kernels.SPEED_INTEGRAL] = held_a
     elif g.structure == "pid" and g.position_ki_per_s2 > 0:

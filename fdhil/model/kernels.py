@@ -14,7 +14,8 @@ from fdhil.records import Float
 # places in the state vector: what every drive has, then what structures and options add
 CURRENT, SPEED, POSITION, SPEED_INTEGRAL, CURRENT_INTEGRAL, CURRENT_DEMAND = range(6)
 POSITION_INTEGRAL, SET_POINT_BEFORE, POSITION_BEFORE, FILTERED, SPEED_FILTERED = 6, 7, 8, 9, 15
-TABLE, TABLE_SPEED, NEXT, WAITING = 16, 17, 18, 19  # a table behind a spring; the voltages that wait, as a ring
+TABLE, TABLE_SPEED = 16, 17  # a table behind a spring
+BRISTLE, NEXT, WAITING = 18, 19, 20  # dry friction that builds up, N.m; the voltages that wait, as a ring
 MOST_WAITING = 32
 STATES = WAITING + MOST_WAITING
 # what a run records at each SYNC instant: how many of the cycle's steps have a limit acting, the state
@@ -25,7 +26,7 @@ POSITION_KI, ACCELERATION, DECAY, RAD_PER_MM, SPEED_CYCLES_PER_S, SPEED_DECAY, F
 GAINS = 17
 # places in the terms, see fdhil.model.terms.packed; behind them periods in a turn, amplitude and phase of each ripple
 LOAD, DRY_POSITIVE, DRY_NEGATIVE, VISCOUS, VISCOUS_POSITIVE, VISCOUS_NEGATIVE, STRIBECK, STRIBECK_SPEED = range(8)
-DEAD_TIME, SPRING, DAMPER, RIPPLES = range(8, 12)
+DEAD_TIME, SPRING, DAMPER, PRESLIDING, RIPPLES = range(8, 13)
 STRIBECK_REACH = 6.0  # times its speed, from where it is less than the last bit of the friction
 # the laws from set-point to current demand
 CASCADE, PID = range(2)
@@ -140,7 +141,8 @@ def _current_cycles(
     ``limited``: the current demand is at its limit. The voltage acts ``delay`` steps after it was computed, less the
     inverter's dead time. Ripples are those of the middle of each step. ``masses`` (2, 5, 8), or None where motor and
     table are one, is the exact step of both, free and with the table held; the table has the dry friction then.
-    What is None is not compiled.
+    What is None is not compiled. Dry friction with presliding is the force of a bristle (Dahl 1968): as the table moves
+    it builds up to that of sliding, and nothing sticks.
     """
     phi_ii, phi_iw, phi_wi, phi_ww, phi_xi, phi_xw = plant[0], plant[1], plant[2], plant[3], plant[4], plant[5]
     i_u, w_u, x_u, i_t, w_t, x_t = plant[6], plant[7], plant[8], plant[9], plant[10], plant[11]
@@ -154,6 +156,9 @@ def _current_cycles(
         more_positive, more_negative = terms[VISCOUS_POSITIVE] - viscous, terms[VISCOUS_NEGATIVE] - viscous
         rad_per_mm, full_a = gains[RAD_PER_MM], gains[FULL_DEAD_TIME_A]
         spring, damper, table_w, table = terms[SPRING] * rad_per_mm, terms[DAMPER], state[TABLE_SPEED], state[TABLE]
+        bristle, sliding = state[BRISTLE], 0.0
+        if terms[PRESLIDING] > 0.0:
+            sliding = 2e3 * half_step_mm / terms[PRESLIDING]
     for _ in range(n_current):
         error = demand_a - i
         candidate = integral + ki * error
@@ -184,11 +189,15 @@ def _current_cycles(
             dry = (positive if forward else negative) + _low_speed(rubbing, slow, slow_speed)
         friction = -dry if forward else dry
         held = rubbing == 0.0 and abs(push) <= dry
+        builds_up = False
+        if terms is not None and sliding > 0.0:
+            bristle = -friction + (bristle + friction) * np.exp(-abs(rubbing) * sliding)
+            friction, held, builds_up = -bristle, False, True
         if masses is not None:
             m, apart = masses[1 if held else 0], x - table
             table_next = _stepped(m, 3, i, w, apart, table_w, u, against, -friction)
             moved = _stepped(m, 4, i, w, apart, table_w, u, against, -friction)
-            if table_next * friction > 0.0:
+            if table_next * friction > 0.0 and not builds_up:
                 moved, table_next = half_step_mm * table_w, 0.0
             w_next = _stepped(m, 1, i, w, apart, table_w, u, against, -friction)
             x = table + _stepped(m, 2, i, w, apart, table_w, u, against, -friction)
@@ -200,7 +209,7 @@ def _current_cycles(
             continue
         total = friction - against
         w_next = phi_wi * i + phi_ww * w + w_u * u + w_t * total
-        if w_next * friction > 0.0:  # the sign changed: the table stops for this step
+        if w_next * friction > 0.0 and not builds_up:  # the sign changed: the table stops for this step
             x += half_step_mm * w
             w_next = 0.0
         else:
@@ -209,6 +218,8 @@ def _current_cycles(
         w = w_next
     state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL] = i, w, x, integral
     state[NEXT] = at
+    if terms is not None:
+        state[BRISTLE] = bristle
     if masses is not None:
         state[TABLE_SPEED], state[TABLE] = table_w, table
     return steps

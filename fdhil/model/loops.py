@@ -117,7 +117,7 @@ def prepare(law: int, places: int, parameters: Parameters, axis: Axis, sync_peri
     more = terms.any_of(parameters)
     plant, values = plant_step(parameters, axis.screw_pitch_mm, g.current_period_s), gains(axis, sync_period_s)
     kp, ki = values[kernels.CURRENT_KP], values[kernels.CURRENT_KI]
-    steps_only = g.current_delay_cycles > 0 or terms.has_spring(parameters)
+    steps_only = g.current_delay_cycles > 0 or terms.has_spring(parameters) or terms.builds_up(parameters)
     through = _NO_LEAP if steps_only else leap(_per_newton_metre(plant) if more else plant, kp, ki, n_current)
     return Drive(
         plant,
@@ -141,7 +141,7 @@ def _kept(places: int, parameters: Parameters, axis: Axis) -> int:
     g = axis.regulators
     if g.current_delay_cycles:
         return kernels.WAITING + g.current_delay_cycles
-    if terms.has_spring(parameters):
+    if terms.has_spring(parameters) or terms.builds_up(parameters):
         return kernels.NEXT
     if g.speed_filter_s > 0:
         return kernels.TABLE

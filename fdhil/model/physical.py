@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 ABOVE_ZERO = ("R", "L", "K", "Jt", "stribeck_speed", "resonance")
 NOT_NEGATIVE = ("ft", "Cd", "coulomb_positive", "coulomb_negative", "viscous_positive", "viscous_negative",
-                "resonance_damping")  # fmt: skip
+                "resonance_damping", "presliding_um")  # fmt: skip
 LEAST_SHARE = 0.01  # of the inertia before and behind a spring: with less there is no second mass
 LEAST_SPEED_RAD_S = 1e-3  # at which friction at low speed falls off: slower than any sample tells
 

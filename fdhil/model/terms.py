@@ -58,9 +58,14 @@ def has_spring(parameters: Parameters) -> bool:
     return parameters.term("resonance") > 0.0
 
 
+def builds_up(parameters: Parameters) -> bool:
+    """Return whether dry friction builds up over a way (presliding)."""
+    return parameters.term("presliding_um") > 0.0
+
+
 @lru_cache(maxsize=256)
 def packed(parameters: Parameters) -> Float:
-    """Return (12 + 3 ripples,) the terms in the kernels' order."""
+    """Return (13 + 3 ripples,) the terms in the kernels' order."""
     p, values = parameters, np.zeros(kernels.RIPPLES)
     values[kernels.LOAD] = p.term("load")
     values[kernels.DRY_POSITIVE] = p.term("coulomb_positive", p.Cd)
@@ -71,6 +76,7 @@ def packed(parameters: Parameters) -> Float:
     values[kernels.STRIBECK] = p.term("stribeck")
     values[kernels.STRIBECK_SPEED] = p.term("stribeck_speed")
     values[kernels.DEAD_TIME] = p.term("dead_time")
+    values[kernels.PRESLIDING] = p.term("presliding_um")
     values[kernels.SPRING], values[kernels.DAMPER] = spring(p)
     ripples = [
         (float(found[1]), amplitude, p.term(f"{name}_phase"))

@@ -11,7 +11,7 @@ import numpy as np
 from fdhil.model import terms
 from fdhil.records import PARAMETERS, Bool, Float, Parameters
 
-DRY = ("coulomb_positive", "coulomb_negative", "stribeck", "stribeck_speed")
+DRY = ("coulomb_positive", "coulomb_negative", "stribeck", "stribeck_speed", "presliding_um")
 LINEAR = ("resonance", "resonance_damping", "resonance_share")
 # what a term's second and third value are called: they mean nothing alone
 _PARTS = ("_phase", "_speed", "_damping", "_share")

@@ -1,7 +1,8 @@
 """Reads model files: the parameters of each axis as JSON, ``{"X": {"R", "L", "K", "Jt", "ft", "Cd"}, ...}``.
 
-An axis may have two tables more: ``terms``, the value of each term that has joined the six, and ``loops``, keys of
-``[axis.X.regulators]`` that were identified and take the place of the configuration's.
+An axis may have three tables more: ``terms``, the value of each term that has joined the six; ``loops``, keys of
+``[axis.X.regulators]`` that were identified and take the place of the configuration's; ``held_out``, what the model
+leaves of moves that it was not identified on.
 """
 
 from __future__ import annotations
@@ -29,10 +30,11 @@ SHOWN_CHARS = 40
 MOST_FAULTS = 50
 LARGEST, SMALLEST = 1e12, 1e-12
 COPIED = 1e-3  # to which a value agrees that was copied from what fdhil shows
-_TABLES = ("terms", "loops")
+_TABLES = ("terms", "loops", "held_out")
 TERMS = ("load", "coulomb_positive", "coulomb_negative", "viscous_positive", "viscous_negative", "stribeck",
-         "stribeck_speed", "ripple_screw_1", "ripple_screw_1_phase", "ripple_motor_1", "ripple_motor_1_phase",
-         "dead_time", "speed_delay", "resonance", "resonance_damping", "resonance_share")  # fmt: skip
+         "stribeck_speed", "presliding_um", "ripple_screw_1", "ripple_screw_1_phase", "ripple_motor_1",
+         "ripple_motor_1_phase", "dead_time", "speed_delay",
+         "resonance", "resonance_damping", "resonance_share")  # fmt: skip
 """The terms' names, of the ripples the first ones."""
 
 Loops = Mapping[str, Mapping[str, float | str]]
@@ -40,10 +42,14 @@ Loops = Mapping[str, Mapping[str, float | str]]
 
 
 class ModelFile(NamedTuple):
-    """What a model file says of each axis; one without a table of loops has none in ``loops``."""
+    """The contents of a model file by axis; an axis without a table of loops has none in ``loops``.
+
+    ``held_out_um`` is the RMS in um that the model leaves of moves that it was not identified on, where it is given.
+    """
 
     parameters: dict[str, Parameters]
     loops: Loops
+    held_out_um: Mapping[str, float]
 
 
 def nominal_models(config: MachineConfig) -> dict[str, Parameters]:
@@ -77,10 +83,13 @@ def load_model_file(path: Path) -> ModelFile:
     faults: list[ConfigFault] = []
     models = {axis: _parameters(axis[:SHOWN_CHARS], values, faults) for axis, values in document.items()}
     loops = {axis: _table(axis[:SHOWN_CHARS], "loops", values, faults) for axis, values in document.items()}
+    held_out_um = {
+        axis: um for axis, values in document.items() if (um := _held_out_um(axis, values, faults)) is not None
+    }
     if faults:
         raise ConfigError(str(path), faults[:MOST_FAULTS])
     known = {axis: model for axis, model in models.items() if model is not None}
-    return ModelFile(known, {axis: values for axis, values in loops.items() if "loops" in document[axis]})
+    return ModelFile(known, {axis: values for axis, values in loops.items() if "loops" in document[axis]}, held_out_um)
 
 
 def with_loops(config: MachineConfig, loops: Loops, source: str) -> MachineConfig:
@@ -178,6 +187,19 @@ def _table(axis: str, name: str, values: Any, faults: list[ConfigFault]) -> dict
         faults.append(ConfigFault(f"{axis}.{name}", f"must be a table of names, not {_shown(table)}"))
         return {}
     return table
+
+
+def _held_out_um(axis: str, values: Any, faults: list[ConfigFault]) -> float | None:
+    """Return what a model leaves of moves that it was not identified on, RMS um; None where that is not given."""
+    table = _table(axis[:SHOWN_CHARS], "held_out", values, faults)
+    if not table:
+        return None
+    um = table.get("rms_um")
+    if isinstance(um, bool) or not isinstance(um, int | float) or not 0.0 <= um <= LARGEST:
+        place = f"{axis[:SHOWN_CHARS]}.held_out.rms_um"
+        faults.append(ConfigFault(place, f"must be a finite number of at least 0, not {_shown(um)}", "in um"))
+        return None
+    return float(um)
 
 
 def _unknown(axis: str, name: str, known: tuple[str, ...], listed: str) -> ConfigFault:

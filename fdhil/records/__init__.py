@@ -7,7 +7,7 @@ name says ``_um``. Drive increments appear in none of them.
 from __future__ import annotations
 
 from fdhil.records.nc import NcState
-from fdhil.records.paths import Correction, Prediction, Skill, Trajectory, Zone, table_path
+from fdhil.records.paths import Correction, HeldOut, Prediction, Skill, Trajectory, Zone, table_path
 from fdhil.records.signals import (
     AxisSamples,
     MoveEvent,
@@ -64,6 +64,7 @@ __all__ = [
     "Correction",
     "Estimate",
     "Float",
+    "HeldOut",
     "Int",
     "LoopEstimate",
     "MoveEvent",

@@ -121,6 +121,19 @@ class Skill:
 
 
 @dataclass(frozen=True, slots=True)
+class HeldOut:
+    """What models leave of the following error of moves that they were not identified on, um: of the worst move.
+
+    ``max_um`` is the largest of any move, ``following_um`` the RMS following error of the move with ``rms_um``.
+    """
+
+    moves: int
+    rms_um: float
+    max_um: float
+    following_um: float
+
+
+@dataclass(frozen=True, slots=True)
 class Correction:
     """What a correction method plans for a reference: offsets per axis (n,), the path error without and with them.
 

@@ -37,6 +37,7 @@ _TERMS: Mapping[str, str] = {
     r"viscous_(positive|negative)": "N.m.s",
     r"stribeck": "N.m",
     r"stribeck_speed": "rad/s",
+    r"presliding_um": "um",
     r"ripple_(screw|motor)_[1-9][0-9]?": "N.m",
     r"ripple_(screw|motor)_[1-9][0-9]?_phase": "rad",
     r"dead_time": "V",

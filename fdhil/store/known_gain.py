@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from fdhil.config import MachineConfig
-from fdhil.prediction.gain import Gain, gain
+from fdhil.prediction.gain import Gain, gain, worst_skill_um
 from fdhil.records import Correction, Parameters
 from fdhil.store.history import History
 
@@ -11,13 +11,20 @@ RECENT_MOVES = 3  # whose skill bounds what a correction can reach
 
 
 def known_gain(
-    planned: Correction, models: Mapping[str, Parameters], config: MachineConfig, from_history: bool
+    planned: Correction,
+    models: Mapping[str, Parameters],
+    config: MachineConfig,
+    from_history: bool,
+    held_out_um: Mapping[str, float] | None = None,
 ) -> Gain:
-    """Return the gain; without ``from_history`` nothing is known of how well the models fit. StoreError."""
+    """Return the predicted gain; ``from_history`` uses the newest parameters' covariance and skill. StoreError.
+
+    ``held_out_um`` is what models that come from elsewhere leave of moves that they were not identified on.
+    """
     if not from_history:
-        return gain(planned, models, config, {}, {})
+        return gain(planned, models, config, {}, held_out_um or {})
     with History.read(config.store.directory) as history:
         newest = {axis: history.revisions(axis, limit=1) for axis in config.axis}
         skills = {axis: history.skills(axis, limit=RECENT_MOVES) for axis in config.axis}
     covariances = {axis: found[0].set.covariance for axis, found in newest.items() if found}
-    return gain(planned, models, config, covariances, skills)
+    return gain(planned, models, config, covariances, worst_skill_um(skills))

@@ -22,6 +22,7 @@ GAINS: Mapping[str, Float] = {  # powers of R, L, K, Jt, ft, Cd
 }
 LEAST_GAIN_CHANGE = 0.02
 WARMING = ("R", *FRICTION)
+WINDING = ("R", "L")
 LEAST_CHANGE: Mapping[str, float] = {"R": 0.02, "L": 0.03, "K": 0.01, "Jt": 0.02, "ft": 0.15, "Cd": 0.10}
 
 Pair = tuple[tuple[Window, Estimate], tuple[Window, Estimate]]
@@ -66,6 +67,11 @@ def moved(told: Sequence[tuple[Window, Estimate]]) -> list[Reason]:
     suspected = [worst] if worst is not None else [*pairwise(told), *_by_direction(told)]
     sensors = [reason for pair in suspected if (reason := gain_change(*pair)) is not None]
     return sensors[:1] or reasons
+
+
+def is_of_winding(reason: Reason) -> bool:
+    """Return whether a reason of :func:`moved` says that R or L moves: the current loop hides it at the table."""
+    return reason.code == "ParameterJump" and reason.text.split(" ", 1)[0] in WINDING
 
 
 def _farthest(told: Sequence[tuple[Window, Estimate]], name: str) -> Pair | None:

@@ -20,7 +20,7 @@ from fdhil.identification.without_voltage import fit as fit_torque
 from fdhil.records import PARAMETERS, Bool, Estimate, Float, Parameters, Reason, Window, rms
 from fdhil.validation.backlash import DeadBand, backlash
 from fdhil.validation.breakaway import Breakaway, breakaway
-from fdhil.validation.replay import replay_window
+from fdhil.validation.replay import completed, replay_window
 from fdhil.validation.score_bench import Finding
 from fdhil.validation.selection import Lacking, lacking
 from fdhil.validation.sensor_reconstruction import Bridge
@@ -28,7 +28,7 @@ from fdhil.validation.shifts import LATE, Shift, late_findings, shifts
 from fdhil.validation.simulation import fit_percent
 from fdhil.validation.structure import DEAD_TIME, FRICTION, OFFSET_CURRENT, findings
 from fdhil.validation.table_error import TableError
-from fdhil.validation.weight import NEXT_SPEED, Move, Weight, completed, to_and_fro, weigh
+from fdhil.validation.weight import NEXT_SPEED, Move, Weight, to_and_fro, weigh
 from fdhil.validation.whiteness import coloured, noisy
 from fdhil.validation.widening import widened
 

@@ -12,7 +12,7 @@ from fdhil.identification.motion import resolution
 from fdhil.identification.windows import moving_range
 from fdhil.model import closed_loop
 from fdhil.model.terms import with_resonance
-from fdhil.records import Float, Int, Parameters, Window, rms
+from fdhil.records import PARAMETERS, Float, Int, Parameters, Window, rms
 
 LEAST_ROWS = 20
 OFF_GRID = 1e-3  # of a cycle, by which a row may differ from it
@@ -98,9 +98,7 @@ def replay_window(window: Window, parameters: Parameters, axis: Axis, sync_perio
     shaft comes to rest, one rapid does not tell. Its dry friction holds a constant load, too; how much of it is load
     shows as it leaves rest alone: of what it may be, that is taken which explains the rapid best.
     """
-    if abs(window.dt_s / sync_period_s - 1.0) > OFF_GRID or not (
-        _moves(window.demand_mm) and _moves(window.position_mm)
-    ):
+    if not _rows_are_setpoints(window, sync_period_s):
         return None
     signals, moving = (window.demand_mm, window.position_mm), moving_range(window)
     best: Replay | None = None
@@ -117,6 +115,33 @@ def replay_window(window: Window, parameters: Parameters, axis: Axis, sync_perio
         if best.unexplained_um < ENOUGH * best.measured_um:
             break
     return best
+
+
+def replay_setpoints(window: Window, parameters: Parameters, axis: Axis, sync_period_s: float) -> Replay | None:
+    """Return the replay of a window as :func:`replay_window`, by this very model: nothing is fitted to it."""
+    if not _rows_are_setpoints(window, sync_period_s):
+        return None
+    parameters = completed(parameters, Parameters(**axis.nominal.model_dump()))
+    signals, held_a = (window.demand_mm, window.position_mm), _standstill_a(window)
+    try:
+        told = replay(*signals, parameters, axis, sync_period_s, window.offset_mm, standstill_a=held_a)
+    except ValueError:  # too few whole rows, or no drive
+        return None
+    return told.during(*moving_range(window)) if np.isfinite(told.difference_um).all() else None
+
+
+def completed(parameters: Parameters, spare: Parameters) -> Parameters:
+    """Return the parameters with what is not known of them taken from ``spare``: R and L do little at the table."""
+    values = parameters.as_dict()
+    return parameters.changed(
+        **{name: getattr(spare, name) for name in PARAMETERS[:2] if not math.isfinite(values[name])}
+    )
+
+
+def _rows_are_setpoints(window: Window, sync_period_s: float) -> bool:
+    """Return whether a window's rows are the drive's set-points, and demand and position were recorded and moved."""
+    on_grid = abs(window.dt_s / sync_period_s - 1.0) <= OFF_GRID
+    return on_grid and _moves(window.demand_mm) and _moves(window.position_mm)
 
 
 def _parted(p: Parameters, direction: int, current_a: float, share: float) -> tuple[Parameters, float] | None:

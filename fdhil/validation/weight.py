@@ -19,7 +19,7 @@ from fdhil.config.controller import TOLERANCE_SHARE
 from fdhil.identification.filtering import moving_mean
 from fdhil.identification.windows import carried
 from fdhil.model.terms import torque
-from fdhil.records import PARAMETERS, Bool, Float, Parameters, Reason, Window, rms
+from fdhil.records import Bool, Float, Parameters, Reason, Window, rms
 from fdhil.validation.replay import Replay, replay_window
 from fdhil.validation.table_error import TableError
 
@@ -236,11 +236,3 @@ def _beyond_noise(left: float, loop: TableError, p: Parameters, move: Move, nois
     expected = loop.noise_um(p.Jt * speed_rad_s, p.K * current_a * dt_s, n, dt_s) * math.sqrt(moving)
     independent = max(1.0, moving * n * dt_s / max(NOISE_ROWS, dt_s))
     return math.sqrt(max(0.0, left**2 - expected**2 * (1.0 + SCATTER * math.sqrt(2.0 / independent))))
-
-
-def completed(parameters: Parameters, spare: Parameters) -> Parameters:
-    """Return the parameters with what is not known of them taken from ``spare``: R and L do little at the table."""
-    values = parameters.as_dict()
-    return parameters.changed(
-        **{name: getattr(spare, name) for name in PARAMETERS[:2] if not math.isfinite(values[name])}
-    )

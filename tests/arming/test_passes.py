@@ -16,7 +16,7 @@ from fdhil.arming.passes import Pass
 from fdhil.arming.preparing import Armament
 from fdhil.config import MachineConfig
 from fdhil.prediction import contour_error_um
-from fdhil.prediction.gain import Gain, plus_minus
+from fdhil.prediction.gain import Gain, joint_held_out_um, plus_minus, worst_skill_um
 from fdhil.records import AxisSamples, Correction, Float, Notice, Skill, frozen, frozen_ints
 from tests.arming.mill import Mill
 from tests.arming.test_ahead import opened
@@ -130,6 +130,7 @@ async def test_each_pass_is_told_beside_what_was_predicted(
     assert first["measured"]["rms_um"] == pytest.approx(first["predicted"]["rms_um"], rel=1e-3)
     assert second["measured"]["rms_um"] == pytest.approx(second["predicted_without"]["rms_um"], rel=1e-3)
     assert "pass 1 of gentle.ngc: contour error measured" in first["text"]
+    assert first["gain"]["measured"] == pytest.approx(first["gain"]["predicted"], rel=1e-3)
     assert "ended by StaleData" in third["text"]
     assert any("more than predicted; identify again" in notice.text for notice in shop.told)
     assert any("worse than without; leave it off" in notice.text for notice in shop.told)
@@ -153,6 +154,15 @@ def test_a_gain_is_bounded_by_the_parameters_spread_and_by_the_skill(config: Mac
     for unknown in ((), (Skill("X", 1, math.nan, 1.0, 0.0, 900.0),)):
         assert predicted(skills=unknown).half_um is None
     assert "how well it fits this machine is not known" in str(predicted(skills=()))
+
+
+def test_gain_includes_what_held_out_moves_show_and_is_unknown_where_an_axis_has_none() -> None:
+    assert joint_held_out_um({"X": 3.0, "Y": 4.0}, ("X", "Y")) == pytest.approx(5.0)
+    assert joint_held_out_um({"X": 3.0}, ("X", "Y")) is None
+    assert joint_held_out_um({"X": 3.0}, ()) is None
+    assert worst_skill_um({"X": (Skill("X", 1, 2.0, 9.0, 0.0, 9.0), Skill("X", 2, 3.0, 9.0, 0.0, 9.0)), "Y": ()}) == {
+        "X": 3.0
+    }
 
 
 def test_a_spread_below_the_digits_is_not_zero() -> None:

@@ -1,0 +1,70 @@
+"""Judges a pooled model by moves that it was not identified on: what it leaves of their following error.
+
+Each move is predicted by the pool of the others, so that no model is judged by what it was fitted to. What is left
+there is what a correction by the model leaves, too: the same drive, predicted through the same loops.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from fdhil.config import Axis, Identification
+from fdhil.identification.between import between
+from fdhil.identification.physical_bounds import bounded
+from fdhil.identification.pooling import member, pooled
+from fdhil.records import Estimate, HeldOut, Parameters, Reason, Window
+from fdhil.validation.presliding import TERM
+from fdhil.validation.replay import Replay, replay_setpoints
+
+Move = tuple[Window, Estimate]
+
+
+def predict_held_out(moves: Sequence[Move], model: Estimate, axis: Axis, sync_period_s: float) -> list[Replay | None]:
+    """Return each move replayed by the pool of the others; None where its samples cannot be compared.
+
+    ``model`` is the pool of all: it gives the presliding, and predicts where the others are no drive. A single move is
+    predicted by ``model`` itself.
+    """
+    members = [member(window, estimate, k) for k, (window, estimate) in enumerate(moves)]
+    build_up = {TERM: model.value(TERM)} if TERM in model.names else {}
+    found = []
+    for k, (window, _) in enumerate(moves):
+        rest = [m for m in members if m.place != k]
+        without = bounded(pooled(rest, model, between(rest))).parameters().changed(**build_up) if rest else None
+        usable = without if without is not None and _is_drive(without) else model.parameters()
+        found.append(replay_setpoints(window, usable, axis, sync_period_s))
+    return found
+
+
+def _is_drive(p: Parameters) -> bool:
+    """Return whether a pool of fewer moves is a drive: K and Jt positive, friction known."""
+    return bool(np.isfinite([p.K, p.Jt, p.ft, p.Cd]).all() and min(p.K, p.Jt) > 0.0)
+
+
+def worst_of(predicted: Sequence[Replay | None]) -> HeldOut | None:
+    """Return what is left of the worst of the moves; None where none could be compared."""
+    told = [one for one in predicted if one is not None]
+    if not told:
+        return None
+    worst = max(told, key=lambda one: one.unexplained_um)
+    most_um = max(float(np.abs(one.difference_um).max()) for one in told)
+    return HeldOut(len(told), worst.unexplained_um, most_um, worst.measured_um)
+
+
+def is_predicted(found: Replay | None, settings: Identification) -> bool:
+    """Return whether a move that a model was not identified on is predicted to the tolerance."""
+    return found is not None and found.unexplained_um <= settings.tolerance_for(found.measured_um)
+
+
+def held_out_reason(found: HeldOut, settings: Identification) -> Reason | None:
+    """Return why a model is not validated that does not predict the moves that it was not identified on."""
+    limit_um = settings.tolerance_for(found.following_um)
+    if found.rms_um <= limit_um:
+        return None
+    text = (
+        f"identified on the other moves the model leaves {found.rms_um:.3g} um RMS of a following error of "
+        f"{found.following_um:.3g} um, limit {limit_um:.3g} um: it does not predict a move that it has not seen"
+    )
+    return Reason("ValidationFailed", text, "record more rapids in both directions, at several speeds and lengths")

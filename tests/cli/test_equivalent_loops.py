@@ -1,0 +1,45 @@
+"""Cascade and PID with the same sum and product of gains are reported as the same controller."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fdhil.cli.loops_view import equivalent_loops
+from fdhil.config.regulators import Regulators
+from fdhil.model import closed_loop
+from fdhil.records import LoopEstimate, Parameters, Verdict, frozen
+from studies.bench import shuttle
+from tests.bench import bench_config
+
+NAMES = ("position_gain_per_s", "speed_feedforward", "speed_kp", "position_ki_per_s2")
+
+
+def found(structure: str, names: tuple[str, ...], values: tuple[float, ...]) -> LoopEstimate:
+    covariance = frozen(np.zeros((len(names), len(names))))
+    return LoopEstimate("X", structure, names, frozen(values), covariance, Verdict(True, None, ()), None)
+
+
+def test_pid_is_reported_as_the_two_cascades_of_its_sum_and_product() -> None:
+    same = equivalent_loops(found("pid", NAMES, (84.0, 1.0, 20.0, 1760.0)))
+    assert [each["position_gain_per_s"] for each in same] == pytest.approx([40.0, 44.0])
+    assert [each["speed_ki"] for each in same] == pytest.approx([880.0, 800.0])
+
+
+def test_no_cascade_is_the_same_without_real_gains_or_with_part_of_the_speed_fed_forward() -> None:
+    assert equivalent_loops(found("pid", NAMES, (40.0, 1.0, 20.0, 1760.0))) == []
+    assert equivalent_loops(found("pid", NAMES, (84.0, 0.5, 20.0, 1760.0))) == []
+
+
+@pytest.mark.usefixtures("long_computation")
+def test_exchanged_cascade_follows_a_rapid_alike() -> None:
+    axis = bench_config().axis["X"]
+    model, demand_mm = Parameters(**axis.nominal.model_dump()), 1e3 * shuttle()
+    g = axis.regulators
+    names = ("position_gain_per_s", "speed_feedforward", "speed_kp", "speed_ki")
+    cascade = found("p_pi_pi", names, (g.position_gain_per_s, 1.0, g.speed_kp, g.speed_ki))
+    pid, exchanged = equivalent_loops(cascade)
+    assert (pid["structure"], exchanged["structure"]) == ("pid", "p_pi_pi")
+    other = axis.model_copy(update={"regulators": Regulators.model_validate(g.model_dump() | dict(exchanged))})
+    places = [closed_loop.simulate(model, each, 0.001, demand_mm).position_mm for each in (axis, other)]
+    assert 1e3 * np.abs(places[1] - places[0]).max() < 0.02 * 1e3 * np.abs(places[0] - demand_mm).max()

@@ -1,0 +1,80 @@
+"""A model is judged by moves that it was not identified on, and friction that builds up is identified from them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from fdhil.config import Identification
+from fdhil.model import closed_loop
+from fdhil.records import PARAMETERS, Estimate, Float, Parameters, Result, Window, frozen
+from fdhil.validation.held_out import held_out_reason, is_predicted, predict_held_out, worst_of
+from fdhil.validation.presliding import TERM, with_presliding
+from studies.bench import shuttle
+from tests.bench import bench_config
+from tests.validation.test_at_the_table import AXIS, PERIOD_S, rapids
+
+TRUE = Parameters(**AXIS.nominal.model_dump())
+SETTINGS = Identification()
+
+
+@lru_cache(maxsize=4)
+def moves(presliding_um: float) -> list[Window]:
+    """Return a rapid back and forth whose positions are those of a drive with this presliding."""
+    demand_mm = 1e3 * shuttle(moves=2)
+    drive = TRUE.changed(**{TERM: presliding_um}) if presliding_um else TRUE
+    response = closed_loop.simulate(drive, AXIS, PERIOD_S, demand_mm)
+    noise = 0.05e-3 * np.random.default_rng(1).standard_normal(demand_mm.size)
+    return [_with_position(window, response.position_mm + noise, demand_mm) for window in rapids()]
+
+
+def _with_position(window: Window, position_mm: Float, demand_mm: Float) -> Window:
+    first = round(window.start_s / PERIOD_S)
+    rows = slice(first, first + window.n)
+    return replace(window, position_mm=frozen(position_mm[rows]), demand_mm=frozen(demand_mm[rows]))
+
+
+def estimate(**changes: float) -> Estimate:
+    values = TRUE.changed(**changes).as_dict()
+    covariance = np.diag([(1e-3 * value) ** 2 for value in values.values()])
+    return Estimate("maximum_likelihood", PARAMETERS, frozen(list(values.values())), frozen(covariance), {}, Result.OK)
+
+
+@pytest.mark.usefixtures("long_computation")
+def test_presliding_is_identified_within_its_interval_and_only_where_there_is_some() -> None:
+    found = with_presliding(estimate(), moves(8.0), AXIS, PERIOD_S)
+    assert found.value(TERM) == pytest.approx(8.0, abs=max(0.4, 3 * found.std(TERM)))
+    assert with_presliding(estimate(), moves(0.0), AXIS, PERIOD_S).names == PARAMETERS
+
+
+@pytest.mark.usefixtures("long_computation")
+def test_pool_that_does_not_predict_the_other_move_is_refused() -> None:
+    windows = moves(0.0)
+    right, wrong = ([(window, estimate(Jt=jt)) for window in windows] for jt in (TRUE.Jt, 1.3 * TRUE.Jt))
+    good, bad = (predict_held_out(made, made[0][1], AXIS, PERIOD_S) for made in (right, wrong))
+    assert all(is_predicted(one, SETTINGS) for one in good)
+    assert not any(is_predicted(one, SETTINGS) for one in bad)
+    kept, left = worst_of(good), worst_of(bad)
+    assert kept is not None
+    assert left is not None
+    assert held_out_reason(kept, SETTINGS) is None
+    reason = held_out_reason(left, SETTINGS)
+    assert reason is not None
+    assert "does not predict a move that it has not seen" in reason.text
+    assert left.moves == 2
+    assert left.max_um > left.rms_um > kept.rms_um
+
+
+def test_friction_that_builds_up_lets_the_table_creep_where_sharp_friction_holds_it() -> None:
+    """Within the band of dry friction a bristle gives way by its share of the presliding way."""
+    axis = bench_config().axis["X"]
+    demand_mm = np.linspace(0.0, 0.5e-3, 200)
+    sharp, soft = (
+        closed_loop.simulate(model, axis, PERIOD_S, demand_mm).position_mm[-1]
+        for model in (TRUE, TRUE.changed(**{TERM: 10.0}))
+    )
+    assert abs(sharp) < 1e-6
+    assert 1e-5 < soft < demand_mm[-1]
