@@ -55,6 +55,13 @@ class CanBus(Section):
         True,
         description="python-can: acknowledge nothing, so that a wrong bit rate disturbs nobody, where it can be told",
     )
+    offset_lead_cycles: int = Field(
+        0,
+        ge=0,
+        le=200,
+        description="HAL: by how many cycles offsets are sent ahead into the streamer; 20 where the bridge is on the PC "
+        "of LinuxCNC. CANopen: 0",
+    )
     options: Mapping[str, bool | Whole | Finite | str] = Field(
         {}, description="python-can: what its interface takes besides, e.g. { tty_baudrate = 3000000 }"
     )

@@ -1,0 +1,111 @@
+"""A machine that has HAL pins and no CANopen drive: its LinuxCNC files, fdhil's configuration and HAL file for it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+from fdhil import config as machine_config
+from fdhil.bridges import hal_bus, linuxcnc
+from fdhil.cli.demo.toml import to_toml
+from fdhil.commissioning.init.hal_file import correction_hal, splices_of
+from fdhil.commissioning.init.linuxcnc_text import Hal, Ini, parse_hal
+from tests.linuxcnc.hal_plant import (
+    CURRENT_KI,
+    CURRENT_KP,
+    MOTOR,
+    PITCH_MM,
+    POSITION_GAIN,
+    SPEED_KP,
+    machine_hal,
+)
+from tests.linuxcnc.machine import LinuxCnc
+
+LEAD_CYCLES = 60  # a computer that tests run on is busy
+LOADS = "loadusr -Wn {name} /usr/bin/python3 {file} {arguments}"
+
+
+def plant_hal(axes: str) -> Hal:
+    """Return what the HAL file of the plant says."""
+    hal = Hal()
+    parse_hal(machine_hal(axes, dict.fromkeys(axes, MOTOR)), Ini({}), lambda _name: "", hal)
+    return hal
+
+
+def hal_pins(axis: str, joint: int, hal: Hal) -> dict[str, Any]:
+    """Return [axis.X.drive.hal] of an axis of the plant."""
+
+    def source(name: str) -> str:
+        return next(pin for pin in hal.nets[f"{axis.lower()}-{name}"] if pin.endswith(".out"))
+
+    return {
+        "position_command": f"joint.{joint}.motor-pos-cmd",
+        "position_feedback": source("position"),
+        "speed": source("speed-shown"),
+        "speed_mm_s_per_unit": PITCH_MM / (2 * math.pi),  # the plant has rad/s
+        "current": source("current-shown"),
+        "voltage": source("voltage-shown"),
+        "enabled": f"joint.{joint}.amp-enable-out",
+    }
+
+
+def document(folder: Path, bus_port: int, nc_port: int, axes: str = "XY", **correction: float) -> dict[str, Any]:
+    """Return the configuration of the machine as a parsed file."""
+    regulators = {
+        "structure": "linuxcnc_pid",
+        "pid_output": "current",
+        "position_gain_per_s": POSITION_GAIN,
+        "position_derivative": 1.0,
+        "speed_feedforward": 0.0,
+        "error_previous_target": False,
+        "speed_kp": SPEED_KP,
+        "speed_ki": 0.0,
+        "speed_period_s": 0.001,
+        "current_limit_a": 150.0,
+        "current_kp": CURRENT_KP,
+        "current_ki": CURRENT_KI,
+        "voltage_limit_v": 300.0,
+    }
+    hal = plant_hal(axes)
+    limits = {"max_offset_um": 250.0, "max_speed_mm_s": 20.0, "max_acceleration_mm_s2": 1000.0}
+    axis = {
+        "screw_pitch_mm": PITCH_MM,
+        "rapid_speed_mm_s": 500.0,
+        "max_acceleration_mm_s2": 2000.0,
+        "nominal": {**MOTOR},
+        "regulators": regulators,
+        "correction": {**limits, **correction},
+    }
+    return {
+        "machine": {"name": "hal", "sync_period_s": 0.001},
+        "nc": {"profile": "linuxcnc"},
+        "g0": {"source": "linuxcnc"},
+        "nc_source": {"linuxcnc": {"port": nc_port}},
+        "bus": {
+            "hal": {"interface": "socketcand", "channel": "hal", "port": bus_port, "offset_lead_cycles": LEAD_CYCLES}
+        },
+        "store": {"directory": str(folder / "store")},
+        "axis": {
+            letter: {**axis, "drive": {"source": "hal", "bus": "hal", "hal": hal_pins(letter, joint, hal)}}
+            for joint, letter in enumerate(axes)
+        },
+    }
+
+
+class HalMachine(LinuxCnc):
+    """LinuxCNC with the plant, fdhil's offsets spliced in, and both bridges."""
+
+    def __init__(
+        self, file: Path, text: dict[str, Any], nc_port: int, axes: str = "XY", corrected: bool = True
+    ) -> None:
+        file.write_text(to_toml(text))
+        config, hal = machine_config.load(file), plant_hal(axes)
+        base = machine_hal(axes, dict.fromkeys(axes, MOTOR))
+        splices = splices_of(hal, {letter: joint for joint, letter in enumerate(axes)}, axes) if corrected else []
+        load = LOADS.format(name=hal_bus.NAME, file=hal_bus.__file__, arguments="{folder}/machine.toml")
+        beside = {"fdhil.hal": correction_hal(config, splices, hal, load), "machine.toml": file.read_text()}
+        nc = LOADS.format(name=linuxcnc.NAME, file=linuxcnc.__file__, arguments=f"--port {nc_port} --channel 1")
+        sampled = ("fffffb" + "f" * corrected) * len(axes) + "sb" * corrected
+        more = f"loadrt sampler depth=8192,8192 cfg={sampled},{'f' * len(axes)}ssff\nsource fdhil.hal\n{nc}\n"
+        super().__init__(axes=axes, base=base, hal=more, beside=beside)
