@@ -430,6 +430,7 @@ class Bridge:
         self._queue = OffsetQueue(self.axes, lead) if self._sampler.corrected and lead else None
         self._component = component
         if self._queue is not None:
+            _halcmd("net", "fdhil-beat", f"{NAME}.heartbeat", "=>", "fdhil-watchdog.in")
             self._streamer = hal.stream(component, hal.streamer_base, "s" + "f" * len(self.axes))
         self._guard_s = -GUARD_SILENT_S
         self._started_s = time.time()
