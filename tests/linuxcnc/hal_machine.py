@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import math
+import socket
+import struct
+import threading
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
+
+import numpy as np
 
 from fdhil import config as machine_config
 from fdhil.bridges import hal_bus, linuxcnc
 from fdhil.cli.demo.toml import to_toml
 from fdhil.commissioning.init.hal_file import correction_hal, splices_of
 from fdhil.commissioning.init.linuxcnc_text import Hal, Ini, parse_hal
+from fdhil.config.axis import HAL_INCREMENTS
+from fdhil.records import Float
 from tests.linuxcnc.hal_plant import (
     CURRENT_KI,
     CURRENT_KP,
@@ -109,3 +117,51 @@ class HalMachine(LinuxCnc):
         sampled = ("fffffb" + "f" * corrected) * len(axes) + "sb" * corrected
         more = f"loadrt sampler depth=8192,8192 cfg={sampled},{'f' * len(axes)}ssff\nsource fdhil.hal\n{nc}\n"
         super().__init__(axes=axes, base=base, hal=more, beside=beside)
+
+
+class HalTrace:
+    """A client of the bridge that keeps what each axis was ordered and where it was, for the end of a with block."""
+
+    def __init__(self, port: int, nodes: int) -> None:
+        self._nodes = nodes
+        self._wire = socket.create_connection(("127.0.0.1", port))
+        self._came: list[bytes] = []
+        self._reading = threading.Thread(target=self._read, name="trace")
+
+    def __enter__(self) -> Self:
+        for text in (b"< open hal >", b"< rawmode >"):
+            self._wire.sendall(text)
+        self._reading.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._wire.shutdown(socket.SHUT_RDWR)
+        self._reading.join()
+        self._wire.close()
+
+    def _read(self) -> None:
+        while came := self._wire.recv(1 << 20):
+            self._came.append(came)
+
+    def rows_mm(self) -> tuple[Float, Float, Float]:
+        """Return demand, position and applied offset (n, axes) in mm of each servo cycle that came whole."""
+        per_mm = HAL_INCREMENTS / PITCH_MM
+        now: dict[int, bytes] = {}
+        rows = []
+        for piece in b"".join(self._came).split(b">"):
+            words = piece.split()
+            if len(words) < 5 or words[1] != b"frame":
+                continue
+            cob_id = int(words[2], 16)
+            if cob_id == hal_bus.RPDO1 + 1 and len(now) == 3 * self._nodes:
+                rows.append(self._row(now))
+                now = {}
+            if cob_id & 0x780 in (hal_bus.RPDO1, hal_bus.TPDO1, hal_bus.TPDO3):
+                now[cob_id] = bytes.fromhex(words[4].decode())
+        table = np.array(rows, float) / per_mm
+        return table[:, 0], table[:, 1], table[:, 2]
+
+    def _row(self, now: Mapping[int, bytes]) -> list[list[int]]:
+        kinds = ((hal_bus.RPDO1, "<Hi", 1), (hal_bus.TPDO1, "<ii", 0), (hal_bus.TPDO3, "<ii", 1))
+        nodes = range(1, self._nodes + 1)
+        return [[struct.unpack(form, now[base + node])[at] for node in nodes] for base, form, at in kinds]
