@@ -62,6 +62,7 @@ class Axis(NamedTuple):
     per_mm: float  # increments, with the axis' sign
     period_s: float
     commanded: bool  # the voltage is a command, which acts in the cycle that begins
+    corrected: bool  # offsets may be added: the HAL file has its limit3
 
 
 class Sample(NamedTuple):
@@ -96,8 +97,8 @@ def read_axes(document: Mapping[str, Any]) -> list[Axis]:
         pins["current"] = pins.pop("torque", pins.get("current", ""))
         pins.setdefault("enabled", "motion.motion-enabled")
         per_mm = sign * turn / table["screw_pitch_mm"]
-        commanded = own.get("voltage_is") == "commanded"
-        axes.append(Axis(name, drive.get("node_id", number), pins, scales, per_mm, period_s, commanded))
+        commanded, corrected = own.get("voltage_is") == "commanded", "correction" in table
+        axes.append(Axis(name, drive.get("node_id", number), pins, scales, per_mm, period_s, commanded, corrected))
     return axes
 
 
@@ -109,7 +110,7 @@ class AxisReader:
         self._before_mm: float | None = None
         self._voltage = 0.0
 
-    def sample(self, value: Mapping[str, float], offset_mm: float) -> Sample:
+    def sample(self, value: Mapping[str, float]) -> Sample:
         """Return the sample of one cycle; ``value`` has a value for each key of the axis' pins."""
         axis, scale = self.axis, self.axis.scales
         position_mm = value["position_feedback"] * scale["position"]
@@ -128,7 +129,7 @@ class AxisReader:
             _whole(speed_mm_s * axis.per_mm, 31),
             _whole(value["current"] * scale["current"] * sign * 1e5, 31),
             _whole(volts * sign * 50.0, 15),
-            _whole(offset_mm * axis.per_mm, 31),
+            _whole(value.get("offset", 0.0) * scale["position"] * axis.per_mm, 31),
             bool(value["enabled"]),
         )
 
@@ -166,13 +167,13 @@ class OffsetQueue:
     """Places offsets on servo cycles: which rows go into the streamer now. Pure.
 
     The streamer hands one row to HAL in each cycle. A row's number comes back through the sampler, so that the cycle of
-    every later row is known. ``rows`` are (number, offsets in mm of each axis); before the first answer the queue is
+    every later row is known. ``rows`` are (number, offsets in HAL's unit of each axis); before the first answer the queue is
     primed with zeros. A cycle whose offset did not come keeps the one before; what comes too late is dropped.
     """
 
     def __init__(self, axes: Sequence[Axis], lead: int) -> None:
         self._axes = {axis.node_id: place for place, axis in enumerate(axes)}
-        self._per_mm = [axis.per_mm for axis in axes]
+        self._per_unit = [axis.per_mm * axis.scales["position"] for axis in axes]
         self._lead = lead
         self.dropped = self.restarts = 0
         self._stop()
@@ -180,7 +181,7 @@ class OffsetQueue:
     def _stop(self) -> None:
         self._next = 1  # the number of the row to be written next
         self._zero: int | None = None  # the cycle in which row 0 would have taken effect
-        self._held = [0.0] * len(self._per_mm)
+        self._held = [0.0] * len(self._per_unit)
         self._answers: dict[int, dict[int, float]] = {}
         self._newest = -1
 
@@ -207,7 +208,7 @@ class OffsetQueue:
             return
         increments, counter = struct.unpack("<iB", data)
         cycle = self._newest - (self._newest - (counter - 1)) % SYNC_RANGE
-        self._answers.setdefault(cycle + 1 + self._lead, {})[place] = increments / self._per_mm[place]
+        self._answers.setdefault(cycle + 1 + self._lead, {})[place] = increments / self._per_unit[place]
 
     def rows(self) -> Iterator[tuple[int, list[float]]]:
         """Yield the rows to be written now."""
@@ -220,7 +221,7 @@ class OffsetQueue:
             self._answers.clear()  # until the first row came back
             return
         for target in sorted(self._answers):
-            if len(self._answers[target]) < len(self._per_mm) and target == max(self._answers):
+            if len(self._answers[target]) < len(self._per_unit) and target == max(self._answers):
                 return  # the rest is on its way
             number = target - self._zero
             told = self._answers.pop(target)
@@ -337,17 +338,21 @@ def _text(frames: Sequence[tuple[int, bytes]], stamp_s: float) -> bytes:
 class HalSampler:
     """HAL's sampler on the axes' pins; PinError for a pin that cannot be sampled."""
 
-    def __init__(self, hal: Any, component: Any, axes: Sequence[Axis], channel: int, thread: str) -> None:
+    def __init__(self, hal: Any, component: Any, axes: Sequence[Axis], options: argparse.Namespace) -> None:
+        channel, thread, more = options.channel, options.thread, options.also
         kinds = {pin.name: pin for pin in map(Pin, _halcmd("-s", "show", "pin").splitlines()) if pin.name}
+        functions = [words for line in _halcmd("-s", "show", "funct").splitlines() if len(words := line.split()) == 6]
         self.corrected = SHARED[0] in _halcmd("-s", "show", "sig").split()
         self._places: list[dict[str, int]] = []
         wanted: dict[str, int] = {}
         for axis in axes:
             pins = dict(axis.pins)
-            if self.corrected:
+            if self.corrected and axis.corrected:
                 pins["offset"] = f"fdhil-limit-{axis.name.lower()}.out"
             for key, pin in pins.items():
-                _require(pin, kinds, f"axis.{axis.name}.drive.hal.{key}", "bit" if key == "enabled" else "float")
+                _require(
+                    pin, kinds, functions, f"axis.{axis.name}.drive.hal.{key}", "bit" if key == "enabled" else "float"
+                )
             self._places.append({key: wanted.setdefault(pin, len(wanted)) for key, pin in pins.items()})
         if self.corrected:
             self._shared = [wanted.setdefault(pin, len(wanted)) for pin in ("streamer.0.pin.0", "streamer.0.empty")]
@@ -355,7 +360,8 @@ class HalSampler:
             raise PinError(f"{len(wanted)} pins are more than the {MOST_PINS} of one sampler; leave out speed pins")
         types = "".join(HAL_TYPES[kinds[pin].kind] for pin in wanted)
         if not hal.component_exists("sampler"):
-            _halcmd("loadrt", "sampler", f"depth={DEPTH}", f"cfg={types}")
+            depths, kinds_of_all = [str(DEPTH)] * (1 + len(more)), [types, *more]
+            _halcmd("loadrt", "sampler", f"depth={','.join(depths)}", f"cfg={','.join(kinds_of_all)}")
         for pin, place in wanted.items():
             _halcmd(
                 "net",
@@ -385,23 +391,30 @@ class Pin:
 
     def __init__(self, line: str) -> None:
         words = line.split()
-        self.name, self.kind, self.signal = "", "", ""
+        self.owner, self.name, self.kind, self.signal = "", "", "", ""
         if len(words) >= 5 and words[1] in HAL_TYPES:
-            self.kind, self.name = words[1], words[4]
+            self.owner, self.kind, self.name = words[0], words[1], words[4]
             self.signal = words[6] if len(words) > 6 else ""
 
 
-def _require(pin: str, kinds: Mapping[str, Pin], key: str, kind: str) -> None:
-    """Raise PinError unless HAL has the pin, of this type."""
-    found = kinds.get(pin)
+def _require(pin: str, pins: Mapping[str, Pin], functions: Sequence[Sequence[str]], key: str, kind: str) -> None:
+    """Raise PinError unless HAL has the pin, of this type, and a thread computes it.
+
+    ``functions`` are the words of ``halcmd -s show funct``: owner, two addresses, floating point, users, name.
+    """
+    found = pins.get(pin)
+    owner = pin.rpartition(".")[0]
     if found is None:
-        near = [name for name in kinds if name.rpartition(".")[0] == pin.rpartition(".")[0]]
-        known = (
-            f"; {pin.rpartition('.')[0]} has {', '.join(near[:8])}" if near else "; no component of that name is loaded"
-        )
-        raise PinError(f"{key}: HAL has no pin {pin}{known}. Correct {key}, or load the bridge after that component")
+        near = [name for name in pins if name.rpartition(".")[0] == owner]
+        known = f"{owner} has {', '.join(near[:8])}" if near else f"no component {owner} is loaded"
+        raise PinError(f"{key}: HAL has no pin {pin}; {known}. Correct {key}, or load the bridge after that component")
     if found.kind != kind:
         raise PinError(f"{key}: pin {pin} is of type {found.kind}, and {key} needs {kind}. Name another pin")
+    used = {words[5]: words[4] != "0" for words in functions if words[0] == found.owner}
+    own = {name: runs for name, runs in used.items() if name == owner or name.startswith(f"{owner}.")} or used
+    if not any(own.values()):
+        why = f"function {next(iter(own))} is in no thread; addf it" if own else "its component runs in userspace"
+        raise PinError(f"{key}: pin {pin} is not computed in the servo thread: {why}, or name another pin")
 
 
 def _halcmd(*words: str) -> str:
@@ -425,13 +438,13 @@ class Bridge:
         ]
         self._readers = [AxisReader(axis) for axis in self.axes]
         self._hub = Hub(options.host, int(bus["port"]))
-        self._sampler = HalSampler(hal, component, self.axes, options.channel, options.thread)
-        lead = int(bus.get("offset_lead_cycles", 0))
-        self._queue = OffsetQueue(self.axes, lead) if self._sampler.corrected and lead else None
+        self._sampler = HalSampler(hal, component, self.axes, options)
+        lead, corrected = int(bus.get("offset_lead_cycles", 0)), [axis for axis in self.axes if axis.corrected]
+        self._queue = OffsetQueue(corrected, lead) if self._sampler.corrected and lead else None
         self._component = component
         if self._queue is not None:
             _halcmd("net", "fdhil-beat", f"{NAME}.heartbeat", "=>", "fdhil-watchdog.in")
-            self._streamer = hal.stream(component, hal.streamer_base, "s" + "f" * len(self.axes))
+            self._streamer = hal.stream(component, hal.streamer_base, "s" + "f" * len(corrected))
         self._guard_s = -GUARD_SILENT_S
         self._started_s = time.time()
 
@@ -441,7 +454,7 @@ class Bridge:
         for cycle, values, row, empty in self._sampler.cycles():
             if self._queue is not None:
                 self._queue.applied(cycle, row, empty)
-            samples = [r.sample(v, v.get("offset", 0.0)) for r, v in zip(self._readers, values, strict=True)]
+            samples = [reader.sample(value) for reader, value in zip(self._readers, values, strict=True)]
             stamp_s = self._started_s + cycle * self.axes[0].period_s
             text += _text(list(frames_of(cycle, self.axes, samples)), stamp_s)
         self._hub.send(bytes(text))
@@ -455,6 +468,7 @@ class Bridge:
                     self._streamer.write((number, *offsets))
             if time.monotonic() - self._guard_s < GUARD_SILENT_S:
                 self._component["heartbeat"] = not self._component["heartbeat"]
+            self._component["dropped"], self._component["restarts"] = self._queue.dropped, self._queue.restarts
 
 
 def serve(hal: Any, component: Any, options: argparse.Namespace) -> NoReturn:
@@ -473,6 +487,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("config", help="the machine's configuration, with [axis.X.drive.hal]")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at; 0.0.0.0: also for another computer")
     parser.add_argument("--channel", type=int, default=0, help="sampler channel, where HAL has loaded sampler already")
+    parser.add_argument("--also", nargs="*", default=(), help="types of further sampler channels, for other programs")
     parser.add_argument("--thread", default="servo-thread", help="the thread of the motion controller")
     options = parser.parse_args(arguments)
     here = Path(__file__).resolve().parent
@@ -482,6 +497,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     component = hal.component(NAME)
     component.newpin("heartbeat", hal.HAL_BIT, hal.HAL_OUT)
+    for name in ("dropped", "restarts"):  # offsets that came too late, times that the streamer ran empty
+        component.newpin(name, hal.HAL_S32, hal.HAL_OUT)
     try:
         serve(hal, component, options)
     except KeyboardInterrupt:

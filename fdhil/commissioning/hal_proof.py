@@ -24,6 +24,7 @@ from fdhil.errors import DriveFault
 STEPS_UM = (10.0, 50.0)  # the second where friction holds the axis against the first
 SETTLE_CYCLES, AVERAGE_CYCLES = 400, 100
 LISTEN_CYCLES = 200
+TRIES = 8  # a busy computer lets the streamer run empty now and then, which takes the offset away
 SILENCE_S = 2.0
 ZERO_WITHIN_CYCLES = 1000
 ENABLED_MASK, ENABLED = 0x6F, 0x27
@@ -145,7 +146,7 @@ def _move(hal: HalAxis) -> tuple[float, int]:
     steps = [um for um in STEPS_UM if um * 1e-3 * hal.per_mm <= hal.bounds.offset]
     for um in steps:
         step = round(um * 1e-3 * hal.per_mm)
-        after = hal.run(2 * SETTLE_CYCLES, step)
+        after = _held(hal, step)
         if abs(after.mean(after.applied) - step) > 1.5:
             text = (
                 f"an offset of {um:g} um was sent, and HAL applies {after.mean(after.applied) / hal.per_mm * 1e3:.1f}"
@@ -166,9 +167,18 @@ def _move(hal: HalAxis) -> tuple[float, int]:
     raise DriveFault(hal.device, f"{text}; check position_feedback, its sign and scale, and how stiff the loop is")
 
 
+def _held(hal: HalAxis, step: int) -> Seen:
+    """Hold an offset until HAL has applied it for long enough to be averaged; return the last try."""
+    for _ in range(TRIES):
+        seen = hal.run(2 * SETTLE_CYCLES, step)
+        if set(seen.applied[-2 * AVERAGE_CYCLES :]) <= {step - 1, step, step + 1}:
+            break
+    return seen
+
+
 def _stop_answering(hal: HalAxis, held: int) -> None:
     """Send nothing more: HAL must bring the offset to zero by itself."""
-    hal.run(SETTLE_CYCLES, held)
+    _held(hal, held)
     seen = hal.run(ZERO_WITHIN_CYCLES, None)
     if any(seen.applied[-AVERAGE_CYCLES:]):
         text = "HAL keeps the offset although nobody sends it: the watchdog does not work"

@@ -78,7 +78,7 @@ class FeedforwardLimits(Section):
 
 
 HalPin = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.:-]{1,127}$")]
-HalScale = Annotated[float, Field(allow_inf_nan=False)]
+HalScale = Finite
 
 
 class HalPins(Section):
@@ -142,8 +142,10 @@ class Drive(Section):
 
     @model_validator(mode="after")
     def _hal_pins(self) -> Drive:
-        if (self.source == "hal") != (self.hal is not None) or (self.source == "hal") != (self.profile == "hal"):
-            raise ValueError('source = "hal", profile "hal" and the table drive.hal go together')
+        if (self.source == "hal") != (self.hal is not None):
+            raise ValueError('source = "hal" and the table drive.hal go together')
+        if self.source == "hal" and self.profile != "hal":
+            raise ValueError(f'source = "hal" has profile "hal", not {self.profile}')
         return self
 
     @property

@@ -13,7 +13,7 @@ from typing import Any, Self
 import numpy as np
 
 from fdhil import config as machine_config
-from fdhil.bridges import hal_bus, linuxcnc
+from fdhil.bridges import hal_bus
 from fdhil.cli.demo.toml import to_toml
 from fdhil.commissioning.init.hal_file import correction_hal, splices_of
 from fdhil.commissioning.init.linuxcnc_text import Hal, Ini, parse_hal
@@ -31,7 +31,6 @@ from tests.linuxcnc.hal_plant import (
 from tests.linuxcnc.machine import LinuxCnc
 
 LEAD_CYCLES = 60  # a computer that tests run on is busy
-LOADS = "loadusr -Wn {name} /usr/bin/python3 {file} {arguments}"
 
 
 def plant_hal(axes: str) -> Hal:
@@ -104,19 +103,14 @@ def document(folder: Path, bus_port: int, nc_port: int, axes: str = "XY", **corr
 class HalMachine(LinuxCnc):
     """LinuxCNC with the plant, fdhil's offsets spliced in, and both bridges."""
 
-    def __init__(
-        self, file: Path, text: dict[str, Any], nc_port: int, axes: str = "XY", corrected: bool = True
-    ) -> None:
+    def __init__(self, file: Path, text: dict[str, Any], axes: str = "XY") -> None:
         file.write_text(to_toml(text))
         config, hal = machine_config.load(file), plant_hal(axes)
         base = machine_hal(axes, dict.fromkeys(axes, MOTOR))
-        splices = splices_of(hal, {letter: joint for joint, letter in enumerate(axes)}, axes) if corrected else []
-        load = LOADS.format(name=hal_bus.NAME, file=hal_bus.__file__, arguments="{folder}/machine.toml")
-        beside = {"fdhil.hal": correction_hal(config, splices, hal, load), "machine.toml": file.read_text()}
-        nc = LOADS.format(name=linuxcnc.NAME, file=linuxcnc.__file__, arguments=f"--port {nc_port} --channel 1")
-        sampled = ("fffffb" + "f" * corrected) * len(axes) + "sb" * corrected
-        more = f"loadrt sampler depth=8192,8192 cfg={sampled},{'f' * len(axes)}ssff\nsource fdhil.hal\n{nc}\n"
-        super().__init__(axes=axes, base=base, hal=more, beside=beside)
+        splices = splices_of(hal, {letter: joint for joint, letter in enumerate(axes)}, axes)
+        text_of_hal = correction_hal(config, "{folder}/machine.toml", len(axes), splices, hal)
+        beside = {"fdhil.hal": text_of_hal, "machine.toml": file.read_text()}
+        super().__init__(axes=axes, base=base, hal="source fdhil.hal\n", beside=beside)
 
 
 class HalTrace:

@@ -84,8 +84,10 @@ def machine_hal(axes: str, motors: Mapping[str, Mapping[str, float]]) -> str:
     latched = sums.functions[-len(axes) * len(NAMES) :]
     stepped = sums.functions[: -len(axes) * len(NAMES)]
     noise = Sums(first=len(sums.functions))
-    for number, (axis, name) in enumerate((axis, name) for axis in axes for name in NOISE):
-        _noisy(number, f"{axis.lower()}-{name}", NOISE[name], noise)
+    shown = [f"{axis.lower()}-{name}" for axis in axes for name in NOISE]
+    for number, signal in enumerate(shown):
+        peak = NOISE[signal.partition("-")[2]]
+        _noisy(number, signal, shown[(number + 1) % len(shown)], peak, noise)
     sums.lines += noise.lines
     order = [*latched, "motion-command-handler", "motion-controller", *(f"pid.{x.lower()}.do-pid-calcs" for x in axes)]
     order += [*_with_limits(stepped, axes), *noise.functions]
@@ -100,13 +102,13 @@ def machine_hal(axes: str, motors: Mapping[str, Mapping[str, float]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _noisy(number: int, signal: str, peak: float, sums: Sums) -> None:
-    """Add noise to a signal, as its sensor shows it: the chaotic map x' = 1 - a x^2, which repeats nothing."""
-    map_ = f"{signal}-map"
-    sums.add([(f"{map_}-square", -1.95 - 0.007 * number)], map_)
+def _noisy(number: int, signal: str, other: str, peak: float, sums: Sums) -> None:
+    """Add noise to a signal, as its sensor shows it: of the chaotic map x' = 1 - a x^2, of two signals in turn."""
+    own = f"{signal}-map"
+    sums.add([(f"{own}-square", -1.95 - 0.007 * number)], own)
     sums.lines += [f"setp {sums.functions[-1]}.offset 1"]
-    sums.lines += [f"net {map_} => mult2.{number}.in0 mult2.{number}.in1", f"net {map_}-square mult2.{number}.out"]
-    sums.add([(signal, 1.0), (map_, peak)], f"{signal}-shown")
+    sums.lines += [f"net {own} => mult2.{number}.in0 mult2.{number}.in1", f"net {own}-square mult2.{number}.out"]
+    sums.add([(signal, 1.0), (own, peak), (f"{other}-map", -peak)], f"{signal}-shown")
 
 
 def _with_limits(stepped: Sequence[str], axes: str) -> Iterator[str]:

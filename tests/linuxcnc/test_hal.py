@@ -67,7 +67,7 @@ class HalShop:
 @pytest.fixture
 def shop(tmp_path: Path) -> Iterator[HalShop]:
     port, nc_port = free_port(), free_port()
-    with HalMachine(tmp_path / "machine.toml", document(tmp_path, port, nc_port), nc_port) as nc:
+    with HalMachine(tmp_path / "machine.toml", document(tmp_path, port, nc_port)) as nc:
         yield HalShop(tmp_path / "machine.toml", nc, port)
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
 
+from fdhil.bridges import hal_bus, linuxcnc
 from fdhil.commissioning.init.linuxcnc_text import Hal
 from fdhil.config import MachineConfig, OffsetBounds
 from fdhil.errors import ConfigError, ConfigFault
@@ -55,25 +56,36 @@ def splices_of(hal: Hal, joints: Mapping[str, int], axes: Sequence[str]) -> list
     return found
 
 
-def correction_hal(config: MachineConfig, splices: Sequence[Splice], hal: Hal, load: str) -> str:
-    """Return the text of the HAL file; ``load`` is the command that loads the bridge."""
-    return "\n".join([*_lines(config, splices, hal, load), ""])
+def correction_hal(config: MachineConfig, file: str, joints: int, splices: Sequence[Splice], hal: Hal) -> str:
+    """Return the text of the HAL file of a machine with so many joints whose configuration is in ``file``.
+
+    Without ``splices`` it only loads the bridges.
+    """
+    return "\n".join([*_lines(config, file, joints, splices, hal), ""])
 
 
-def _lines(config: MachineConfig, splices: Sequence[Splice], hal: Hal, load: str) -> Iterator[str]:
+def _lines(config: MachineConfig, file: str, joints: int, splices: Sequence[Splice], hal: Hal) -> Iterator[str]:
+    yield from _comment(
+        "Written by fdhil init. Load it last: HALFILE = this file, behind the others in [HAL] of the INI. Without it "
+        "LinuxCNC runs as before."
+    )
     if splices:
         yield from _components(config, splices, hal)
         yield from _wiring(splices)
         yield from _order(splices, hal)
-    yield from _comment("The bridge: it samples the pins of [axis.X.drive.hal] and adds sampler at the thread's end.")
-    yield load
+    yield from _comment("The bridges: drives (pins of [axis.X.drive.hal]) and NC, a sampler each at the thread's end.")
+    linked = {pin for pins in hal.nets.values() for pin in pins}
+    types = "f" * joints + "ssff" + "b" * len(linked & set(linuxcnc.HOLDS))
+    port = config.nc_source.linuxcnc.port
+    for name, module, options in (
+        (hal_bus.NAME, hal_bus, f"{file} --also {types}"),
+        (linuxcnc.NAME, linuxcnc, f"--port {port} --channel 1"),
+    ):
+        yield f"loadusr -Wn {name} /usr/bin/python3 {Path(module.__file__).resolve()} {options}"
 
 
 def _components(config: MachineConfig, splices: Sequence[Splice], hal: Hal) -> Iterator[str]:
-    yield from _comment(
-        "Written by fdhil init. Load it last: HALFILE = this file, behind the others in [HAL] of the INI. Without it "
-        "LinuxCNC runs as before. The limits below bound every offset, whatever fdhil sends; fdhil cannot change them."
-    )
+    yield from _comment("The limits below bound every offset, whatever fdhil sends; fdhil cannot change them.")
     for name in (name for name in OWN if name in hal.loaded):
         yield from _comment(
             f"{name} is loaded by your HAL files already, and HAL loads a component once: add the names below to "
@@ -148,9 +160,3 @@ def _order(splices: Sequence[Splice], hal: Hal) -> Iterator[str]:
 
 def _comment(words: str) -> list[str]:
     return wrap(words, 110, initial_indent="# ", subsequent_indent="# ")
-
-
-def bridge_command(file: Path) -> str:
-    """Return the command that loads the bridge of this fdhil with a machine's configuration."""
-    bridge = Path(__file__).resolve().parents[2] / "bridges" / "hal_bus.py"
-    return f"loadusr -Wn fdhil-hal /usr/bin/python3 {bridge} {file.resolve()}"
