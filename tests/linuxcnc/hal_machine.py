@@ -30,7 +30,7 @@ from tests.linuxcnc.hal_plant import (
 )
 from tests.linuxcnc.machine import LinuxCnc
 
-LEAD_CYCLES = 60  # a computer that tests run on is busy
+LEAD_CYCLES = 150  # a computer that tests run on is busy
 
 
 def plant_hal(axes: str) -> Hal:
