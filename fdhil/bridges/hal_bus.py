@@ -19,6 +19,7 @@ Standard library and LinuxCNC's ``hal`` module only.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import signal
 import socket
 import struct
@@ -26,7 +27,6 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
@@ -88,13 +88,14 @@ def read_axes(document: Mapping[str, Any]) -> list[Axis]:
         own = drive["hal"]
         sign, turn = drive.get("sign", 1), drive.get("increments_per_rev", 1_000_000)
         current_a = own.get("current_a_per_unit", 1.0)
-        if "torque" in own:
+        if "current" not in own:
             current_a = own.get("torque_nm_per_unit", 1.0) / table["nominal"]["K"]
         position_mm = own.get("position_mm_per_unit", 1.0)
         scales = {"position": position_mm, "speed": own.get("speed_mm_s_per_unit", 1.0), "current": current_a}
         scales["voltage"] = own.get("voltage_v_per_unit", 1.0)
         pins = {key: pin for key, pin in own.items() if isinstance(pin, str) and key != "voltage_is"}
-        pins["current"] = pins.pop("torque", pins.get("current", ""))
+        torque = pins.pop("torque", "")
+        pins.setdefault("current", torque)
         pins.setdefault("enabled", "motion.motion-enabled")
         per_mm = sign * turn / table["screw_pitch_mm"]
         commanded, corrected = own.get("voltage_is") == "commanded", "correction" in table
@@ -167,8 +168,8 @@ class OffsetQueue:
     """Places offsets on servo cycles: which rows go into the streamer now. Pure.
 
     The streamer hands one row to HAL in each cycle. A row's number comes back through the sampler, so that the cycle of
-    every later row is known. ``rows`` are (number, offsets in HAL's unit of each axis); before the first answer the queue is
-    primed with zeros. A cycle whose offset did not come keeps the one before; what comes too late is dropped.
+    every later row is known. ``rows`` are (number, offsets in HAL's unit of each axis); before the first answer the
+    queue is primed with zeros. A cycle whose offset did not come keeps the one before; what comes too late is dropped.
     """
 
     def __init__(self, axes: Sequence[Axis], lead: int) -> None:
@@ -288,10 +289,8 @@ class Hub:
 
     def received(self) -> list[tuple[int, bytes]]:
         """Admit clients and return the frames that they sent."""
-        try:
+        with contextlib.suppress(OSError):  # nobody waits
             self._clients.append(Client(self._door.accept()[0]))
-        except OSError:  # nobody waits
-            pass
         frames = []
         for client in self._clients:
             for words in client.commands():
@@ -376,7 +375,7 @@ class HalSampler:
         self._stream = hal.stream(component, hal.sampler_base + channel, types)
 
     def cycles(self) -> Iterator[tuple[int, list[dict[str, float]], int, bool]]:
-        """Yield of each cycle since the last call: its number, the axes' values, the streamer's row, whether it ran empty."""
+        """Yield of each cycle since the last call its number, the axes' values, the streamer's row, whether it is empty."""
         while self._stream.readable:
             row = self._stream.read()
             if row is None:

@@ -18,8 +18,8 @@ from fdhil.errors import ConfigError, ConfigFault, OutputError
 if TYPE_CHECKING:
     from fdhil.commissioning.init.draft import Asked, Draft
     from fdhil.commissioning.init.drives import FoundBus
-    from fdhil.commissioning.init.making import Look
     from fdhil.commissioning.init.linuxcnc import Machine
+    from fdhil.commissioning.init.making import Look
     from fdhil.commissioning.init.told import Told
 
 SCHEMA = "fdhil-init-1"

@@ -88,7 +88,7 @@ class HalPins(Section):
     position_feedback: HalPin = Field(description="measured position, before any offset is subtracted")
     speed: HalPin | None = Field(None, description="measured speed; left out: differences of the measured position")
     current: HalPin | None = Field(None, description="motor current, or the current command of an analogue drive")
-    torque: HalPin | None = Field(None, description="in place of current: motor torque, divided by nominal.K")
+    torque: HalPin | None = Field(None, description="where there is no current: motor torque, divided by nominal.K")
     voltage: HalPin | None = Field(None, description="motor voltage, or the duty of the PWM; left out: without voltage")
     enabled: HalPin | None = Field(None, description="true while the drive is enabled; left out: motion.motion-enabled")
     position_mm_per_unit: Positive = Field(1.0, description="of command and feedback: 25.4 where they are in inch")
@@ -102,8 +102,8 @@ class HalPins(Section):
 
     @model_validator(mode="after")
     def _has_current(self) -> HalPins:
-        if (self.current is None) == (self.torque is None):
-            raise ValueError("name the pin of the current or that of the torque, and not both")
+        if self.current is None and self.torque is None:
+            raise ValueError("name the pin of the current or that of the torque: without both nothing is identified")
         for key in ("speed", "current", "torque", "voltage"):
             if not any(k.startswith(f"{key}_") and getattr(self, k) == 0 for k in type(self).model_fields):
                 continue
@@ -136,14 +136,20 @@ class Drive(Section):
     @classmethod
     def _hal_defaults(cls, given: Any) -> Any:
         """Fill in what HAL leaves no choice of: its profile, and set-points that act in their own cycle."""
-        if isinstance(given, dict) and given.get("source") == "hal":
-            return {"profile": "hal", "setpoint_delay_cycles": 0, "increments_per_rev": HAL_INCREMENTS, **given}
+        if isinstance(given, dict) and given.get("source", "hal" if "hal" in given else "") == "hal":
+            return {
+                "source": "hal",
+                "profile": "hal",
+                "setpoint_delay_cycles": 0,
+                "increments_per_rev": HAL_INCREMENTS,
+                **given,
+            }
         return given
 
     @model_validator(mode="after")
     def _hal_pins(self) -> Drive:
-        if (self.source == "hal") != (self.hal is not None):
-            raise ValueError('source = "hal" and the table drive.hal go together')
+        if self.source == "hal" and self.hal is None:
+            raise ValueError('source = "hal" needs the table drive.hal with its pins')
         if self.source == "hal" and self.profile != "hal":
             raise ValueError(f'source = "hal" has profile "hal", not {self.profile}')
         return self

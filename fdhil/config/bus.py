@@ -59,8 +59,7 @@ class CanBus(Section):
         0,
         ge=0,
         le=200,
-        description="HAL: by how many cycles offsets are sent ahead into the streamer; 20 where the bridge is on the PC "
-        "of LinuxCNC. CANopen: 0",
+        description="by how many cycles offsets are sent ahead: HAL (streamer) 20 or more, CANopen 0",
     )
     options: Mapping[str, bool | Whole | Finite | str] = Field(
         {}, description="python-can: what its interface takes besides, e.g. { tty_baudrate = 3000000 }"

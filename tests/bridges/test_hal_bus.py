@@ -34,7 +34,7 @@ VALUE = {"position_command": 10.0, "position_feedback": 9.9, "current": 2.0, "en
 
 
 def document(**hal: Any) -> dict[str, Any]:
-    drive = {"source": "hal", "bus": "hal", "hal": PINS | hal}
+    drive = {"source": "hal", "bus": "hal", "hal": {k: v for k, v in (PINS | hal).items() if v is not None}}
     axis = {"screw_pitch_mm": 20.0, "nominal": {"K": 0.8}, "correction": {}}
     return {"machine": {}, "axis": {"X": {**axis, "drive": drive}, "Y": {**axis, "drive": drive}, "A": {}}}
 
@@ -96,7 +96,7 @@ class Streamer:
         self.seen: dict[int, float] = {}
 
     def run(self, cycles: int, offset: Mapping[int, int] | None = None, late: int = 3) -> None:
-        """Run cycles; the SYNC of each is answered ``late`` cycles later with the increments for the cycle it acts in."""
+        """Run cycles; the SYNC of each is answered ``late`` cycles later, by the increments for when it acts."""
         for _ in range(cycles):
             self.cycle += 1
             empty = not self.waiting
@@ -125,7 +125,7 @@ def test_a_missing_answer_keeps_the_offset_before() -> None:
     streamer = Streamer()
     streamer.run(200, {})
     for cycle in range(1201, 1260):
-        streamer.run(1, {k: 500 for k in range(1150, 1400)} if cycle % 2 else None)
+        streamer.run(1, dict.fromkeys(range(1150, 1400), 500) if cycle % 2 else None)
     assert round(streamer.applied * 50_000) == 500
     assert streamer.queue.restarts == 0
 
@@ -136,7 +136,7 @@ def test_silence_runs_the_streamer_empty_and_the_next_answers_start_again_in_ste
     streamer.run(SYNC_RANGE)  # nobody answers
     assert not streamer.waiting
     assert not streamer.queue.running
-    wanted = {cycle: 700 for cycle in range(1600, 1700)}
+    wanted = dict.fromkeys(range(1600, 1700), 700)
     streamer.run(400, wanted)
     assert {c for c, mm in streamer.seen.items() if mm} == set(wanted)
 
@@ -167,7 +167,7 @@ odrive float OUT 0 odrive.0.iq
 )
 def test_a_bad_pin_is_refused_with_its_key_and_name(pin: str, text: str) -> None:
     pins = {each.name: each for each in map(Pin, PIN_LINES.splitlines()) if each.name}
-    with pytest.raises(PinError, match="^axis.X.drive.hal.current: ") as refused:
+    with pytest.raises(PinError, match=r"^axis\.X\.drive\.hal\.current: ") as refused:
         _require(pin, pins, FUNCTIONS, "axis.X.drive.hal.current", "float")
     assert text in str(refused.value)
     for good in ("pid.y.output", "encoder.0.position"):

@@ -58,7 +58,7 @@ net x-out pid.x.output => hm2_7i92.0.7i77.0.1.analogout0
 net z-cmd joint.1.motor-pos-cmd => hm2_7i92.0.stepgen.01.position-cmd
 net z-fb hm2_7i92.0.stepgen.01.position-fb => joint.1.motor-pos-fb
 """
-AXIS = {
+AXIS: dict[str, Any] = {
     "screw_pitch_mm": 5.0,
     "nominal": {"R": 0.5, "L": 0.005, "K": 0.4, "Jt": 0.002, "ft": 0.001, "Cd": 0.2},
     "regulators": {"current_limit_a": 20.0, "voltage_limit_v": 100.0},
@@ -105,7 +105,7 @@ def test_pins_and_gains_are_taken_from_the_files(tmp_path: Path) -> None:
 
 
 def test_a_pid_that_commands_current_has_its_gains_converted(tmp_path: Path) -> None:
-    x = {"regulators": {**AXIS["regulators"], "pid_output": "current"}}  # type: ignore[dict-item]
+    x: dict[str, Any] = {"regulators": {**AXIS["regulators"], "pid_output": "current"}}
     x["drive"] = {"hal": {"current": "pid.x.output", "current_a_per_unit": 3.0}}
     _, config = made(tmp_path, machine(tmp_path), answers(**x))
     loop = config.axis["X"].regulators

@@ -7,6 +7,7 @@ import socket
 import struct
 import threading
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
@@ -134,8 +135,9 @@ class HalTrace:
         self._wire.close()
 
     def _read(self) -> None:
-        while came := self._wire.recv(1 << 20):
-            self._came.append(came)
+        with suppress(ConnectionError):  # the bridge lets go what was not read yet
+            while came := self._wire.recv(1 << 20):
+                self._came.append(came)
 
     def rows_mm(self) -> tuple[Float, Float, Float]:
         """Return demand, position and applied offset (n, axes) in mm of each servo cycle that came whole."""

@@ -33,8 +33,8 @@ class LinuxCnc:
     """LinuxCNC, switched on and homed at 0; leaving the with block ends it.
 
     ``hal`` are more lines of its HAL file, such as the one that loads the bridge; ``base`` is another HAL file than
-    that of joints without drives, and ``beside`` are files that it finds in its folder. AssertionError in LinuxCNC's own
-    words when it does not do its part.
+    that of joints without drives, and ``beside`` are files that it finds in its folder. AssertionError in LinuxCNC's
+    own words when it does not do its part.
     """
 
     def __init__(

@@ -54,7 +54,7 @@ class HalShop:
         return fdhil("status", self.file)
 
     def trace(self, cut: Callable[[], None]) -> tuple[Float, Float, Float]:
-        """Return demand, position and applied offset (n, 2) in mm from the first motion of ``cut`` to 0.3 s after it."""
+        """Return demand, position and applied offset (n, 2) in mm, from the first motion of ``cut`` on."""
         with HalTrace(self.port, 2) as trace:
             cut()
             time.sleep(0.5)  # the trace is of what LinuxCNC does, in real time

@@ -6,6 +6,7 @@ It shares no code with the model: other integration, other order of work, positi
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -122,8 +123,8 @@ class SlowDrive:
         error = math.copysign(max(0.0, abs(error) - dead), error)
         if error * self.saturated <= 0:
             self.error_sum += error * t
-        slopes = [(a - b) / t for a, b in zip(r, r[1:], strict=False)]
-        bends = [(a - b) / t for a, b in zip(slopes, slopes[1:], strict=False)]
+        slopes = [(a - b) / t for a, b in pairwise(r)]
+        bends = [(a - b) / t for a, b in pairwise(slopes)]
         jerk = (bends[0] - bends[1]) / t
         closing = slopes[0] - (measured - self.measured) / t
         self.measured = measured

@@ -1,4 +1,4 @@
-"""Writes the HAL file that adds fdhil's offsets between LinuxCNC's motion controller and the drives, and loads the bridge.
+"""Writes the HAL file that adds offsets between LinuxCNC's motion controller and the drives, and loads the bridges.
 
     streamer -> limit3 -> offset, between joint.N.motor-pos-cmd and what it commanded; the feedback to the joint less it
     heartbeat of the bridge -> oneshot, motion.motion-enabled, streamer not empty -> lut5 -> limit3.enable
@@ -81,7 +81,7 @@ def _lines(config: MachineConfig, file: str, joints: int, splices: Sequence[Spli
         (hal_bus.NAME, hal_bus, f"{file} --also {types}"),
         (linuxcnc.NAME, linuxcnc, f"--port {port} --channel 1"),
     ):
-        yield f"loadusr -Wn {name} /usr/bin/python3 {Path(module.__file__).resolve()} {options}"
+        yield f"loadusr -Wn {name} /usr/bin/python3 {Path(str(module.__file__)).resolve()} {options}"
 
 
 def _components(config: MachineConfig, splices: Sequence[Splice], hal: Hal) -> Iterator[str]:
@@ -100,7 +100,7 @@ def _components(config: MachineConfig, splices: Sequence[Splice], hal: Hal) -> I
     for splice in splices:
         axis, name = config.axis[splice.axis], f"fdhil-limit-{splice.axis.lower()}"
         pins = axis.drive.hal
-        assert axis.correction is not None and pins is not None  # those alone are spliced
+        assert pins is not None  # those alone are spliced
         unit, per_mm = pins.position_mm_per_unit, axis.scaling.increments_per_mm
         offset, rate, acceleration, *_ = OffsetBounds.of(axis, period_s).whole
         yield from _comment(

@@ -56,9 +56,9 @@ def propose_axis(hal: Hal, axis: str, joint: int, unit_mm: float, running: Colle
     for loop in hal.loops_behind(command)[:1]:
         made.told |= {f"regulators.{key}": told for key, told in _gains(hal.given, loop, unit_mm)}
         made.notes.append(
-            f"axis {axis}: HAL's {loop} closes the position loop. Its output is taken for a speed in units/s; where the "
-            f"drive takes it for a current set regulators.pid_output = 'current' and drive.hal.current = '{loop}.output' "
-            "(docs/how-to/hal-mesa.md has the gains for it)"
+            f"axis {axis}: HAL's {loop} closes the position loop. Its output is taken for a speed in units/s; where "
+            "the drive takes it for a current set regulators.pid_output = 'current' and drive.hal.current = "
+            f"'{loop}.output' (docs/how-to/hal-mesa.md has the gains for it)"
         )
     return made
 
@@ -114,6 +114,7 @@ def current_gains(told: Mapping[str, Any], a_per_unit: float, unit_mm: float, pi
     if derivative <= 0.0:
         raise ValueError("a pid that commands current needs a Dgain")
     speed_kp = derivative * abs(a_per_unit) / unit_mm * pitch_mm / (2 * math.pi)
+    scaled: tuple[str, ...]
     scaled = ("position_gain_per_s", "position_ki_per_s2", "position_feedforward_per_s", "speed_feedforward")
     scaled += ("acceleration_feedforward_s", "jerk_feedforward_s2", "output_limit_mm_s")
     found = {key: rounded(float(told[key]) / derivative) for key in scaled if key in told}
