@@ -355,9 +355,11 @@ class HalSampler:
             self._places.append({key: wanted.setdefault(pin, len(wanted)) for key, pin in pins.items()})
         if self.corrected:
             self._shared = [wanted.setdefault(pin, len(wanted)) for pin in ("streamer.0.pin.0", "streamer.0.empty")]
-        if len(wanted) > MOST_PINS:
-            raise PinError(f"{len(wanted)} pins are more than the {MOST_PINS} of one sampler; leave out speed pins")
-        types = "".join(HAL_TYPES[kinds[pin].kind] for pin in wanted)
+        if len(wanted) >= MOST_PINS:
+            raise PinError(
+                f"{len(wanted)} pins are too many for one sampler, which has {MOST_PINS}; leave out speed pins"
+            )
+        types = "".join(HAL_TYPES[kinds[pin].kind] for pin in wanted) + "s"
         if not hal.component_exists("sampler"):
             depths, kinds_of_all = [str(DEPTH)] * (1 + len(more)), [types, *more]
             _halcmd("loadrt", "sampler", f"depth={','.join(depths)}", f"cfg={','.join(kinds_of_all)}")
@@ -369,20 +371,21 @@ class HalSampler:
                 "=>",
                 f"sampler.{channel}.pin.{place}",
             )
+        _halcmd("net", "fdhil-lost", f"sampler.{channel}.overruns", "=>", f"sampler.{channel}.pin.{len(wanted)}")
         threads = _halcmd("-s", "show", "thread")
         if f"sampler.{channel}" not in threads.split():
             _halcmd("addf", f"sampler.{channel}", thread)
         self._stream = hal.stream(component, hal.sampler_base + channel, types)
 
     def cycles(self) -> Iterator[tuple[int, list[dict[str, float]], int, bool]]:
-        """Yield of each cycle since the last call its number, the axes' values, the streamer's row, whether it is empty."""
+        """Yield each new cycle: its number, the axes' values, the streamer's row, whether the streamer is empty."""
         while self._stream.readable:
             row = self._stream.read()
             if row is None:
                 return
             values = [{key: row[place] for key, place in places.items()} for places in self._places]
             applied, empty = (row[k] for k in self._shared) if self.corrected else (0, True)
-            yield self._stream.sampleno, values, applied, empty
+            yield self._stream.sampleno + row[-1], values, applied, empty  # what was lost has no number of its own
 
 
 class Pin:

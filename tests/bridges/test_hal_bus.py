@@ -159,7 +159,7 @@ odrive float OUT 0 odrive.0.iq
     ("pin", "text"),
     [
         ("pid.z.output", "HAL has no pin pid.z.output; no component pid.z is loaded"),
-        ("pid.y.outptu", "pid.y has pid.y.output"),
+        ("pid.y.outputs", "pid.y has pid.y.output"),
         ("pid.y.saturated", "is of type bit"),
         ("pid.x.output", "function pid.x.do-pid-calcs is in no thread"),
         ("odrive.0.iq", "runs in userspace"),

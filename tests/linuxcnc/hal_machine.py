@@ -34,10 +34,10 @@ from tests.linuxcnc.machine import LinuxCnc
 LEAD_CYCLES = 150  # a computer that tests run on is busy
 
 
-def plant_hal(axes: str) -> Hal:
+def plant_hal(text: str) -> Hal:
     """Return what the HAL file of the plant says."""
     hal = Hal()
-    parse_hal(machine_hal(axes, dict.fromkeys(axes, MOTOR)), Ini({}), lambda _name: "", hal)
+    parse_hal(text, Ini({}), lambda _name: "", hal)
     return hal
 
 
@@ -75,7 +75,7 @@ def document(folder: Path, bus_port: int, nc_port: int, axes: str = "XY", **corr
         "current_ki": CURRENT_KI,
         "voltage_limit_v": 300.0,
     }
-    hal = plant_hal(axes)
+    hal = plant_hal(machine_hal(axes, dict.fromkeys(axes, MOTOR)))
     limits = {"max_offset_um": 250.0, "max_speed_mm_s": 20.0, "max_acceleration_mm_s2": 1000.0}
     axis = {
         "screw_pitch_mm": PITCH_MM,
@@ -104,14 +104,24 @@ def document(folder: Path, bus_port: int, nc_port: int, axes: str = "XY", **corr
 class HalMachine(LinuxCnc):
     """LinuxCNC with the plant, fdhil's offsets spliced in, and both bridges."""
 
-    def __init__(self, file: Path, text: dict[str, Any], axes: str = "XY") -> None:
+    def __init__(self, file: Path, text: dict[str, Any], motors: Mapping[str, Mapping[str, float]]) -> None:
         file.write_text(to_toml(text))
-        config, hal = machine_config.load(file), plant_hal(axes)
-        base = machine_hal(axes, dict.fromkeys(axes, MOTOR))
+        axes = "".join(motors)
+        base = machine_hal(axes, motors)
+        config, hal = machine_config.load(file), plant_hal(base)
         splices = splices_of(hal, {letter: joint for joint, letter in enumerate(axes)}, axes)
         text_of_hal = correction_hal(config, "{folder}/machine.toml", len(axes), splices, hal)
         beside = {"fdhil.hal": text_of_hal, "machine.toml": file.read_text()}
         super().__init__(axes=axes, base=base, hal="source fdhil.hal\n", beside=beside)
+
+    def pid_of(self, program: str) -> int:
+        """Return the process of this machine that runs a program."""
+        for place in Path("/proc").glob("[0-9]*/cmdline"):
+            with suppress(OSError):
+                words = place.read_bytes().decode().split("\0")
+                if program in words and any(str(self.folder) in word for word in words):
+                    return int(place.parent.name)
+        raise AssertionError(f"{program} does not run")
 
 
 class HalTrace:

@@ -13,6 +13,11 @@ import numpy as np
 from scipy.linalg import expm
 
 MOTOR = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
+# not what the data sheet says, heavier, and with friction of two directions ("Cd_back": toward minus)
+OTHERS = {
+    "X": {"R": 0.6, "L": 0.006, "K": 0.76, "Jt": 0.09, "ft": 0.08, "Cd": 6.0, "Cd_back": 4.5},
+    "Y": {"R": 0.45, "L": 0.0045, "K": 0.85, "Jt": 0.065, "ft": 0.03, "Cd": 3.0, "Cd_back": 4.0},
+}
 CURRENT_KP, CURRENT_KI = 12.566, 1256.64
 PITCH_MM, PERIOD_S = 20.0, 0.001
 SPEED_KP, POSITION_GAIN = 23.562, 50.0  # A.s/rad, 1/s
@@ -127,7 +132,7 @@ def _axis(joint: int, x: str, motor: Mapping[str, float], sums: Sums) -> Iterato
     sums.add([(inputs[k], float(free[k])) for k in (0, 1, 2, 4)], f"{x}-stopping")
     yield f"net {x}-stopping => limit1.{joint}.in"
     yield f"net {x}-friction limit1.{joint}.out"
-    yield f"setp limit1.{joint}.min {-motor['Cd']}"
+    yield f"setp limit1.{joint}.min {-motor.get('Cd_back', motor['Cd'])}"
     yield f"setp limit1.{joint}.max {motor['Cd']}"
     for state, name in enumerate(NAMES):
         if state == SPEED:

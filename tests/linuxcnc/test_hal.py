@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import socket
 import struct
 import time
@@ -23,7 +25,7 @@ from fdhil.prediction import contour_error_um
 from fdhil.records import Float
 from tests.linuxcnc.beside import SHUTTLE, TRIES, fdhil, record, repeated, until
 from tests.linuxcnc.hal_machine import LEAD_CYCLES, HalMachine, HalTrace, document
-from tests.linuxcnc.hal_plant import MOTOR, PITCH_MM
+from tests.linuxcnc.hal_plant import MOTOR, OTHERS, PITCH_MM
 from tests.ports import free_port
 
 pytestmark = pytest.mark.debian
@@ -39,6 +41,10 @@ G1 X20 Y20
 G1 X0 Y0
 M2
 """
+PLANTS: dict[str, tuple[dict[str, dict[str, float]], float]] = {  # and by how much the contour error falls at least
+    "benign": (dict.fromkeys("XY", MOTOR), 10.0),
+    "realistic": (OTHERS, 4.0),
+}
 PER_MM = HAL_INCREMENTS / PITCH_MM
 
 
@@ -65,9 +71,14 @@ class HalShop:
 
 
 @pytest.fixture
-def shop(tmp_path: Path) -> Iterator[HalShop]:
+def plant() -> str:
+    return "benign"
+
+
+@pytest.fixture
+def shop(tmp_path: Path, plant: str) -> Iterator[HalShop]:
     port, nc_port = free_port(), free_port()
-    with HalMachine(tmp_path / "machine.toml", document(tmp_path, port, nc_port)) as nc:
+    with HalMachine(tmp_path / "machine.toml", document(tmp_path, port, nc_port), PLANTS[plant][0]) as nc:
         yield HalShop(tmp_path / "machine.toml", nc, port)
 
 
@@ -75,7 +86,9 @@ def rms(values: Float) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def test_the_second_cut_is_corrected_by_hal_pins_alone(shop: HalShop, tmp_path: Path) -> None:
+@pytest.mark.parametrize("plant", PLANTS)
+def test_the_second_cut_is_corrected_by_hal_pins_alone(shop: HalShop, plant: str, tmp_path: Path) -> None:
+    motors, least_gain = PLANTS[plant]
     fdhil("commission", shop.file, "--yes")
     part = tmp_path / "part.csv"
     with ExitStack() as stack:
@@ -86,9 +99,9 @@ def test_the_second_cut_is_corrected_by_hal_pins_alone(shop: HalShop, tmp_path: 
         until((run_directory / SOCKET_NAME).exists)
         shop.nc.run(SHUTTLE)
         until(lambda: all(axis["accepted"] >= 4 for axis in shop.status()["axes"].values()))
-        for axis in shop.status()["axes"].values():
-            found = {name: told["value"] for name, told in axis["parameters"].items()}
-            assert found == pytest.approx(MOTOR, rel=0.02)
+        for name, axis in shop.status()["axes"].items():
+            for symbol in ("R", "L", "K", "Jt"):
+                assert axis["parameters"][symbol]["value"] == pytest.approx(motors[name][symbol], rel=0.03), symbol
         for tried in range(1, TRIES + 1):
             demand, position, _ = shop.trace(lambda: record(shop.file, part, lambda: shop.nc.run(PART)))
             before = rms(contour_error_um(demand, position, 0.001))
@@ -101,22 +114,22 @@ def test_the_second_cut_is_corrected_by_hal_pins_alone(shop: HalShop, tmp_path: 
         assert shop.status()["counters"]["lost"] == 0
     first = int(np.flatnonzero(np.abs(offset).max(axis=1) > 0)[0])
     assert first == pytest.approx(LEAD_CYCLES, abs=5)
-    assert after < before / 10, (before, after)
+    assert after < before / least_gain, (before, after)
 
 
 class Nonsense:
     """A client of the bridge that sends offsets as it likes."""
 
     def __init__(self, port: int) -> None:
-        self._wire = socket.create_connection(("127.0.0.1", port))
-        self._wire.sendall(b"< open hal >< rawmode >")
-        self._rest = b""
+        self.wire = socket.create_connection(("127.0.0.1", port))
+        self.wire.sendall(b"< open hal >< rawmode >")
+        self.rest = b""
 
     def run(self, cycles: int, offset_mm: Callable[[int], float | None]) -> list[float]:
         """Answer so many SYNCs with the offset of X and Y; return what HAL applied to X in each cycle, mm."""
         applied: list[float] = []
         while len(applied) < cycles:
-            *pieces, self._rest = (self._rest + self._wire.recv(1 << 16)).split(b">")
+            *pieces, self.rest = (self.rest + self.wire.recv(1 << 16)).split(b">")
             for words in (piece.split() for piece in pieces):
                 if len(words) < 5 or words[1] != b"frame":
                     continue
@@ -127,11 +140,11 @@ class Nonsense:
                 if offset is not None:
                     frame = struct.pack("<iB", round(offset * PER_MM), data[0]).hex(" ")
                     for node in (1, 2):
-                        self._wire.sendall(f"< send {hal_bus.RPDO2 + node:03X} 5 {frame} >".encode())
+                        self.wire.sendall(f"< send {hal_bus.RPDO2 + node:03X} 5 {frame} >".encode())
         return applied
 
     def close(self) -> None:
-        self._wire.close()
+        self.wire.close()
 
 
 @pytest.fixture
@@ -168,3 +181,26 @@ def test_hal_brings_the_offset_to_zero(shop: HalShop, nonsense: Nonsense, fault:
     else:
         left = nonsense.run(1500, lambda _cycle: None)
     assert set(left[-200:]) == {0.0}
+
+
+def syncs(client: Nonsense, count: int) -> list[tuple[int, int]]:
+    """Return cycle (by the stamp) and counter of the next SYNCs."""
+    found: list[tuple[int, int]] = []
+    while len(found) < count:
+        *pieces, client.rest = (client.rest + client.wire.recv(1 << 16)).split(b">")
+        for words in (piece.split() for piece in pieces):
+            if len(words) == 5 and words[2] == b"080":
+                found.append((round(float(words[3]) * 1000), int(words[4], 16)))
+    return found
+
+
+def test_samples_that_found_no_room_are_a_hole_of_their_size(shop: HalShop, nonsense: Nonsense) -> None:
+    bridge = shop.nc.pid_of(hal_bus.__file__)
+    before = syncs(nonsense, 100)
+    os.kill(bridge, signal.SIGSTOP)
+    time.sleep(1.3 * hal_bus.DEPTH / 1000)  # longer than the sampler has room for
+    os.kill(bridge, signal.SIGCONT)
+    seen = np.array(before + syncs(nonsense, hal_bus.DEPTH + 1000))
+    cycles, counters = np.diff(seen[:, 0]), np.diff(seen[:, 1]) % hal_bus.SYNC_RANGE
+    assert np.count_nonzero(cycles > 1) == 1
+    assert (cycles % hal_bus.SYNC_RANGE == counters).all()
