@@ -39,7 +39,7 @@ MOST_PINS = 20  # of one channel of the sampler
 MOST_WAITING = 8 << 20  # bytes that a client may be behind
 MOST_COMMAND = 4096
 SYNC_RANGE = 240  # of the SYNC counter, 1 to 240
-GUARD_SILENT_S = 0.05
+GUARD_SILENT_S = 0.05  # beyond the lead
 ENABLED, DISABLED = 0x1237, 0x0250  # statuswords: operation enabled and following, switch on disabled
 POSITION_MODE = 8
 MODE_EVERY = 10
@@ -447,7 +447,8 @@ class Bridge:
         if self._queue is not None:
             _halcmd("net", "fdhil-beat", f"{NAME}.heartbeat", "=>", "fdhil-watchdog.in")
             self._streamer = hal.stream(component, hal.streamer_base, "s" + "f" * len(corrected))
-        self._guard_s = -GUARD_SILENT_S
+        self._silent_s = GUARD_SILENT_S + lead * self.axes[0].period_s
+        self._guard_s = -self._silent_s
         self._started_s = time.time()
 
     def turn(self) -> None:
@@ -468,7 +469,7 @@ class Bridge:
             for number, offsets in self._queue.rows():
                 if self._streamer.writable:
                     self._streamer.write((number, *offsets))
-            if time.monotonic() - self._guard_s < GUARD_SILENT_S:
+            if time.monotonic() - self._guard_s < self._silent_s:
                 self._component["heartbeat"] = not self._component["heartbeat"]
             self._component["dropped"], self._component["restarts"] = self._queue.dropped, self._queue.restarts
 

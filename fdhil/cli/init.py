@@ -44,7 +44,7 @@ NEXT = (
               help="Drives are LinuxCNC's HAL pins: propose them, and write FILE's HAL file besides.")  # fmt: skip
 @click.option("--eds", "places", multiple=True, type=FILE,
               help="EDS or DCF file, or a folder of them; left out: the folder of FILE.")  # fmt: skip
-@click.option("--offline", is_flag=True, help="Look at no bus: what drives would tell is asked.")
+@click.option("--offline", is_flag=True, help="Look at no bus and no running HAL: what they would tell is asked.")
 @click.option("--dry-run", is_flag=True, help="Write no file; print what it would be.")
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
 def init(
@@ -82,7 +82,7 @@ def init(
     nc = read_linuxcnc(ini) if ini is not None else None
     ask = _ask if answers is None and not as_json else None
     if nc is not None and hal:
-        draft = make(file, given, nc, ask, pins=running_pins())
+        draft = make(file, given, nc, ask, pins=[] if offline else running_pins())
     else:
         draft = make(file, given, nc, ask, None if offline else _look(places, file.parent), _can_interface())
     text = conclude(draft, file)

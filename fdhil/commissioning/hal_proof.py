@@ -51,6 +51,9 @@ class HalAxis:
     def __init__(self, config: MachineConfig, axis: str) -> None:
         settings = config.axis[axis]
         self.device = f"axis {axis}"
+        if settings.correction is None:
+            text = f"there is no [axis.{axis}.correction]: no offset may be added, and nothing is to be proven"
+            raise DriveFault(self.device, f"{text}; add that section, and write the HAL file again with fdhil init")
         self.per_mm = settings.scaling.increments_per_mm
         self.bounds = OffsetBounds.of(settings, config.machine.sync_period_s)
         profile, self._node_id = load_profile(settings.drive), config.node_id(axis)

@@ -165,6 +165,7 @@ def test_limit3_holds_whatever_is_sent(shop: HalShop, nonsense: Nonsense) -> Non
     assert np.abs(acceleration).max() <= 1.2 * limits["max_acceleration_mm_s2"] + 4 * rounding / 1e-6
 
 
+@pytest.mark.fault("E8")
 @pytest.mark.parametrize("fault", ["silence", "end", "abort and estop"])
 def test_hal_brings_the_offset_to_zero(shop: HalShop, nonsense: Nonsense, fault: str) -> None:
     nonsense.run(300, lambda _cycle: 0.0)

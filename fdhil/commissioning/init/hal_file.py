@@ -19,7 +19,7 @@ from fdhil.commissioning.init.linuxcnc_text import Hal
 from fdhil.config import MachineConfig, OffsetBounds
 from fdhil.errors import ConfigError, ConfigFault
 
-WATCHDOG_S = 0.05
+WATCHDOG_S = 0.05  # beyond the lead
 ALL_THREE = 0x8  # lut5: in-0 and in-1 and not in-2
 MARGIN = 1.1  # limit3's over the guard's limits: it never acts while the guard does its work
 OWN = ("streamer", "limit3", "offset", "oneshot", "lut5")
@@ -71,7 +71,8 @@ def _lines(config: MachineConfig, file: str, joints: int, splices: Sequence[Spli
     )
     if splices:
         yield from _components(config, splices, hal)
-        yield from _wiring(splices)
+        bus = config.bus[config.axis[splices[0].axis].drive.bus]
+        yield from _wiring(splices, WATCHDOG_S + bus.offset_lead_cycles * config.machine.sync_period_s)
         yield from _order(splices, hal)
     yield from _comment("The bridges: drives (pins of [axis.X.drive.hal]) and NC, a sampler each at the thread's end.")
     linked = {pin for pins in hal.nets.values() for pin in pins}
@@ -113,10 +114,10 @@ def _components(config: MachineConfig, splices: Sequence[Splice], hal: Hal) -> I
             yield f"setp {name}.{key} {value:.9g}"
 
 
-def _wiring(splices: Sequence[Splice]) -> Iterator[str]:
+def _wiring(splices: Sequence[Splice], watchdog_s: float) -> Iterator[str]:
     yield from _comment("Offsets pass while the bridge's heart beats, the machine is on, and the streamer has rows.")
-    for key, value in (("width", WATCHDOG_S), ("retriggerable", 1), ("rising", 1), ("falling", 1)):
-        yield f"setp fdhil-watchdog.{key} {value}"
+    for key, value in (("width", watchdog_s), ("retriggerable", 1), ("rising", 1), ("falling", 1)):
+        yield f"setp fdhil-watchdog.{key} {value:g}"
     yield f"setp fdhil-gate.function {ALL_THREE:#x}"
     yield "net fdhil-alive fdhil-watchdog.out => fdhil-gate.in-0"
     yield "net fdhil-machine-on motion.motion-enabled => fdhil-gate.in-1"
