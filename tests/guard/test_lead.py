@@ -22,11 +22,14 @@ class QueuedDrive(Drive):
 
     waiting: deque[int] = field(default_factory=lambda: deque([0] * LEAD))
     empty: bool = False
+    falling: float | None = None  # by which part of it an offset comes nearer to zero at each SYNC
 
     def at_sync(self, tick: int) -> list[tuple[int, bytes]]:
         received = self.received_offset if self.received_offset is not None else self.waiting[-1]
         self.waiting.append(received)
         self.received_offset = 0 if self.empty else self.waiting[0]
+        if self.falling is not None:
+            self.received_offset = int(self.offset * self.falling)
         self.waiting.popleft()
         frames = [frame for frame in super().at_sync(tick) if frame[0] & 0x780 != 0x380]
         return [*frames, (0x380 + self.node_id, struct.pack("<ii", self.followed or 0, self.offset))]
@@ -77,6 +80,22 @@ def test_a_queue_that_runs_empty_is_seen_and_ramped_down(armed: Bench) -> None:
         drive.empty = True
     armed.until(Mode.RAMP_DOWN, limit=10)
     assert armed.alarms[-1].code in ("EchoMismatch", "OffsetHijack")
+    armed.until(Mode.OFF, limit=600)
+    assert [drive.offset for drive in armed.drives] == [0, 0]
+
+
+def test_a_queue_that_another_writes_to_is_measured_until_it_stands(armed: Bench) -> None:
+    """What HAL takes to zero after an empty queue changes from reading to reading: it is waited for, not frozen."""
+    armed.play()
+    armed.until(Mode.ACTIVE)
+    armed.run(100)
+    held = armed.drives[0].offset
+    assert held
+    for drive in armed.drives:
+        assert isinstance(drive, QueuedDrive)
+        drive.falling = 0.9
+    armed.until(Mode.OFF, limit=600)
+    assert [drive.offset for drive in armed.drives] == [0, 0]
 
 
 @pytest.mark.parametrize("changes", [{"lead": -1}, {"lead": 201}, {"lead": 0}])
