@@ -8,7 +8,9 @@ from dataclasses import dataclass, field, replace
 
 import pytest
 
+from fdhil.config.offset_bounds import TIME_TO_SAFE_S
 from fdhil.errors import ConfigError
+from fdhil.guard.adoption import patience
 from fdhil.guard.protocol import Mode
 from fdhil.guard.settings import LEAD_LAYOUT, AxisSettings, Pdo, from_json, to_json
 from tests.guard.machine import Bench, Drive, bench, settings
@@ -22,14 +24,11 @@ class QueuedDrive(Drive):
 
     waiting: deque[int] = field(default_factory=lambda: deque([0] * LEAD))
     empty: bool = False
-    falling: float | None = None  # by which part of it an offset comes nearer to zero at each SYNC
 
     def at_sync(self, tick: int) -> list[tuple[int, bytes]]:
         received = self.received_offset if self.received_offset is not None else self.waiting[-1]
         self.waiting.append(received)
         self.received_offset = 0 if self.empty else self.waiting[0]
-        if self.falling is not None:
-            self.received_offset = int(self.offset * self.falling)
         self.waiting.popleft()
         frames = [frame for frame in super().at_sync(tick) if frame[0] & 0x780 != 0x380]
         return [*frames, (0x380 + self.node_id, struct.pack("<ii", self.followed or 0, self.offset))]
@@ -84,18 +83,10 @@ def test_a_queue_that_runs_empty_is_seen_and_ramped_down(armed: Bench) -> None:
     assert [drive.offset for drive in armed.drives] == [0, 0]
 
 
-def test_a_queue_that_another_writes_to_is_measured_until_it_stands(armed: Bench) -> None:
-    """What HAL takes to zero after an empty queue changes from reading to reading: it is waited for, not frozen."""
-    armed.play()
-    armed.until(Mode.ACTIVE)
-    armed.run(100)
-    held = armed.drives[0].offset
-    assert held
-    for drive in armed.drives:
-        assert isinstance(drive, QueuedDrive)
-        drive.falling = 0.9
-    armed.until(Mode.OFF, limit=600)
-    assert [drive.offset for drive in armed.drives] == [0, 0]
+def test_an_offset_that_hal_takes_to_zero_is_awaited_before_it_is_judged() -> None:
+    made = settings(lead=LEAD)
+    made = replace(made, axes=tuple(map(ahead, made.axes)))
+    assert patience(made) * made.sync_period_s > TIME_TO_SAFE_S + LEAD * made.sync_period_s
 
 
 @pytest.mark.parametrize("changes", [{"lead": -1}, {"lead": 201}, {"lead": 0}])
