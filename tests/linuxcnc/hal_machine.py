@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import socket
 import struct
 import threading
@@ -31,6 +32,7 @@ from tests.linuxcnc.hal_plant import (
 )
 from tests.linuxcnc.machine import LinuxCnc
 
+RTAPI = "/usr/bin/rtapi_app"
 LEAD_CYCLES = 150  # a computer that tests run on is busy
 
 
@@ -114,14 +116,23 @@ class HalMachine(LinuxCnc):
         beside = {"fdhil.hal": text_of_hal, "machine.toml": file.read_text()}
         super().__init__(axes=axes, base=base, hal="source fdhil.hal\n", beside=beside)
 
-    def pid_of(self, program: str) -> int:
-        """Return the process of this machine that runs a program."""
+    def pids_of(self, program: str) -> list[int]:
+        """Return the processes of LinuxCNC that run a program."""
+        found = []
         for place in Path("/proc").glob("[0-9]*/cmdline"):
             with suppress(OSError):
                 words = place.read_bytes().decode().split("\0")
-                if program in words and any(str(self.folder) in word for word in words):
-                    return int(place.parent.name)
-        raise AssertionError(f"{program} does not run")
+                if program in words and (program == RTAPI or any(str(self.folder) in word for word in words)):
+                    found.append(int(place.parent.name))
+        return found
+
+    def prioritise(self, *others: int) -> None:
+        """Give LinuxCNC, the bridge and others real-time priority, as a machine does, where that is allowed."""
+        programs = (RTAPI, "milltask", hal_bus.__file__)
+        for pid in (*others, *(pid for program in programs for pid in self.pids_of(program))):
+            for task in Path(f"/proc/{pid}/task").glob("*"):
+                with suppress(OSError):
+                    os.sched_setscheduler(int(task.name), os.SCHED_FIFO, os.sched_param(10))
 
 
 class HalTrace:
