@@ -24,7 +24,7 @@ SPEED_KP, POSITION_GAIN = 23.562, 50.0  # A.s/rad, 1/s
 # states of the plant, and what its step also takes: the current demand and the friction torque
 CURRENT, INTEGRAL, SPEED, PLACE, VOLTAGE = range(5)
 # of what sensors show (peak values): A, rad/s, V
-NOISE = {"current": 0.2, "speed": 0.03, "voltage": 2.0}
+NOISE = {"current": 0.2, "speed": 0.03, "voltage": 0.5}
 NAMES = ("current", "integral", "speed", "position", "voltage")
 
 

@@ -105,7 +105,7 @@ def test_the_second_cut_is_corrected_by_hal_pins_alone(shop: HalShop, plant: str
         until(lambda: all(axis["accepted"] >= 4 for axis in shop.status()["axes"].values()))
         for name, axis in shop.status()["axes"].items():
             for symbol in ("R", "L", "K", "Jt"):
-                assert axis["parameters"][symbol]["value"] == pytest.approx(motors[name][symbol], rel=0.03), symbol
+                assert axis["parameters"][symbol]["value"] == pytest.approx(motors[name][symbol], rel=0.05), symbol
         for tried in range(1, TRIES + 1):
             demand, position, _ = shop.trace(lambda: record(shop.file, part, lambda: shop.nc.run(PART)))
             before = rms(contour_error_um(demand, position, 0.001))
