@@ -23,6 +23,7 @@ REGULATORS: Mapping[str, str] = {
     "p_pi_pi": "fdhil.model.p_pi_pi:prepare",
     "double_pi": "fdhil.model.double_pi:prepare",
     "pid": "fdhil.model.pid:prepare",
+    "linuxcnc_pid": "fdhil.model.linuxcnc_pid:prepare",
 }
 DRIVE_VOLTAGE = "drive"  # comes with the drive's samples; every other source is a sensor of its own
 VOLTAGE_SOURCES: Mapping[str, str] = {
@@ -68,6 +69,7 @@ DRIVE_PROFILES: Mapping[str, str] = {
     "faulhaber": "fdhil.drivers.cia402.profiles:faulhaber.toml",
     "schunk": "fdhil.drivers.cia402.profiles:schunk.toml",
     "infranor": "fdhil.drivers.cia402.profiles:infranor.toml",
+    "hal": "fdhil.drivers.cia402.profiles:hal.toml",
     "roboteq": "fdhil.drivers.cia402.profiles:roboteq.toml",
 }
 PUBLISHERS: Mapping[str, str] = {

@@ -65,6 +65,7 @@ def settings_of(machine: MachineConfig, bus: str, run_directory: Path, token_sha
         axes=tuple(axes),
         daemon_uid=_user_id(machine.guard.daemon_user),
         watching=tuple(_known_ids((*machine.access.watch, *machine.access.operate))),
+        lead=machine.bus[bus].offset_lead_cycles,
     )
     require_own_identifiers(machine, bus)
     return settings
@@ -100,7 +101,7 @@ def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
     per_rad = axis.drive.increments_per_rev / (2 * math.pi)
     require_offset(profile, name)
     target, offset = _rpdo(profile, profile.target, name), _rpdo(profile, profile.offset, name)
-    if len(offset.entries) != 1:
+    if len(offset.entries) != 1 + (axis.drive.source == "hal"):
         fault = ConfigFault(
             f"axis.{name}.drive.profile", "its offset RPDO maps more than 0x60B0", "give it its own RPDO"
         )

@@ -14,7 +14,7 @@ import click
 from fdhil import config as machine_config
 from fdhil.cli.audited import audited
 from fdhil.cli.commission_guide import Asked, Guide, confirm, room_of, told
-from fdhil.cli.commission_steps import FEEDFORWARD, STEPS, moves_of, planned, trial_moves
+from fdhil.cli.commission_steps import FEEDFORWARD, HAL_STEPS, STEPS, moves_of, planned, trial_moves
 from fdhil.cli.commission_trial import try_commissioned
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import AS_JSON, CONFIG
@@ -66,7 +66,9 @@ def commission(
     up as it must be, 2 wrong option or configuration, 3 the drive or the bus cannot be reached.
     """
     machine = machine_config.load(config)
-    axes = [only] if only else list(machine.axis)
+    # an axis of HAL pins without offsets has nothing to prove
+    proven = [name for name, axis in machine.axis.items() if axis.correction is not None or axis.drive.source != "hal"]
+    axes = [only] if only else proven or list(machine.axis)
     if axes[0] not in machine.axis:
         fault = ConfigFault("--axis", f"there is no axis {only}", f"one of {', '.join(machine.axis)}")
         raise ConfigError(str(config), [fault])
@@ -140,34 +142,41 @@ def _tell_plan(machine: MachineConfig, axes: list[str], asked: Asked) -> int:
 def _commission_axis(machine: MachineConfig, axis: str, asked: Asked) -> dict[str, Any]:
     from fdhil.cli.bus_lock import lock_bus
     from fdhil.commissioning import steps
+    from fdhil.commissioning.hal_proof import commission_hal
     from fdhil.commissioning.record import save_record
 
+    hal = machine.axis[axis].drive.source == "hal"
     progress = _progress_of(machine, axis)
     if progress.doubt:
         click.echo(progress.doubt, err=True)
     if asked.again:
         progress.forget()
-    if asked.room is not None:
+    if asked.room is not None and not hal:
         trial_moves(machine, axis, asked.room)  # a room that is too small is told before anything is sent
     bus = machine.bus[machine.axis[axis].drive.bus]
     with lock_bus(bus), audited(machine, "commission", axis=axis) as ended:  # the guard reads the record when it starts
-        record = steps.commission(machine, axis, _commissioning_guide(machine, axis, asked, progress), progress)
+        guide = _commissioning_guide(machine, axis, asked, progress)
+        if hal:
+            record = commission_hal(machine, axis, guide)
+        else:
+            record = steps.commission(machine, axis, guide, progress)
         path = save_record(record, machine.store.directory, machine.store.commissioning_key)
         ended["text"] = f"record {record.digest[:16]}"
         asked.say(
             f"axis {axis} is commissioned: moved {record.sign_test_um:+.1f} um, "
             f"{FEEDFORWARD[record.offset_in_feedforward]}, watchdog {record.watchdog}; record {path}"
         )
-        tried = try_commissioned(machine, record, asked, progress)
+        tried = None if hal else try_commissioned(machine, record, asked, progress)
     return {**asdict(record), "record": str(path), "digest": record.digest, "trial": tried}
 
 
 def _commissioning_guide(machine: MachineConfig, axis: str, asked: Asked, progress: Progress) -> Callable[[str], None]:
     """Return the function that tells of each step, and asks before the drive is switched on."""
-    guide = Guide(axis, asked, STEPS, moves_of(machine, axis), progress)
+    steps = HAL_STEPS if machine.axis[axis].drive.source == "hal" else STEPS
+    guide = Guide(axis, asked, steps, moves_of(machine, axis), progress)
 
     def report(step: str) -> None:
-        if step == "enable" and not asked.yes:
+        if step in ("enable", "move") and not asked.yes:
             _ask(machine, axis)
         guide(step)
 
@@ -200,9 +209,15 @@ def _ask(machine: MachineConfig, axis: str) -> None:
     """Ask before anything moves; DriveFault when the answer is no, or nobody is there to give one."""
     from fdhil.commissioning.steps import largest_move_um
 
+    hal = machine.axis[axis].drive.source == "hal"
+    question = f"Now axis {axis} moves by 10 um, or by 50 um where friction holds it. Is it free to move, and may it?"
     question = (
-        f"The set-up of axis {axis} is as it must be. Now the drive is switched on and the axis moves by 10 um, "
-        f"then up to {largest_move_um(machine, axis):.0f} um to and fro. Is it free to move, and may it?"
+        question
+        if hal
+        else (
+            f"The set-up of axis {axis} is as it must be. Now the drive is switched on and the axis moves by 10 um, "
+            f"then up to {largest_move_um(machine, axis):.0f} um to and fro. Is it free to move, and may it?"
+        )
     )
     if axis[0] + "2" in machine.axis:
         question = f"{axis} is one of two drives of a gantry axis: its beam will be skewed by as much. {question}"

@@ -24,6 +24,11 @@ STEPS: Mapping[str, str] = {
     "fdhil dies.",
     "restore": "Taking the offset to zero, switching the drive off and giving back what was changed.",
 }
+HAL_STEPS: Mapping[str, str] = {
+    "listen": "Listening to the bridge: LinuxCNC must be on, homed and at rest.",
+    "move": "Offsetting the axis: HAL must apply it within its limits, and command and table must follow.",
+    "watchdog test": "Sending nothing more: HAL must bring the offset to zero by itself.",
+}
 FEEDFORWARD: Mapping[bool | None, str] = {
     True: "the speed feed-forward sees the offset",
     False: "the speed feed-forward does not see the offset",
@@ -45,7 +50,10 @@ TRIAL: Mapping[str, str] = {
 
 
 def moves_of(machine: MachineConfig, axis: str) -> dict[str, str]:
-    """Return what each of the ``STEPS`` moves."""
+    """Return what each of the ``STEPS`` moves, of an axis of HAL pins each of the ``HAL_STEPS``."""
+    if machine.axis[axis].drive.source == "hal":
+        moved = "10 um toward plus, and 50 um where friction holds it"
+        return {"listen": NOTHING, "move": moved, "watchdog test": "back to where it was"}
     from fdhil.commissioning.steps import RAMPS, SIGN_TEST_UM, largest_move_um
 
     largest = largest_move_um(machine, axis)
@@ -75,8 +83,9 @@ def trial_moves(machine: MachineConfig, axis: str, room: Room) -> dict[str, str]
 def planned(machine: MachineConfig, axis: str, room: Room | None, progress: Progress) -> list[dict[str, Any]]:
     """Return all steps of an axis, what each does and moves, and when it was done if it was; nothing is sent."""
     done = progress.done()
-    steps = [(STEPS, moves_of(machine, axis))]
-    if room is not None:
+    hal = machine.axis[axis].drive.source == "hal"
+    steps = [(HAL_STEPS if hal else STEPS, moves_of(machine, axis))]
+    if room is not None and not hal:
         steps.append((TRIAL, trial_moves(machine, axis, room)))
     return [
         {"step": step, "does": texts[step], "moves": moved, "done_utc": done.get(step)}

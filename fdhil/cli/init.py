@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from fdhil.errors import ConfigError, ConfigFault, OutputError
 if TYPE_CHECKING:
     from fdhil.commissioning.init.draft import Asked, Draft
     from fdhil.commissioning.init.drives import FoundBus
+    from fdhil.commissioning.init.linuxcnc import Machine
     from fdhil.commissioning.init.making import Look
     from fdhil.commissioning.init.told import Told
 
@@ -38,15 +40,18 @@ NEXT = (
               help="TOML with answers, its keys those of the configuration; then nothing is asked.")  # fmt: skip
 @click.option("--from-linuxcnc", "ini", type=FILE, metavar="INI",
               help="Take axes, speeds and scales from this LinuxCNC machine and its HAL files.")  # fmt: skip
+@click.option("--hal", is_flag=True,
+              help="Drives are LinuxCNC's HAL pins: propose them, and write FILE's HAL file besides.")  # fmt: skip
 @click.option("--eds", "places", multiple=True, type=FILE,
               help="EDS or DCF file, or a folder of them; left out: the folder of FILE.")  # fmt: skip
-@click.option("--offline", is_flag=True, help="Look at no bus: what drives would tell is asked.")
+@click.option("--offline", is_flag=True, help="Look at no bus and no running HAL: what they would tell is asked.")
 @click.option("--dry-run", is_flag=True, help="Write no file; print what it would be.")
 @AS_JSON
 def init(
     file: Path,
     answers: Path | None,
     ini: Path | None,
+    hal: bool,
     places: tuple[Path, ...],
     offline: bool,
     dry_run: bool,
@@ -61,24 +66,58 @@ def init(
     """
     if offline and places:
         raise click.UsageError("--eds fits files to drives on the bus, and --offline looks at none: give one of them")
-    if file.exists() and not dry_run:
-        raise OutputError(f"{file} is there already, and init never overwrites; name another file, or move it away")
+    if hal and ini is None:
+        raise click.UsageError("--hal takes the pins from LinuxCNC's files: give --from-linuxcnc INI too")
+    if hal and places:
+        raise click.UsageError("--hal looks at no CAN bus, so that --eds fits nothing: give one of them")
+    hal_file = file.with_suffix(".hal")
+    for each in (file, hal_file) if hal else (file,):
+        if each.exists() and not dry_run:
+            text = "is there already, and init never overwrites; name another file, or move it away"
+            raise OutputError(f"{each} {text}")
     given = machine_config.read_toml(answers, "a file of answers") if answers is not None else {}
     from fdhil.commissioning.init.linuxcnc import read_linuxcnc  # late: --help imports nothing heavy
     from fdhil.commissioning.init.making import conclude, make
 
     nc = read_linuxcnc(ini) if ini is not None else None
     ask = _ask if answers is None and not as_json else None
-    draft = make(file, given, nc, ask, None if offline else _look(places, file.parent), _can_interface())
+    if nc is not None and hal:
+        draft = make(file, given, nc, ask, pins=[] if offline else running_pins())
+    else:
+        draft = make(file, given, nc, ask, None if offline else _look(places, file.parent), _can_interface())
     text = conclude(draft, file)
-    if not dry_run:
-        with file.open("x", encoding="utf-8") as out:  # whatever came there meanwhile is kept
-            out.write(text)
+    made = {file: text} | ({hal_file: _hal_text(text, file, nc, draft)} if nc is not None and hal else {})
+    for place, content in made.items() if not dry_run else ():
+        with place.open("x", encoding="utf-8") as out:  # whatever came there meanwhile is kept
+            out.write(content)
     if as_json:
         click.echo(json.dumps(_document(draft, file, text, dry_run)))
     elif dry_run:
         click.echo(text, nl=False)
     _tell(draft, file, dry_run, as_json)
+
+
+def running_pins() -> list[str]:
+    """Return the pins that HAL has now; empty where it does not run, or this user may not ask it."""
+    try:
+        asked = subprocess.run(["halcmd", "-s", "show", "pin"], capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return []
+    return [words[4] for line in asked.stdout.splitlines() if len(words := line.split()) > 4]
+
+
+def _hal_text(text: str, file: Path, nc: Machine, draft: Draft) -> str:
+    """Return the HAL file that loads the bridge, and lets offsets pass where an axis may be corrected."""
+    from fdhil.commissioning.init.hal_file import correction_hal, splices_of
+
+    machine = machine_config.parse(machine_config.toml_document(text.encode(), str(file)), str(file), file.parent)
+    corrected = [axis for axis, settings in machine.axis.items() if settings.correction is not None]
+    draft.notes.append(
+        f"{file.with_suffix('.hal').name} loads the bridge: name it as the last HALFILE in [HAL] of the INI; see that "
+        f"LinuxCNC's user can read {file.name}"
+    )
+    splices = splices_of(nc.hal, nc.joints, corrected)
+    return correction_hal(machine, str(file.resolve()), nc.joint_count, splices, nc.hal)
 
 
 def _look(places: Sequence[Path], folder: Path) -> Look:

@@ -126,7 +126,14 @@ def axis_digest(config: MachineConfig, axis: str) -> str:
 def _described(drive: Drive) -> dict[str, Any]:
     """Return what the configuration says of the drive; a file by what it says, wherever it lies."""
     said = drive.model_dump(mode="json", exclude={"eds"})
-    new = {"logical_axis": 1, "rated_torque_nm": 1.0, "dc_link_v": None, "speed_unit": None}
+    new = {
+        "source": "canopen",
+        "hal": None,
+        "logical_axis": 1,
+        "rated_torque_nm": 1.0,
+        "dc_link_v": None,
+        "speed_unit": None,
+    }
     said = {key: value for key, value in said.items() if key not in new or value != new[key]}
     if drive.profile not in tables.DRIVE_PROFILES or drive.eds is not None:
         said["profile"] = repr(load_profile(drive))

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, PrivateAttr, field_validator
+from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from fdhil import tables
 from fdhil.cia402 import Scaling
@@ -23,6 +23,9 @@ CEILING_OFFSET_UM = 250.0
 CEILING_SPEED_MM_S = 20.0
 CEILING_ACCELERATION_MM_S2 = 2000.0
 
+
+HAL_INCREMENTS = 1_000_000
+"""Increments per revolution in which the bridge counts the positions of HAL's pins, unless the file has another."""
 
 SpeedUnit = Literal["increments_per_s", "rpm", "millirpm"]
 """What a drive's speed object can count in."""
@@ -75,6 +78,40 @@ class FeedforwardLimits(Section):
     max_speed_rate_rad_s2: Positive = Field(5e3, description="largest rate of the speed offset")
 
 
+HalPin = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.:-]{1,127}$")]
+HalScale = Finite
+
+
+class HalPins(Section):
+    """[axis.X.drive.hal]: the HAL pins of an axis, for source = "hal". A negative scale reverses the sign."""
+
+    position_command: HalPin = Field(description="joint's commanded position, as joint.0.motor-pos-cmd")
+    position_feedback: HalPin = Field(description="measured position, before any offset is subtracted")
+    speed: HalPin | None = Field(None, description="measured speed; left out: differences of the measured position")
+    current: HalPin | None = Field(None, description="motor current, or the current command of an analogue drive")
+    torque: HalPin | None = Field(None, description="where there is no current: motor torque, divided by nominal.K")
+    voltage: HalPin | None = Field(None, description="motor voltage, or the duty of the PWM; left out: without voltage")
+    enabled: HalPin | None = Field(None, description="true while the drive is enabled; left out: motion.motion-enabled")
+    position_mm_per_unit: Positive = Field(1.0, description="of command and feedback: 25.4 where they are in inch")
+    speed_mm_s_per_unit: HalScale = Field(1.0, description="speed of the table per unit of the pin")
+    current_a_per_unit: HalScale = Field(1.0, description="current per unit of the pin")
+    torque_nm_per_unit: HalScale = Field(1.0, description="torque per unit of the pin")
+    voltage_v_per_unit: HalScale = Field(1.0, description="voltage per unit of the pin; of a duty: the bus voltage")
+    voltage_is: Literal["measured", "commanded"] = Field(
+        "measured", description="measured: the mean of the cycle before; commanded: acts in the cycle that begins"
+    )
+
+    @model_validator(mode="after")
+    def _has_current(self) -> HalPins:
+        if self.current is None and self.torque is None:
+            raise ValueError("name the pin of the current or that of the torque: without both nothing is identified")
+        for key in ("speed", "current", "torque", "voltage"):
+            if not any(k.startswith(f"{key}_") and getattr(self, k) == 0 for k in type(self).model_fields):
+                continue
+            raise ValueError(f"the scale of {key} is 0: every value would be 0")
+        return self
+
+
 def _content(path: Path) -> bytes:
     """Return a file's bytes, as many as a profile or an EDS may have: one that has more is refused when it is read."""
     with path.open("rb") as file:
@@ -96,11 +133,37 @@ class Drive(Section):
         drive._files = hashlib.sha256(told).hexdigest() if own or eds else ""
         return drive
 
+    @model_validator(mode="before")
+    @classmethod
+    def _hal_defaults(cls, given: Any) -> Any:
+        """Fill in what HAL leaves no choice of: its profile, and set-points that act in their own cycle."""
+        if isinstance(given, dict) and given.get("source", "hal" if "hal" in given else "") == "hal":
+            return {
+                "source": "hal",
+                "profile": "hal",
+                "setpoint_delay_cycles": 0,
+                "increments_per_rev": HAL_INCREMENTS,
+                **given,
+            }
+        return given
+
+    @model_validator(mode="after")
+    def _hal_pins(self) -> Drive:
+        if self.source == "hal" and self.hal is None:
+            raise ValueError('source = "hal" needs the table drive.hal with its pins')
+        if self.source == "hal" and self.profile != "hal":
+            raise ValueError(f'source = "hal" has profile "hal", not {self.profile}')
+        return self
+
     @property
     def files_digest(self) -> str:
         """Of what its own profile and its EDS say, a part of what the configuration means; empty without such files."""
         return self._files
 
+    source: Literal["canopen", "hal"] = Field(
+        "canopen", description="hal: LinuxCNC's HAL pins (drive.hal), by the bridge that LinuxCNC runs"
+    )
+    hal: HalPins | None = None
     bus: str = Field("can0", description="the [bus.*] it is on")
     node_id: int | None = Field(
         None, ge=1, le=127, description="CANopen node-ID; left out: 1 for the first axis, 2 for the next"

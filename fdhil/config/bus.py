@@ -55,6 +55,12 @@ class CanBus(Section):
         True,
         description="python-can: acknowledge nothing, so that a wrong bit rate disturbs nobody, where it can be told",
     )
+    offset_lead_cycles: int = Field(
+        0,
+        ge=0,
+        le=200,
+        description="by how many cycles offsets are sent ahead: HAL (streamer) 20 or more, CANopen 0",
+    )
     options: Mapping[str, bool | Whole | Finite | str] = Field(
         {}, description="python-can: what its interface takes besides, e.g. { tty_baudrate = 3000000 }"
     )

@@ -63,10 +63,14 @@ class MachineConfig(Section):
         period = self.machine.sync_period_s
         faults: list[str] = []
         for name, axis in self.axis.items():
-            if axis.drive.bus not in self.bus:
+            bus = self.bus.get(axis.drive.bus)
+            if bus is None:
                 faults.append(f"axis.{name}.drive.bus: there is no [bus.{axis.drive.bus}]")
-            elif axis.correction is not None and not self.bus[axis.drive.bus].may_send:
+            elif axis.correction is not None and not bus.may_send:
                 faults.append(f"axis.{name}.correction: {self._listening(axis.drive.bus)}")
+            elif axis.correction is not None and (axis.drive.source == "hal") != (bus.offset_lead_cycles > 0):
+                text = "1 or more where its drives are HAL pins, which take offsets from a queue, and 0 for CANopen"
+                faults.append(f"bus.{axis.drive.bus}.offset_lead_cycles: must be {text}")
             faults += [f"axis.{name}.regulators.{fault}" for fault in period_faults(axis.regulators, period)]
             limits = [f"axis.{name}.correction: {fault}" for fault in limit_faults(axis, period)]
             # a number in another unit makes limits wrong too, and says so better

@@ -43,6 +43,17 @@ class Regulators(Section):
     )
     current_delay_cycles: int = Field(0, ge=0, le=32, description="current cycles until a computed voltage acts")
 
+    pid_output: Literal["speed", "current"] = Field(
+        "speed", description="linuxcnc_pid: what the drive makes of the output: a speed, or speed_kp times it a current"
+    )
+    position_derivative: NotNegative = Field(0.0, description="linuxcnc_pid: Dgain")
+    position_feedforward_per_s: NotNegative = Field(0.0, description="linuxcnc_pid: FF0, 1/s")
+    acceleration_feedforward_s: NotNegative = Field(0.0, description="linuxcnc_pid: FF2, s")
+    jerk_feedforward_s2: NotNegative = Field(0.0, description="linuxcnc_pid: FF3, s2")
+    deadband_mm: NotNegative = Field(0.0, le=10.0, description="linuxcnc_pid: dead band of the error")
+    output_limit_mm_s: NotNegative = Field(0.0, description="linuxcnc_pid: maxoutput, as table speed; 0: none")
+    error_previous_target: bool = Field(True, description="linuxcnc_pid: error against the command of the cycle before")
+
     @model_validator(mode="after")
     def _integrals(self) -> Regulators:
         """Refuse a gain that the structure would ignore silently, and one whose lack makes it another structure."""
@@ -50,9 +61,23 @@ class Regulators(Section):
             raise ValueError("structure p_pi_pi has no position_ki_per_s2; set structure = 'double_pi'")
         if self.structure == "double_pi" and not self.position_ki_per_s2:
             raise ValueError("structure double_pi needs position_ki_per_s2; without it, it is p_pi_pi")
-        if self.structure == "pid" and self.speed_ki:
-            raise ValueError("structure pid has no speed_ki: set it to 0, its integral gain is position_ki_per_s2")
+        no_speed_loop = self.structure == "pid" or (self.structure == "linuxcnc_pid" and self.pid_output == "current")
+        if no_speed_loop and self.speed_ki:
+            text = f"structure {self.structure} has no speed_ki"
+            raise ValueError(f"{text}: set it to 0, its integral gain is position_ki_per_s2")
+        if self.structure == "linuxcnc_pid" and (self.setpoint_filter_s or self.torque_feedforward):
+            raise ValueError(
+                "structure linuxcnc_pid has neither setpoint_filter_s nor torque_feedforward: leave them out"
+            )
+        if self.structure != "linuxcnc_pid" and (own := self._of_linuxcnc()):
+            raise ValueError(f"structure {self.structure} has no {', '.join(own)}; set structure = 'linuxcnc_pid'")
         return self
+
+    def _of_linuxcnc(self) -> list[str]:
+        """Return the keys of structure linuxcnc_pid that are not at their defaults."""
+        fields = type(self).model_fields.items()
+        own = [key for key, field in fields if (field.description or "").startswith("linuxcnc_pid:")]
+        return [key for key in own if getattr(self, key) != type(self).model_fields[key].default]
 
 
 def period_faults(regulators: Regulators, sync_period_s: float) -> list[str]:

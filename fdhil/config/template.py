@@ -55,6 +55,9 @@ EXAMPLES: Mapping[str, Any] = {  # of keys without a default: the bench machine
     "uplink.tls_certificate_file": "mill-1.crt", "uplink.tls_key_file": "mill-1.key",
     "uplink.directory": "/var/lib/fdhil-uplink", "uplink.credentials_file": "mill-1.creds",
     "offers.directory": "/var/lib/fdhil-uplink/offers",
+    "position_command": "joint.0.motor-pos-cmd", "position_feedback": "hm2_7i97.0.encoder.00.position",
+    "axis.X.drive.hal.speed": "hm2_7i97.0.encoder.00.velocity", "axis.X.drive.hal.current": "pid.x.output",
+    "torque": "lcec.0.x.torque", "axis.X.drive.hal.voltage": "pwmgen.0.value", "enabled": "joint.0.amp-enable-out",
     "axis.X.voltage.type": "float32", "count_address": 42, "trigger_address": 43,
 }  # fmt: skip
 NAMES = {"axis": "X", "bus": "can0"}  # the user's own names in the template

@@ -20,6 +20,7 @@ from fdhil.guard.transitions import Event
 
 PERIODS_AWAITED = 2 * AGREEING
 """TPDOs in which a value must have become known: three in a row, and as many that were in doubt."""
+EMPTIED_S = 0.25  # in which what is behind a queue (HAL's limit3) has brought any offset to zero
 DISTURBED_CYCLES = 1000
 """SYNC after another node wrote an offset, in which nothing is adopted."""
 IMPLAUSIBLE = frozenset({"StaleData", "TargetLost", "FollowingError", "Implausible", "PdoLength"})
@@ -27,8 +28,9 @@ OF_THE_RECORD = frozenset({"NotCommissioned", "RecordVoid", "PdoMapping"})
 
 
 def patience(settings: Settings) -> int:
-    """Return how many SYNC to wait for a value to become known."""
-    return PERIODS_AWAITED * max([axis.read_back_every for axis in settings.axes])
+    """Return how many SYNC to wait for a value to become known; a queue that ran empty is first taken to zero."""
+    emptied = settings.lead + settings.cycles(EMPTIED_S) if settings.lead else 0
+    return PERIODS_AWAITED * max([axis.read_back_every for axis in settings.axes]) + emptied
 
 
 def doubts(views: Views, alarms: Alarms) -> Alarms:

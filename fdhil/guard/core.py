@@ -251,7 +251,7 @@ def _move(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outp
     if wrong is not None:
         return frozen(state, wrong), Output()
     axes = tuple([_sent(axis, o, s) for axis, o, s in zip(state.axes, offsets, settings.axes, strict=True)])
-    state = _arrived(state._replace(axes=axes), inputs.path)
+    state = _arrived(state._replace(axes=axes), inputs.path, settings.lead)
     heartbeat = state.tick % settings.heartbeat_cycles == 0
     return state, Output(offsets, heartbeat)
 
@@ -266,7 +266,7 @@ def _next_offsets(state: State, path: CorrectedPath | None, settings: Settings) 
         return tuple(
             [follow(s.limits, a.offset, a.rate, 0, 0) for s, a in zip(settings.axes, state.axes, strict=True)]
         ), None
-    row = state.places[0].row
+    row = state.places[0].row + settings.lead
     wanted, current = path.offsets_at(row + 1), path.offsets_at(row)
     offsets = []
     for s, axis, goal, here in zip(settings.axes, state.axes, wanted, current, strict=True):
@@ -304,10 +304,10 @@ def _stands(axis: AxisState) -> AxisState:
     return axis._replace(rate=0, sent=(axis.sent[0], *axis.sent[:-1]))
 
 
-def _arrived(state: State, path: CorrectedPath | None) -> State:
+def _arrived(state: State, path: CorrectedPath | None, lead: int) -> State:
     """Leave RAMPING when on the table, and a landing when the drives show 0."""
     if state.mode is Mode.RAMPING and path is not None and len(state.places) == 1:
-        on_table = tuple([axis.offset for axis in state.axes]) == path.offsets_at(state.places[0].row + 1)
+        on_table = tuple([axis.offset for axis in state.axes]) == path.offsets_at(state.places[0].row + lead + 1)
         return state.after(Event.ON_TABLE) if on_table else state
     if state.mode not in LANDING:
         return state
@@ -316,7 +316,7 @@ def _arrived(state: State, path: CorrectedPath | None) -> State:
     sent = state.zeros_sent + 1
     if sent > ZEROS and all(axis.zero_shown for axis in state.axes):
         return state.after(Event.ZERO_SHOWN, axes=tuple(map(at_zero, state.axes)))
-    if sent > ZEROS_UNCONFIRMED:
+    if sent > ZEROS_UNCONFIRMED + lead:
         cause = Alarm("EchoMismatch", detail="no zero was read back")
         return unread(state).after(Event.ZERO_NOT_SHOWN, cause=cause)
     return state._replace(zeros_sent=sent)

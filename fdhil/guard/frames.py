@@ -212,6 +212,11 @@ class Listener:
         alarms, self._alarms = tuple(self._alarms.values()), {}
         return alarms
 
+    @property
+    def counter(self) -> int:
+        """The counter of the last SYNC, 0 where it has none."""
+        return self._counter or 0
+
     def forget_sync(self) -> None:
         """After a silence the next SYNC starts a new series."""
         self._counter = self._last_sync_s = None

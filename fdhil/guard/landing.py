@@ -24,11 +24,11 @@ def land(state: State, unsent: Sequence[int], settings: Settings, can: CanSocket
     """
     moving = [(axis.sent[1], 0) if k in unsent else (axis.offset, axis.rate) for k, axis in enumerate(state.axes)]
     feeds = () if state.feed.mode is FeedMode.OFF else settings.feeds
-    zeros = 0 if state.sending else ZEROS
+    zeros = 0 if state.sending else ZEROS + settings.lead
     try:
-        while zeros < ZEROS and _sync(can, settings.silence_s, clock):
+        while zeros < ZEROS + settings.lead and (counter := _sync(can, settings.silence_s, clock)) is not None:
             if state.mode in SENDING:
-                moving = _step(settings, can, moving)
+                moving = _step(settings, can, moving, counter)
             for feed in feeds:
                 can.send(feed.pdo.cob_id, pack(feed.pdo.entries, (0, 0)))
             zeros += not any(offset for offset, _ in moving)
@@ -37,22 +37,23 @@ def land(state: State, unsent: Sequence[int], settings: Settings, can: CanSocket
     return tuple([offset for offset, _ in moving])
 
 
-def _step(settings: Settings, can: CanSocket, moving: list[tuple[int, int]]) -> list[tuple[int, int]]:
+def _step(settings: Settings, can: CanSocket, moving: list[tuple[int, int]], counter: int) -> list[tuple[int, int]]:
     """Send the next offsets; return them with their rates. What does not leave stands."""
     stepped = []
     for axis, (offset, rate) in zip(settings.axes, moving, strict=True):
-        following = follow(axis.limits, offset, rate, 0, 0)
-        left = can.send(axis.offset.cob_id, pack(axis.offset.entries, (following,)))
+        following, entries = follow(axis.limits, offset, rate, 0, 0), axis.offset.entries
+        left = can.send(axis.offset.cob_id, pack(entries, (following, counter)[: len(entries)]))
         stepped.append((following, following - offset) if left else (offset, 0))
     return stepped
 
 
-def _sync(can: CanSocket, silence_s: float, clock: Clock) -> bool:
-    """Wait for the next SYNC; False when none comes for too long."""
+def _sync(can: CanSocket, silence_s: float, clock: Clock) -> int | None:
+    """Wait for the next SYNC and return its counter, 0 where it has none; None when none comes for too long."""
     poll = clock.new_poll()
     poll.register(can, select.POLLIN)
     end_s = clock.now_s() + silence_s
     while (left_s := end_s - clock.now_s()) > 0:
-        if poll.poll(left_s * 1000) and any(cob_id == COB_SYNC for cob_id, _, _ in can.receive()):
-            return True
-    return False
+        syncs = [data for cob_id, data, _ in can.receive() if cob_id == COB_SYNC] if poll.poll(left_s * 1000) else []
+        if syncs:
+            return syncs[-1][0] if syncs[-1] else 0
+    return None

@@ -28,7 +28,12 @@ def observe(state: State, inputs: Inputs, settings: Settings) -> State:
     history = (targets, *state.targets)[:depth]
     sampled = [
         _fed(
-            _believed(_sampled(axis, seen, setting, k, history, state.mode in SENDING), seen, setting, state.tick),
+            _believed(
+                _sampled(axis, seen, setting, k, history, state.mode in SENDING, settings.lead),
+                seen,
+                setting,
+                state.tick,
+            ),
             seen.fed_back,
             [pairs[k] for pairs in state.feed.sent if pairs],
         )
@@ -66,11 +71,13 @@ def _sampled(
     k: int,
     history: tuple[tuple[int, ...] | None, ...],
     sending: bool,
+    lead: int,
 ) -> AxisState:
     """Compare what the drive showed at the SYNC before with what was in force then.
 
     ``axis.sent[0]`` left after that SYNC, ``sent[1]`` after the one before it and was latched at it. The set-point
-    followed then was latched ``setpoint_delay_cycles`` earlier, together with its offset.
+    followed then was latched ``setpoint_delay_cycles`` earlier, together with its offset. With a ``lead`` the offset in
+    force left so many cycles earlier.
     What changes while nothing is ``sending``, but to one of the last that were sent (a drive may be late), was written
     by another node; so was what is shown between readings that are what was sent.
     """
@@ -80,14 +87,15 @@ def _sampled(
     if seen.following_error is not None:
         error = seen.following_error
     elif seen.position is not None and latched is not None:
-        error = latched[k] + axis.sent[1 + setting.setpoint_delay_cycles] - seen.position
+        error = latched[k] + axis.sent[1 + lead + setting.setpoint_delay_cycles] - seen.position
     if seen.read_back is None:
         readings = 0 if seen.read_back_age > 1 or seen.read_back_crowded else axis.readings
         if error == axis.following_error and readings == axis.readings:
             return axis
         return axis._replace(following_error=error, readings=readings)
-    late = seen.read_back != axis.sent[1] and seen.read_back in axis.sent[2:4]
-    wrong = seen.read_back != axis.sent[1] and not late
+    in_force = axis.sent[1 + lead]
+    late = seen.read_back != in_force and seen.read_back in axis.sent[2 + lead : 4 + lead]
+    wrong = seen.read_back != in_force and not late
     strays = min(axis.strays + STRAY, 2 * STRAY) if wrong else max(0, axis.strays - 1)
     moved = not sending and axis.read_back not in (None, seen.read_back) and seen.read_back not in (0, *axis.sent)
     return axis._replace(
@@ -99,7 +107,7 @@ def _sampled(
         strays=strays,
         foreign=bool(moved) or (wrong and strays > STRAY and not axis.echo_misses),
         late_echoes=axis.late_echoes + late,
-        zero_shown=axis.zero_shown or (seen.read_back == 0 and not any(axis.sent[:2])),
+        zero_shown=axis.zero_shown or (seen.read_back == 0 and not any(axis.sent[: 2 + lead])),
     )
 
 

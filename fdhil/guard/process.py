@@ -189,10 +189,11 @@ class Guard:
         self._listener.lost_frames += self._can.lost_frames - self._lost_seen
         self._lost_seen = self._can.lost_frames
         now_s = self._now_s()
-        last_sync = max([k for k, frame in enumerate(frames) if frame[0] == COB_SYNC], default=-1)
-        for k, (cob_id, data, stamp_s) in enumerate(frames):
+        newer = sum(frame[0] == COB_SYNC for frame in frames)
+        for cob_id, data, stamp_s in frames:
             if cob_id == COB_SYNC:
-                self._sync(data, stamp_s, now_s, late=k < last_sync)
+                newer -= 1
+                self._sync(data, stamp_s, now_s, late=newer > self.settings.lead // 2)
             elif cob_id == ERROR:
                 self._listener.error(data.decode())
             else:
@@ -286,7 +287,9 @@ class Guard:
     def _send(self, output: Output) -> None:
         """Send what a step says, and note which axes' frames did not leave."""
         axes = zip(self.settings.axes, self._entries, output.offsets or (), strict=output.offsets is not None)
-        self._unsent = self._sent([(axis.offset.cob_id, pack(entries, (offset,))) for axis, entries, offset in axes])
+        counter = self._listener.counter
+        frames = [(axis.offset.cob_id, pack(e, (offset, counter)[: len(e)])) for axis, e, offset in axes]
+        self._unsent = self._sent(frames)
         feeds = zip(self.settings.feeds, output.feed or (), strict=output.feed is not None)
         self._unfed = self._sent([(feed.pdo.cob_id, pack(feed.pdo.entries, pair)) for feed, pair in feeds])
         if output.heartbeat:

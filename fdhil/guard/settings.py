@@ -26,6 +26,9 @@ MOST_INCREMENTS_PER_MM = 1e6
 Layout = tuple[tuple[int, int, int, bool], ...]
 """Entries (index, sub-index, bits, signed) of a PDO, one behind the other."""
 OFFSET_LAYOUT: Layout = ((Object.POSITION_OFFSET, 0, 32, True),)
+LEAD_LAYOUT: Layout = (*OFFSET_LAYOUT, (0x0005, 0, 8, False))
+"""With a lead: behind the offset, in a dummy entry (CiA 301), the counter of the SYNC that it answers."""
+MOST_LEAD = 200
 FEED_LAYOUT: Layout = ((Object.VELOCITY_OFFSET, 0, 32, True), (Object.TORQUE_OFFSET, 0, 16, True))
 
 
@@ -102,7 +105,8 @@ class Settings:
     ``clock`` "sync": time is SYNC count x period (a simulated machine need not run in real time). ``token_sha256`` is
     the hash of the operator's token, empty: nothing can be armed. ``offset_synchronous``: the drive applies our RPDO
     at the next SYNC, so that without SYNC nothing can be ramped. ``daemon_uid`` is the user of the daemon where it is
-    another than the guard's, ``watching`` are the users who may look and disarm besides.
+    another than the guard's, ``watching`` are the users who may look and disarm besides. ``lead``: an offset takes
+    effect so many cycles later than at the next SYNC, because it waits in a queue (HAL's streamer).
     """
 
     bus: str
@@ -117,14 +121,15 @@ class Settings:
     offset_synchronous: bool = True
     daemon_uid: int | None = None
     watching: tuple[int, ...] = ()
+    lead: int = 0
 
     @property
     def silence_s(self) -> float:
-        """How long the bus may be without SYNC: four periods; 10 s of wall clock where time is the SYNC count.
+        """How long the bus may be without SYNC: four periods and the lead; 10 s where time is the SYNC count.
 
         A simulated machine stands still between two SYNCs, and its slowest listener may hold it up.
         """
-        return 10.0 if self.clock == "sync" else 4 * self.sync_period_s
+        return 10.0 if self.clock == "sync" else (4 + self.lead) * self.sync_period_s
 
     @property
     def daemon_lost_s(self) -> float:
@@ -260,8 +265,9 @@ def _check(settings: Settings) -> None:
         _whole(settings.daemon_uid, 0, 2**32 - 2, "daemon_uid")
     for uid in settings.watching:
         _whole(uid, 0, 2**32 - 2, "watching")
+    _whole(settings.lead, 0, MOST_LEAD, "lead")
     for axis in settings.axes:
-        _check_axis(axis)
+        _check_axis(axis, LEAD_LAYOUT if settings.lead else OFFSET_LAYOUT)
         _check_limits(axis, settings.sync_period_s)
     if len(settings.sent_ids) != 1 + len(settings.axes) + sum(a.feedforward is not None for a in settings.axes):
         raise ValueError("two of our PDOs share one COB-ID")
@@ -274,7 +280,7 @@ def _check(settings: Settings) -> None:
         raise ValueError("a COB-ID that is ours is another sender's: of the NC's set-points or a drive")
 
 
-def _check_axis(axis: AxisSettings) -> None:
+def _check_axis(axis: AxisSettings, layout: Layout) -> None:
     where = f"axis {axis.name}: "
     _word(axis.name, "[A-Z]2?", "an axis' name")
     _whole(axis.node_id, 1, 127, where + "node_id")
@@ -289,7 +295,8 @@ def _check_axis(axis: AxisSettings) -> None:
     _word(axis.void_reason, ".{0,300}", where + "void_reason")
     if type(axis.record_void) is not bool:
         raise ValueError(f"{where}record_void is neither true nor false")
-    _check_sent(axis.offset, OFFSET_LAYOUT, f"{where}the offset RPDO must map 0x60B0:00 and nothing else")
+    text = f"{where}the offset RPDO must map 0x60B0:00 and nothing else (with a lead, also the counter of SYNC)"
+    _check_sent(axis.offset, layout, text)
     if axis.feedforward is not None:
         text = f"{where}the feed-forward's RPDO must map 0x60B1:00 and 0x60B2:00 and nothing else"
         _check_sent(axis.feedforward.pdo, FEED_LAYOUT, text)

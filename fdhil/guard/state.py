@@ -191,6 +191,7 @@ class Output(NamedTuple):
 def initial(settings: Settings) -> State:
     """Return the state at start: off, nothing known."""
     axes = [
-        AxisState(sent=(0,) * (axis.setpoint_delay_cycles + 4), record_void=axis.record_void) for axis in settings.axes
+        AxisState(sent=(0,) * (axis.setpoint_delay_cycles + settings.lead + 4), record_void=axis.record_void)
+        for axis in settings.axes
     ]
     return State(Mode.OFF, tuple(axes))

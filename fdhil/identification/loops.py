@@ -67,6 +67,8 @@ def identify_loops(
     without it the search begins from the demand alone. Set-points come every ``sync_period_s`` (left out: each row).
     Without ``growing`` the keys that are configured are found anew, and no others are tried: that takes no time.
     """
+    if axis is not None and axis.regulators.structure == "linuxcnc_pid":
+        return None  # its gains are those of the HAL files, and no other structure stands in for it
     on_time = [with_demand_on_time(window, axis, sync_period_s)[0] for window in windows[-MOST_WINDOWS:]]
     pairs = list(zip(on_time, mechanics[-MOST_WINDOWS:], strict=True))
     told = [(rapid, own) for w, own in pairs if (rapid := rapid_of(w, own, sync_period_s)) is not None]

@@ -155,7 +155,7 @@ def standing(parameters: Parameters, axis: Axis, position_mm: float, current_a: 
     state[kernels.BRISTLE] = parameters.K * held_a - pull_nm
     if g.speed_ki > 0:
         state[kernels.SPEED_INTEGRAL] = held_a
-    elif g.structure == "pid" and g.position_ki_per_s2 > 0:
+    elif g.structure in ("pid", "linuxcnc_pid") and g.position_ki_per_s2 > 0:
         state[kernels.POSITION_INTEGRAL] = held_a / g.speed_kp
     if terms.has_spring(parameters):  # what friction takes up at the table has gone through the spring
         stiffness = terms.spring(parameters)[0] * terms.rad_per_mm(axis)

@@ -23,13 +23,17 @@ ROW_LIMITED, ROW_STATE = range(2)
 # places in the gains, see fdhil.model.loops.gains
 KV, KFF, SPEED_KP, SPEED_KI, CURRENT_MAX, CURRENT_KP, CURRENT_KI, VOLTAGE_MAX, PERIOD, HALF_STEP_MM = range(10)
 POSITION_KI, ACCELERATION, DECAY, RAD_PER_MM, SPEED_CYCLES_PER_S, SPEED_DECAY, FULL_DEAD_TIME_A = range(10, 17)
-GAINS = 17
+# of LinuxCNC's pid: gains of its terms, output limit (0: none), and as 0 or 1 error-previous-target and a speed loop
+DERIVATIVE, FF0, FF2, FF3, DEADBAND_MM, OUTPUT_MAX, PREVIOUS_TARGET, SPEED_LOOP = range(17, 25)
+GAINS = 25
 # places in the terms, see fdhil.model.terms.packed; behind them periods in a turn, amplitude and phase of each ripple
 LOAD, DRY_POSITIVE, DRY_NEGATIVE, VISCOUS, VISCOUS_POSITIVE, VISCOUS_NEGATIVE, STRIBECK, STRIBECK_SPEED = range(8)
 DEAD_TIME, SPRING, DAMPER, PRESLIDING, RIPPLES = range(8, 13)
 STRIBECK_REACH = 6.0  # times its speed, from where it is less than the last bit of the friction
 # the laws from set-point to current demand
-CASCADE, PID = range(2)
+CASCADE, PID, LINUXCNC = range(3)
+# what LinuxCNC's pid remembers besides, in places of the set-point filter that it does not have
+COMMAND_SPEED, COMMAND_ACCELERATION, OUTPUT, OUTPUT_LIMITED = 10, 11, 13, 14
 # rows of the leap, see fdhil.model.leap: what a whole speed cycle does to a table that moves or is held, and its bounds
 LEAP_CURRENT, LEAP_SPEED, LEAP_INTEGRAL, LEAP_WAY, LEAP_TURN, LEAP_VOLTAGE = range(6)
 HELD_CURRENT, HELD_INTEGRAL, HELD_BREAK, HELD_VOLTAGE, LEAP_RESISTANCE = range(6, 11)
@@ -72,6 +76,43 @@ def _pid(place: float, rate: float, turned: float, state: Float, gains: Float) -
     state[POSITION_BEFORE] = state[POSITION]
     speed = gains[KV] * lag + integral + gains[SPEED_CYCLES_PER_S] * moved + rate
     return gains[SPEED_KP] * speed, 0.0, integral
+
+
+@compiled
+def _linuxcnc_pid(place: float, state: Float, gains: Float) -> None:
+    """Compute the output (rad/s) of LinuxCNC's pid component (2.9, hal/components/pid.c) once, into the state."""
+    period, per_mm = gains[PERIOD], gains[RAD_PER_MM]
+    error = (state[SET_POINT_BEFORE] if gains[PREVIOUS_TARGET] > 0.0 else place) - state[POSITION]
+    deadband = gains[DEADBAND_MM]
+    error = error - deadband if error > deadband else error + deadband if error < -deadband else 0.0
+    if error * state[OUTPUT_LIMITED] <= 0.0:
+        state[POSITION_INTEGRAL] += gains[POSITION_KI] * error
+    speed = (place - state[SET_POINT_BEFORE]) / period
+    acceleration = (speed - state[COMMAND_SPEED]) / period
+    jerk = (acceleration - state[COMMAND_ACCELERATION]) / period
+    closing = speed - (state[POSITION] - state[POSITION_BEFORE]) / period
+    out = gains[KV] * error + state[POSITION_INTEGRAL] + gains[DERIVATIVE] * per_mm * closing
+    out += gains[FF0] * per_mm * place + gains[KFF] * speed
+    out += per_mm * (gains[FF2] * acceleration + gains[FF3] * jerk)
+    state[OUTPUT_LIMITED] = 0.0
+    if gains[OUTPUT_MAX] > 0.0 and abs(out) > gains[OUTPUT_MAX]:
+        state[OUTPUT_LIMITED] = np.sign(out)
+        out = gains[OUTPUT_MAX] * np.sign(out)
+    state[SET_POINT_BEFORE], state[POSITION_BEFORE], state[OUTPUT] = place, state[POSITION], out
+    state[COMMAND_SPEED], state[COMMAND_ACCELERATION] = speed, acceleration
+
+
+@compiled
+def _driven(speed: float, more: float, state: Float, gains: Float) -> tuple[float, float]:
+    """Return the current demand of a drive that takes the output of LinuxCNC's pid, and its speed integral.
+
+    A drive with a speed loop closes it at its own cycle; one without takes the output for a current.
+    """
+    wanted = state[OUTPUT] + more
+    if gains[SPEED_LOOP] == 0.0:
+        return gains[SPEED_KP] * wanted, 0.0
+    candidate = state[SPEED_INTEGRAL] + gains[SPEED_KI] * (wanted - speed)
+    return gains[SPEED_KP] * (wanted - speed) + candidate, candidate
 
 
 @compiled
@@ -471,6 +512,12 @@ def run(
             if law == CASCADE:
                 speed = _seen(state[SPEED], state, gains) if filtered else state[SPEED]
                 raw, speed_integral, position_integral = _cascade(place, kff * rate + more, speed, state, gains)
+            elif law == LINUXCNC:
+                if m == 0:
+                    _linuxcnc_pid(r0, state, gains)
+                speed = _seen(state[SPEED], state, gains) if filtered else state[SPEED]
+                raw, speed_integral = _driven(speed, more, state, gains)
+                position_integral = state[POSITION_INTEGRAL]
             else:
                 turned = gains[RAD_PER_MM] * (state[POSITION] - state[POSITION_BEFORE])
                 turned = _seen(turned, state, gains) if filtered else turned

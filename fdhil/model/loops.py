@@ -68,6 +68,12 @@ def gains(axis: Axis, sync_period_s: float) -> Float:
     values[kernels.RAD_PER_MM] = rad_per_mm
     values[kernels.FULL_DEAD_TIME_A] = terms.full_dead_time_a(axis)
     values[kernels.SPEED_CYCLES_PER_S] = 1.0 / g.speed_period_s
+    if g.structure == "linuxcnc_pid":
+        values[kernels.POSITION_KI] = g.position_ki_per_s2 * rad_per_mm * sync_period_s
+        values[kernels.DERIVATIVE], values[kernels.FF0] = g.position_derivative, g.position_feedforward_per_s
+        values[kernels.FF2], values[kernels.FF3] = g.acceleration_feedforward_s, g.jerk_feedforward_s2
+        values[kernels.DEADBAND_MM], values[kernels.OUTPUT_MAX] = g.deadband_mm, g.output_limit_mm_s * rad_per_mm
+        values[kernels.PREVIOUS_TARGET], values[kernels.SPEED_LOOP] = g.error_previous_target, g.pid_output == "speed"
     values[kernels.SPEED_DECAY] = math.exp(-g.speed_period_s / g.speed_filter_s) if g.speed_filter_s > 0 else 0.0
     return values
 

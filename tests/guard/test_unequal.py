@@ -57,7 +57,7 @@ CASES: dict[str, Callable[[], Any]] = {
     "the feed-forward's frame": lambda: feeding.go_on(
         STATE._replace(feed=feed.zeroing(1, Alarm("StaleOffset"))), INPUTS, (), fed_settings(), Output()
     ),
-    "a landing": lambda: landing._step(MADE, _Taking(), [(0, 0)]),  # type: ignore[arg-type]
+    "a landing": lambda: landing._step(MADE, _Taking(), [(0, 0)], 1),  # type: ignore[arg-type]
     "what is shown": lambda: status.in_um([0], MADE),
 }
 

@@ -92,17 +92,26 @@ MAX_LINEAR_ACCELERATION = {acceleration}
 class LinuxCnc:
     """LinuxCNC, switched on and homed at 0; leaving the with block ends it.
 
-    ``hal`` are more lines of its HAL file, such as the one that loads the bridge. AssertionError in LinuxCNC's own
-    words when it does not do its part.
+    ``hal`` are more lines of its HAL file, such as the one that loads the bridge; ``base`` is another HAL file than
+    that of joints without drives, and ``beside`` are files that it finds in its folder. AssertionError in LinuxCNC's
+    own words when it does not do its part.
     """
 
     def __init__(
-        self, speed_mm_s: float = 500.0, acceleration_mm_s2: float = 2000.0, hal: str = "", axes: str = "XYZ"
+        self,
+        speed_mm_s: float = 500.0,
+        acceleration_mm_s2: float = 2000.0,
+        hal: str = "",
+        axes: str = "XYZ",
+        base: str | None = None,
+        beside: Mapping[str, str] | None = None,
     ) -> None:
         self._alone = _alone()
         self.folder = Path(tempfile.mkdtemp(prefix="fdhil-linuxcnc-"))
         self._lines: IO[str] | None = None
-        write_machine(self.folder, speed_mm_s, acceleration_mm_s2, hal, axes)
+        write_machine(self.folder, speed_mm_s, acceleration_mm_s2, hal, axes, base)
+        for name, text in (beside or {}).items():
+            (self.folder / name).write_text(text.replace("{folder}", str(self.folder)))
         with socket.create_server(("127.0.0.1", 0)) as door:
             self._start(door.getsockname()[1], axes)
             try:
@@ -239,11 +248,14 @@ class LinuxCnc:
         self.close()
 
 
-def write_machine(folder: Path, speed_mm_s: float, acceleration_mm_s2: float, hal: str, axes: str) -> None:
+def write_machine(
+    folder: Path, speed_mm_s: float, acceleration_mm_s2: float, hal: str, axes: str, base: str | None = None
+) -> None:
     """Write the files of a machine as its integrator has them: machine.ini, and the HAL file that it names."""
-    text = (HERE / "machine.hal").read_text()
-    text = text.replace("=xyz", f"={axes.lower()}").replace("joints=3", f"joints={len(axes)}")
-    if axes == "XY":  # the bridge's channel has its joints only
+    text = (HERE / "machine.hal").read_text() if base is None else base
+    if base is None:
+        text = text.replace("=xyz", f"={axes.lower()}").replace("joints=3", f"joints={len(axes)}")
+    if axes == "XY" and base is None:  # the bridge's channel has its joints only
         lines = text.replace(",fffssff", ",ffssff").splitlines()
         text = "\n".join(line for line in lines if "joint.2" not in line)
     (folder / "machine.hal").write_text(f"{text}\n{hal}")

@@ -145,6 +145,8 @@ class Operator:
                 self.command.auto(linuxcnc.AUTO_RESUME)
             case "abort":
                 self.command.abort()
+            case "estop":
+                self.order(self.command.state, linuxcnc.STATE_ESTOP)
             case other:
                 raise Failed(f"nobody knows the order {other!r}")
 

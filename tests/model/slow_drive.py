@@ -6,6 +6,7 @@ It shares no code with the model: other integration, other order of work, positi
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -28,6 +29,9 @@ class SlowDrive:
         self.start = 0.0
         self.before: tuple[float, float] | None = None
         self.seen = 0.0
+        self.commands: list[float] = []
+        self.measured = self.error_sum = self.output = 0.0
+        self.saturated = 0
         self.pipeline = [0.0] * axis.regulators.current_delay_cycles
         self.memory: list[list[float]] = []
 
@@ -95,6 +99,9 @@ class SlowDrive:
         for k in range(len(targets)):
             positions.append(start + self.theta * self.pitch / (2 * math.pi))
             r0, r1, r2 = (targets[min(k + j, len(targets) - 1)] for j in range(3))
+            if self.g.structure == "linuxcnc_pid":
+                encoder = round((start + self.theta * self.pitch / (2 * math.pi)) * per_mm)
+                self._pid_component(2 * math.pi / self.increments * r0, 2 * math.pi / self.increments * encoder)
             for m in range(n_speed):
                 share = m / n_speed
                 encoder = round((start + self.theta * self.pitch / (2 * math.pi)) * per_mm)
@@ -103,6 +110,31 @@ class SlowDrive:
                 ordered = self._filtered([r0 + (r1 - r0) * share, slope, bend])
                 self._cycle(*(2 * math.pi / self.increments * v for v in (*ordered, encoder)))
         return positions
+
+    def _pid_component(self, command: float, measured: float) -> None:
+        """LinuxCNC's pid component as its manual has it, once a servo cycle, angles in radians."""
+        g, t = self.g, self.period
+        if not self.commands:
+            self.commands, self.measured = [command] * 4, measured
+        self.commands = [command, *self.commands[:3]]
+        r = self.commands
+        dead = g.deadband_mm * 2 * math.pi / self.pitch
+        error = r[1 if g.error_previous_target else 0] - measured
+        error = math.copysign(max(0.0, abs(error) - dead), error)
+        if error * self.saturated <= 0:
+            self.error_sum += error * t
+        slopes = [(a - b) / t for a, b in pairwise(r)]
+        bends = [(a - b) / t for a, b in pairwise(slopes)]
+        jerk = (bends[0] - bends[1]) / t
+        closing = slopes[0] - (measured - self.measured) / t
+        self.measured = measured
+        wanted = g.position_gain_per_s * error + g.position_ki_per_s2 * self.error_sum
+        wanted += g.position_derivative * closing + g.position_feedforward_per_s * command
+        wanted += g.speed_feedforward * slopes[0] + g.acceleration_feedforward_s * bends[0]
+        wanted += g.jerk_feedforward_s2 * jerk
+        most = g.output_limit_mm_s * 2 * math.pi / self.pitch or math.inf
+        self.output = max(-most, min(most, wanted))
+        self.saturated = (wanted > most) - (wanted < -most)
 
     def _filtered(self, signals: list[float]) -> list[float]:
         """Set-point, speed and acceleration behind the filter: each stage steps towards its input."""
@@ -132,6 +164,12 @@ class SlowDrive:
             difference = g.speed_feedforward * (place - before[0]) - h * self._slowed((encoder - before[1]) / h)
             self.before = place, encoder
             wanted = g.speed_kp * (outer + difference / h)
+        elif g.structure == "linuxcnc_pid":
+            position_sum, wanted = self.position_sum, g.speed_kp * self.output
+            if g.pid_output == "speed":
+                error = self.output - self._slowed(self.w)
+                speed_sum += g.speed_ki * h * error
+                wanted = g.speed_kp * error + speed_sum
         else:
             error = outer + g.speed_feedforward * rate - self._slowed(self.w)
             speed_sum += g.speed_ki * h * error

@@ -27,6 +27,7 @@ GAINS: dict[str, dict[str, Any]] = {
     "p_pi_pi": {},
     "double_pi": {"position_ki_per_s2": 300.0},
     "pid": {"position_gain_per_s": 100.0, "position_ki_per_s2": 2500.0, "speed_ki": 0.0},
+    "linuxcnc_pid": {"position_ki_per_s2": 300.0, "position_derivative": 0.1, "acceleration_feedforward_s": 0.001},
 }
 OPTIONS: dict[str, dict[str, Any]] = {
     "plain": {},
@@ -45,6 +46,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "current_delay_cycles": 1,
     },
 }
+NOT_OF_LINUXCNC = ("torque_feedforward", "setpoint_filter_s", "setpoint_filter_order")
 CASES = list(product(tables.REGULATORS, OPTIONS))
 
 
@@ -52,7 +54,9 @@ def bench(structure: str, **regulators: Any) -> configuration.MachineConfig:
     """The bench with other regulators."""
     document = bench_document()
     for axis in document["axis"].values():
-        axis["regulators"] |= {"structure": structure} | GAINS[structure] | regulators
+        given = GAINS[structure] | regulators
+        lacks = NOT_OF_LINUXCNC if structure == "linuxcnc_pid" else ()
+        axis["regulators"] |= {"structure": structure} | {k: v for k, v in given.items() if k not in lacks}
     return configuration.parse(document)
 
 
@@ -135,6 +139,24 @@ def test_agrees_with_an_adaptive_solver_while_a_limit_acts(structure: str) -> No
     assert np.abs(run(axis, into_the_limits()).position_mm - exact).max() < 0.05e-3
 
 
+@pytest.mark.parametrize(
+    "regulators",
+    [
+        {"pid_output": "current", "speed_ki": 0.0, "position_derivative": 1.0, "position_gain_per_s": 100.0},
+        {"error_previous_target": False, "deadband_mm": 0.002, "jerk_feedforward_s2": 2e-6},
+        {"output_limit_mm_s": 8.0},
+    ],
+    ids=["current", "deadband", "limit"],
+)
+def test_linuxcncs_pid_agrees_with_independent_physics(regulators: dict[str, Any]) -> None:
+    axis = bench("linuxcnc_pid", **regulators).axis["X"]
+    parameters = Parameters(0.53, 0.0047, 0.82, 0.081, 0.04, 4.2)
+    demand = there_and_back(120)
+    response = closed_loop.simulate(parameters, axis, PERIOD, demand)
+    slow = SlowDrive(parameters, axis, PERIOD, increments=65536 << 20).run(demand.tolist())
+    assert np.abs(response.position_mm - slow).max() < 0.05e-3
+
+
 def test_the_pid_that_is_a_cascade() -> None:
     """With full feed-forward a P and PI cascade is a PID, but for when the speed of the demand comes in."""
     demand = bench_demand(10)[:, 0]
@@ -187,7 +209,7 @@ def test_the_inverse_works_for_every_structure(structure: str, option: str) -> N
     correction = plan(bench_trajectory(10), nominal_models(config), config, "inverse")
     assert correction.refused == ()
     gain = rms(correction.before.contour_um) / rms(correction.after.contour_um)
-    assert gain > (3 if (structure, option) == ("double_pi", "all") else 10)
+    assert gain > (3 if structure in ("double_pi", "linuxcnc_pid") and option == "all" else 10)
 
 
 def test_flatness_leaves_the_drives_own_torque_to_it() -> None:

@@ -1,6 +1,6 @@
 """Makes the values of a machine: takes what files and drives tell, asks for the rest, proposes what can be guessed."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -8,10 +8,12 @@ from typing import Any
 
 from fdhil.commissioning.init.draft import OPERATOR, Draft
 from fdhil.commissioning.init.drives import FoundBus, FoundDrive, needs_dc_link
+from fdhil.commissioning.init.hal_pins import current_gains, propose_axis
 from fdhil.commissioning.init.linuxcnc import Machine, Scale
 from fdhil.commissioning.init.questions import PITCH, QUESTIONS, Question
 from fdhil.commissioning.init.told import Told, rounded
 from fdhil.config import Drive, is_second_drive
+from fdhil.config.axis import HalPins
 from fdhil.config.axis_tables import angular, linear
 from fdhil.config.reading import checked
 from fdhil.drivers.cia402.abilities import GENERIC
@@ -23,6 +25,7 @@ UNITS_OF_CURRENT = {
     "drive.rated_current_a": ("permille_of_rated", "share_of_rated"),
     "drive.rated_torque_nm": ("permille_of_rated_torque",),
 }
+ANY_PINS = HalPins(position_command="a", position_feedback="a", current="a")
 NO_OTHER_WINDOW = (0, 0xFFFFFFFF)
 
 
@@ -123,6 +126,64 @@ def settle_axis(
             f"axis {axis}: profile {profile.name} tells no voltage of the motor; K, inertia and friction are "
             "identified, R and L stay as given, until a sensor is wired (docs/how-to/voltage-sensor.md)"
         )
+
+
+HAL_WHERE = {
+    "position_feedback": "`halcmd show pin`: the encoder's position, before any offset",
+    "current": "`halcmd show pin`: the drive's current (an analogue input, lcec), or in torque mode the pid's output; "
+    "without any, fdhil cannot identify the axis",
+}
+
+
+def settle_hal_axis(draft: Draft, axis: str, others: Sequence[str], nc: Machine, running: Collection[str]) -> None:
+    """Settle [axis.X] of an axis whose drive is HAL pins; a pin that a running HAL lacks is missing."""
+    here = f"axis.{axis}"
+    made = propose_axis(nc.hal, axis, nc.joints.get(axis, 0), nc.unit_mm, running)
+    for key, told in (("source", "hal"), ("bus", "hal"), ("profile", "hal")):
+        draft.tell(f"{here}.drive.{key}", Told(told, "asked: --hal"))
+    for key, value in made.told.items():
+        given = f"{here}.{key}" in draft.values or (
+            key.endswith("torque") and f"{here}.drive.hal.current" in draft.values
+        )
+        if not given:
+            draft.tell(f"{here}.{key}", value)
+    draft.notes += made.notes
+    for key, where in HAL_WHERE.items():
+        if key != "current" or f"{here}.drive.hal.torque" not in draft.values:
+            draft.settle(f"{here}.drive.hal.{key}", where)
+    _settle(draft, axis, PITCH, others)
+    _settle_pid(draft, here, nc.unit_mm)
+    profile = load_profile(Drive(source="hal", hal=ANY_PINS))
+    for question in QUESTIONS:
+        if question.key != "drive.increments_per_rev" and _applies(question.key, profile):
+            _settle(draft, axis, question, others)
+    for key in (*HAL_WHERE, "speed", "torque", "voltage", "enabled", "position_command"):
+        pin = draft.get(f"{here}.drive.hal.{key}")
+        if running and pin is not None and pin not in running:
+            advice = "see `halcmd show pin`; load its component, or name another pin"
+            draft.missing.append(ConfigFault(f"{here}.drive.hal.{key}", f"HAL has no pin {pin}", advice))
+    if not draft.has_table(f"{here}.drive.hal.voltage"):
+        draft.notes.append(
+            f"axis {axis}: no pin of a voltage; K, R and L stay as given, inertia and friction are found"
+        )
+    _settle_correction(draft, axis, profile)
+
+
+def _settle_pid(draft: Draft, here: str, unit_mm: float) -> None:
+    """Take the gains of a pid that commands a current for what they are, once the pitch is known."""
+    regulators = f"{here}.regulators"
+    pitch = draft.get(f"{here}.screw_pitch_mm")
+    if draft.get(f"{regulators}.pid_output") != "current" or not pitch:
+        return
+    told = {path.rpartition(".")[2]: told.value for path, told in draft.values.items() if path.startswith(regulators)}
+    per_unit = draft.get(f"{here}.drive.hal.current_a_per_unit") or 1.0
+    try:
+        found = current_gains(told, per_unit, unit_mm, pitch)
+    except ValueError as error:
+        draft.missing.append(ConfigFault(f"{regulators}.pid_output", f"cannot be 'current': {error}", "see its setp"))
+        return
+    for key, value in found.items():
+        draft.values[f"{regulators}.{key}"] = Told(value, "LinuxCNC: HAL's pid, whose output is a current")
 
 
 def _settle_drive(draft: Draft, axis: str, found: Found) -> FoundDrive | None:

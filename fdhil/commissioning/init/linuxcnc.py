@@ -41,12 +41,20 @@ class Scale:
 
 @dataclass(slots=True)
 class Machine:
-    """What the files tell: values by their key in the configuration, scales by axis, the axes' letters, remarks."""
+    """What the files tell: values by their key in the configuration, scales by axis, the axes' joints, HAL, remarks.
+
+    ``loops`` are those remarks that are for drives which close their own loops.
+    """
 
     told: dict[str, Told] = field(default_factory=dict)
     scales: dict[str, Scale] = field(default_factory=dict)
     axes: tuple[str, ...] = ()
     notes: list[str] = field(default_factory=list)
+    joints: dict[str, int] = field(default_factory=dict)
+    joint_count: int = 0
+    loops: list[str] = field(default_factory=list)
+    unit_mm: float = 1.0
+    hal: Hal = field(default_factory=Hal)
 
 
 def read_linuxcnc(path: Path) -> Machine:
@@ -99,12 +107,13 @@ def machine_of(ini: Ini, hal: Hal, path: Path) -> Machine:
         what = "is of a LinuxCNC before 2.8: it has [AXIS_0] and no [JOINT_0]"
         raise _fault(path, "AXIS_0", what, "convert it with LinuxCNC's update_ini")
     unit_mm = _unit_mm(ini, path)
-    machine = Machine()
-    joints = _joints(ini, machine.notes)
+    machine = Machine(unit_mm=unit_mm, hal=hal)
+    joints = machine.joints = _joints(ini, machine.notes)
     if not joints:
         advice = "[TRAJ] COORDINATES names the axes and [JOINT_n] describes each"
         raise _fault(path, "TRAJ.COORDINATES", "names no linear axis with a joint", advice)
     machine.axes = tuple(joints)
+    machine.joint_count = sum(section.startswith("JOINT_") for section in ini.sections)
     _common(ini, machine)
     _planner(ini, joints, unit_mm, machine)
     units = {letter: _unit(ini, path, letter, unit_mm) for letter in joints}
@@ -275,7 +284,9 @@ def _axis(ini: Ini, hal: Hal, letter: str, joint: int, unit: _Unit, machine: Mac
     scale = _scale(ini, hal, joint, factor)
     if scale is not None:
         machine.scales[letter] = scale
-    machine.notes += _beside(ini, hal, letter, joint, unit)
+    loops = list(_loops(hal, letter, joint))
+    machine.notes += [*_beside(ini, letter, joint, unit), *loops]
+    machine.loops += loops
 
 
 def _scale(ini: Ini, hal: Hal, joint: int, factor: float) -> Scale | None:
@@ -293,7 +304,7 @@ def _scale(ini: Ini, hal: Hal, joint: int, factor: float) -> Scale | None:
     return None
 
 
-def _beside(ini: Ini, hal: Hal, letter: str, joint: int, unit: _Unit) -> Iterator[str]:
+def _beside(ini: Ini, letter: str, joint: int, unit: _Unit) -> Iterator[str]:
     """Say what LinuxCNC itself corrects, and what that means beside fdhil's offsets."""
     section = f"JOINT_{joint}"
     if (ini.number(section, "BACKLASH") or 0.0) > 0 or ini.text(section, "COMP_FILE"):
@@ -307,18 +318,22 @@ def _beside(ini: Ini, hal: Hal, letter: str, joint: int, unit: _Unit) -> Iterato
             "speed and acceleration from every program, used or not; keep them off while a correction is "
             "armed: the path would not be the one that was checked, and the guard refuses it"
         )
-    for loop in hal.loops_behind(f"joint.{joint}.motor-pos-cmd"):
-        gains = _gains(hal.given, loop)
-        yield (
-            f"axis {letter}: HAL's {loop} closes the position loop ({gains}); fdhil corrects drives that get position "
-            "set-points (0x607A) as they are: wire joint's motor-pos-cmd to the drive, and switch this loop off"
-        )
     least = ini.number(section, "MIN_FERROR")
     if least is not None and 0 < least * unit.factor < 2 * LARGEST_OFFSET_MM:  # and as many degrees
         yield (
             f"axis {letter}: [{section}] MIN_FERROR is {least * unit.factor:g} {unit.name}; an offset is a following "
             f"error to LinuxCNC: keep correction.max_offset_{'mdeg' if unit.name == 'deg' else 'um'} below a quarter "
             f"of it, or raise it to {4 * LARGEST_OFFSET_MM:g} {unit.name}"
+        )
+
+
+def _loops(hal: Hal, letter: str, joint: int) -> Iterator[str]:
+    """Say what a loop in HAL means for a drive that closes its own."""
+    for loop in hal.loops_behind(f"joint.{joint}.motor-pos-cmd"):
+        gains = _gains(hal.given, loop)
+        yield (
+            f"axis {letter}: HAL's {loop} closes the position loop ({gains}); fdhil corrects drives that get position "
+            "set-points (0x607A) as they are: wire joint's motor-pos-cmd to the drive, and switch this loop off"
         )
 
 

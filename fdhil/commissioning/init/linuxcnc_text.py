@@ -93,11 +93,16 @@ def _joined(text: str) -> Iterator[str]:
 
 @dataclass(slots=True)
 class Hal:
-    """Parameters that are set, the pins that each signal joins, and the components that are PID loops."""
+    """Parameters that are set, the pins that each signal joins, the components that are PID loops, those loaded at all.
+
+    ``threads`` has the functions of each thread, in their order.
+    """
 
     given: dict[str, str] = field(default_factory=dict)
     nets: dict[str, set[str]] = field(default_factory=dict)
     loops: set[str] = field(default_factory=set)
+    loaded: set[str] = field(default_factory=set)
+    threads: dict[str, list[str]] = field(default_factory=dict)
 
     def joined(self, pin: str) -> list[str]:
         """Return the other pins on a pin's signal, in alphabetical order."""
@@ -143,8 +148,13 @@ def parse_hal(text: str, ini: Ini, read: Read, hal: Hal, depth: int = 0) -> None
                 hal.nets.setdefault(signal, set()).update(pin for pin in pins if pin not in _HAL_ARROWS)
             case ["linkps", pin, *rest] if signals := [word for word in rest if word not in _HAL_ARROWS]:
                 hal.nets.setdefault(signals[0], set()).add(pin)
-            case ["loadrt" | "newinst", name, *arguments] if name in _PIDS:
-                hal.loops.update(_instances(name, arguments))
+            case ["loadrt" | "newinst", name, *arguments]:
+                hal.loaded.add(name)
+                hal.loops.update(_instances(name, arguments) if name in _PIDS else ())
+            case ["addf", function, thread, *position]:
+                functions = hal.threads.setdefault(thread, [])
+                place = int(position[0]) if position and position[0].lstrip("-").isdecimal() else -1
+                functions.insert(place - 1 if place > 0 else len(functions) + place + 1, function)
             case ["source", name] if depth < 8:
                 parse_hal(read(name), ini, read, hal, depth + 1)
 

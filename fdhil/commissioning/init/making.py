@@ -1,13 +1,13 @@
 """Makes a machine's configuration file: the order of the questions, the last check, and the text."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from fdhil.commissioning.init.draft import Ask, Draft
 from fdhil.commissioning.init.drives import FoundBus
-from fdhil.commissioning.init.interview import Found, axis_names, settle_axis, settle_machine
+from fdhil.commissioning.init.interview import Found, axis_names, settle_axis, settle_hal_axis, settle_machine
 from fdhil.commissioning.init.linuxcnc import Machine
 from fdhil.commissioning.init.told import Told
 from fdhil.config import CanBus, CorrectionLimits, parse, toml_document, unlikely
@@ -20,6 +20,7 @@ from fdhil.errors import ConfigError
 Look = Callable[[str, CanBus], FoundBus]
 """Find the drives on a bus; ConnectError."""
 
+HAL_PORT, HAL_LEAD = 5572, 20  # of the bridge: its TCP port, and by how many cycles offsets are sent ahead
 # from the gentlest on: what an axis of coarse increments, or an odd SYNC period, can keep
 LIMITS: tuple[Mapping[str, float], ...] = (
     {},
@@ -37,10 +38,12 @@ def make(
     ask: Ask | None = None,
     look: Look | None = None,
     interface: Told | None = None,
+    pins: Collection[str] | None = None,
 ) -> Draft:
     """Return a draft of the machine's configuration; ``look`` None: no bus is looked at.
 
-    ``interface`` is the CAN interface that this PC has. ConfigError with everything that is not known, where nobody
+    ``interface`` is the CAN interface that this PC has. ``pins``: the drives are HAL pins of ``nc``, these are the pins
+    that HAL has now (empty: it does not run). ConfigError with everything that is not known, where nobody
     can be asked; ConnectError.
     """
     draft = Draft(ask)
@@ -50,6 +53,8 @@ def make(
     for path, told in (nc.told if nc else {}).items():
         draft.tell(path, told)
     draft.notes += nc.notes if nc else []
+    if nc is not None and pins is not None:
+        return _of_hal(draft, file, nc, pins)
     ways = list(_buses(draft, interface, offline=look is None))
     buses = [look(name, settings) for name, settings in ways] if look else []
     settle_machine(draft, buses, file.stem, nc)
@@ -58,6 +63,24 @@ def make(
     names = axis_names(draft, nc, drives)
     for place, axis in enumerate(names):
         settle_axis(draft, axis, names[:place], Found(drives, complete), nc, file.parent)
+    if draft.missing:
+        raise ConfigError(str(file), draft.missing)
+    for axis in names:
+        _fit_limits(draft, axis)
+    return draft
+
+
+def _of_hal(draft: Draft, file: Path, nc: Machine, pins: Collection[str]) -> Draft:
+    """Make the draft of a machine whose drives are HAL pins, by the bridge that LinuxCNC runs."""
+    draft.notes = [note for note in draft.notes if note not in nc.loops]
+    bridge = {"interface": "socketcand", "channel": "hal", "port": HAL_PORT, "offset_lead_cycles": HAL_LEAD}
+    for key, value in bridge.items():
+        draft.tell(f"bus.hal.{key}", Told(value, "the bridge's"))
+    draft.tell("g0.source", Told("linuxcnc", "fdhil's HAL file loads the bridge"))
+    settle_machine(draft, (), file.stem, nc)
+    names = axis_names(draft, nc, ())
+    for place, axis in enumerate(names):
+        settle_hal_axis(draft, axis, names[:place], nc, pins)
     if draft.missing:
         raise ConfigError(str(file), draft.missing)
     for axis in names:

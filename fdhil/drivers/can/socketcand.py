@@ -57,7 +57,8 @@ class SocketcandPort:
         try:
             self._socket = socket.create_connection((settings.host, settings.port), CONNECT_TIMEOUT_S)
         except OSError as error:
-            text = f"the CAN hub {where} cannot be reached ({error}); start it or correct host and port"
+            start = "start it" if not settings.offset_lead_cycles else "start LinuxCNC with fdhil's HAL file"
+            text = f"the CAN hub {where} cannot be reached ({error}); {start} or correct host and port"
             raise ConnectError(name, text) from None
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -283,9 +283,11 @@ class Cia402Decoder:
         """
         if self._offset is None:
             return None
-        _, shown = self._shown(self.profile.offset, first, stop)
+        tick, shown = self._shown(self.profile.offset, first, stop)
         if shown.size and self._offset.queue.tick.size == 0:
             self._offset.held = int(shown[-1])
+            if self._shown_places[self.profile.offset][0] in self._every_sync:
+                return _as_shown(tick - first, shown, stop - first)
         return self._offset.rows(first, stop)
 
     def _read_back_demand(self, first: int, stop: int, offset: SetpointRows | None) -> SetpointRows | None:

@@ -37,6 +37,8 @@ def load_profile(drive: Drive) -> DriveProfile:
     reads a file once: what is changed on disk counts from its next start.
     """
     profile = read_profile(drive.profile, drive.eds)
+    if drive.source == "hal" and drive.hal is not None and drive.hal.voltage is None:
+        profile = replace(profile, voltage=None)
     if deaf := profile.unheard:
         what = f"no TPDO of every SYNC carries its {', '.join(deaf)}"
         raise _fault(

@@ -1,0 +1,163 @@
+"""Writes the HAL file that adds offsets between LinuxCNC's motion controller and the drives, and loads the bridges.
+
+    streamer -> limit3 -> offset, between joint.N.motor-pos-cmd and what it commanded; the feedback to the joint less it
+    heartbeat of the bridge -> oneshot, motion.motion-enabled, streamer not empty -> lut5 -> limit3.enable
+
+Only HAL's own components run in the servo thread. ``limit3`` bounds size, speed and acceleration of whatever comes, and
+brings the offset to zero when the bridge is silent, the streamer is empty or the machine is off. Pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from textwrap import wrap
+
+from fdhil.bridges import hal_bus, linuxcnc
+from fdhil.commissioning.init.linuxcnc_text import Hal
+from fdhil.config import MachineConfig, OffsetBounds
+from fdhil.errors import ConfigError, ConfigFault
+
+WATCHDOG_S = 0.05  # beyond the lead
+ALL_THREE = 0x8  # lut5: in-0 and in-1 and not in-2
+MARGIN = 1.1  # limit3's over the guard's limits: it never acts while the guard does its work
+OWN = ("streamer", "limit3", "offset", "oneshot", "lut5")
+
+
+@dataclass(frozen=True, slots=True)
+class Splice:
+    """Where an axis' offset goes in: the signals of its command and feedback, and the pins that the command drives."""
+
+    axis: str
+    joint: int
+    command: str
+    feedback: str
+    driven: tuple[str, ...]
+
+
+def splices_of(hal: Hal, joints: Mapping[str, int], axes: Sequence[str]) -> list[Splice]:
+    """Return where the offsets of ``axes`` go in; ConfigError that names the pin where HAL leaves no such place."""
+    found, faults = [], []
+    for axis in axes:
+        pins = tuple(f"joint.{joints[axis]}.motor-pos-{end}" for end in ("cmd", "fb"))
+        command, feedback = (next((s for s, on in hal.nets.items() if pin in on), "") for pin in pins)
+        driven = tuple(pin for pin in hal.joined(pins[0]) if pin != pins[1])
+        where = f"axis.{axis}.correction"
+        if not command or not feedback:
+            missing = pins[0] if not command else pins[1]
+            faults.append(ConfigFault(where, f"{missing} is on no signal of the HAL files", "wire it, or leave it out"))
+        elif command == feedback or not driven:
+            faults.append(ConfigFault(where, f"{pins[0]} commands no drive or pid component", "leave this section out"))
+        else:
+            found.append(Splice(axis, joints[axis], command, feedback, driven))
+    if faults:
+        raise ConfigError("HAL", faults)
+    return found
+
+
+def correction_hal(config: MachineConfig, file: str, joints: int, splices: Sequence[Splice], hal: Hal) -> str:
+    """Return the text of the HAL file of a machine with so many joints whose configuration is in ``file``.
+
+    Without ``splices`` it only loads the bridges.
+    """
+    return "\n".join([*_lines(config, file, joints, splices, hal), ""])
+
+
+def _lines(config: MachineConfig, file: str, joints: int, splices: Sequence[Splice], hal: Hal) -> Iterator[str]:
+    yield from _comment(
+        "Written by fdhil init. Load it last: HALFILE = this file, behind the others in [HAL] of the INI. Without it "
+        "LinuxCNC runs as before."
+    )
+    if splices:
+        yield from _components(config, splices, hal)
+        bus = config.bus[config.axis[splices[0].axis].drive.bus]
+        yield from _wiring(splices, WATCHDOG_S + bus.offset_lead_cycles * config.machine.sync_period_s)
+        yield from _order(splices, hal)
+    yield from _comment("The bridges: drives (pins of [axis.X.drive.hal]) and NC, a sampler each at the thread's end.")
+    linked = {pin for pins in hal.nets.values() for pin in pins}
+    types = "f" * joints + "ssff" + "b" * len(linked & set(linuxcnc.HOLDS))
+    port = config.nc_source.linuxcnc.port
+    for name, module, options in (
+        (hal_bus.NAME, hal_bus, f"{file} --also {types}"),
+        (linuxcnc.NAME, linuxcnc, f"--port {port} --channel 1"),
+    ):
+        yield f"loadusr -Wn {name} /usr/bin/python3 {Path(str(module.__file__)).resolve()} {options}"
+
+
+def _components(config: MachineConfig, splices: Sequence[Splice], hal: Hal) -> Iterator[str]:
+    yield from _comment("The limits below bound every offset, whatever fdhil sends; fdhil cannot change them.")
+    for name in (name for name in OWN if name in hal.loaded):
+        yield from _comment(
+            f"{name} is loaded by your HAL files already, and HAL loads a component once: add the names below to "
+            "that line with names=, and delete the line here."
+        )
+    yield f"loadrt streamer depth=1000 cfg=s{'f' * len(splices)}"
+    for component, prefix in (("limit3", "limit"), ("offset", "offset")):
+        yield f"loadrt {component} names={','.join(f'fdhil-{prefix}-{s.axis.lower()}' for s in splices)}"
+    yield "loadrt oneshot names=fdhil-watchdog"
+    yield "loadrt lut5 names=fdhil-gate"
+    period_s = config.machine.sync_period_s
+    for splice in splices:
+        axis, name = config.axis[splice.axis], f"fdhil-limit-{splice.axis.lower()}"
+        pins = axis.drive.hal
+        assert pins is not None  # those alone are spliced
+        unit, per_mm = pins.position_mm_per_unit, axis.scaling.increments_per_mm
+        offset, rate, acceleration, *_ = OffsetBounds.of(axis, period_s).whole
+        yield from _comment(
+            f"{splice.axis}: the limits of [axis.{splice.axis}.correction] and {MARGIN:g} times its rates"
+        )
+        limit = offset / per_mm / unit
+        speed = MARGIN * (rate + 1) / per_mm / period_s / unit
+        most = MARGIN * (acceleration + 2) / per_mm / period_s**2 / unit
+        for key, value in (("min", -limit), ("max", limit), ("maxv", speed), ("maxa", most)):
+            yield f"setp {name}.{key} {value:.9g}"
+
+
+def _wiring(splices: Sequence[Splice], watchdog_s: float) -> Iterator[str]:
+    yield from _comment("Offsets pass while the bridge's heart beats, the machine is on, and the streamer has rows.")
+    for key, value in (("width", watchdog_s), ("retriggerable", 1), ("rising", 1), ("falling", 1)):
+        yield f"setp fdhil-watchdog.{key} {value:g}"
+    yield f"setp fdhil-gate.function {ALL_THREE:#x}"
+    yield "net fdhil-alive fdhil-watchdog.out => fdhil-gate.in-0"
+    yield "net fdhil-machine-on motion.motion-enabled => fdhil-gate.in-1"
+    yield "net fdhil-empty streamer.0.empty => fdhil-gate.in-2"
+    yield "net fdhil-row streamer.0.pin.0"
+    enabled = " ".join(f"fdhil-limit-{s.axis.lower()}.enable" for s in splices)
+    yield f"net fdhil-on fdhil-gate.out => {enabled}"
+    for place, splice in enumerate(splices, 1):
+        x = splice.axis.lower()
+        yield from _comment(f"{splice.axis}: the command plus the offset goes to the drive, the joint sees it without.")
+        yield f"net fdhil-table-{x} streamer.0.pin.{place} => fdhil-limit-{x}.in"
+        yield f"net fdhil-applied-{x} fdhil-limit-{x}.out => fdhil-offset-{x}.offset"
+        yield f"net {splice.command} => fdhil-offset-{x}.in"
+        for pin in splice.driven:
+            yield f"unlinkp {pin}"
+        yield f"net fdhil-command-{x} fdhil-offset-{x}.out => {' '.join(splice.driven)}"
+        yield f"unlinkp joint.{splice.joint}.motor-pos-fb"
+        yield f"net {splice.feedback} => fdhil-offset-{x}.fb-in"
+        yield f"net fdhil-feedback-{x} fdhil-offset-{x}.fb-out => joint.{splice.joint}.motor-pos-fb"
+
+
+def _order(splices: Sequence[Splice], hal: Hal) -> Iterator[str]:
+    """Put the feedback before the motion controller, and the offset right behind it."""
+    thread, functions = next(((t, f) for t, f in hal.threads.items() if "motion-controller" in f), ("servo-thread", []))
+    before = [f"fdhil-offset-{s.axis.lower()}.update-feedback" for s in splices]
+    behind = ["streamer.0", "fdhil-watchdog", "fdhil-gate"]
+    behind += [f"fdhil-limit-{s.axis.lower()}" for s in splices]
+    behind += [f"fdhil-offset-{s.axis.lower()}.update-output" for s in splices]
+    if not functions:
+        yield from _comment("The order of your thread is unknown: put these right behind motion-controller by hand.")
+        yield from (f"addf {function} {thread}" for function in (*before, *behind))
+        return
+    controller = functions.index("motion-controller")
+    first = min(controller, functions.index("motion-command-handler") if "motion-command-handler" in functions else 99)
+    yield from _comment(f"In {thread}: feedback before function {first + 1}, offsets right behind motion-controller.")
+    for place, function in enumerate(before):
+        yield f"addf {function} {thread} {first + 1 + place}"
+    for place, function in enumerate(behind):
+        yield f"addf {function} {thread} {controller + 2 + len(before) + place}"
+
+
+def _comment(words: str) -> list[str]:
+    return wrap(words, 110, initial_indent="# ", subsequent_indent="# ")

@@ -1,0 +1,194 @@
+"""fdhil init for a machine of HAL pins: pins and gains from LinuxCNC's files, and the HAL file that adds offsets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fdhil.commissioning.init.draft import Draft
+from fdhil.commissioning.init.hal_file import correction_hal, splices_of
+from fdhil.commissioning.init.hal_pins import current_gains, propose_axis
+from fdhil.commissioning.init.linuxcnc import Machine, read_linuxcnc
+from fdhil.commissioning.init.linuxcnc_text import Hal, Ini, parse_hal
+from fdhil.commissioning.init.making import conclude, make
+from fdhil.config import MachineConfig, parse, toml_document
+from fdhil.errors import ConfigError
+
+SERVO_INI = """
+[EMCMOT]
+SERVO_PERIOD = 1000000
+[HAL]
+HALFILE = servo.hal
+[TRAJ]
+COORDINATES = X Z
+LINEAR_UNITS = {units}
+[KINS]
+KINEMATICS = trivkins coordinates=XZ
+[AXIS_X]
+MAX_VELOCITY = 20
+MAX_ACCELERATION = 100
+[JOINT_0]
+TYPE = LINEAR
+P = 50
+[AXIS_Z]
+MAX_VELOCITY = 20
+MAX_ACCELERATION = 100
+[JOINT_1]
+TYPE = LINEAR
+"""
+SERVO_HAL = """
+loadrt motmod
+loadrt pid names=pid.x,pid.z
+addf hm2_7i92.0.read servo-thread
+addf motion-command-handler servo-thread
+addf motion-controller servo-thread
+addf pid.x.do-pid-calcs servo-thread
+addf hm2_7i92.0.write servo-thread
+setp pid.x.Pgain [JOINT_0]P
+setp pid.x.FF1 0.98
+setp pid.x.FF2 0.0012
+setp pid.x.Dgain 2
+setp pid.x.deadband 0.001
+setp pid.x.error-previous-target false
+net x-cmd joint.0.motor-pos-cmd => pid.x.command
+net x-fb hm2_7i92.0.encoder.00.position => pid.x.feedback joint.0.motor-pos-fb
+net x-out pid.x.output => hm2_7i92.0.7i77.0.1.analogout0
+net z-cmd joint.1.motor-pos-cmd => hm2_7i92.0.stepgen.01.position-cmd
+net z-fb hm2_7i92.0.stepgen.01.position-fb => joint.1.motor-pos-fb
+"""
+AXIS: dict[str, Any] = {
+    "screw_pitch_mm": 5.0,
+    "nominal": {"R": 0.5, "L": 0.005, "K": 0.4, "Jt": 0.002, "ft": 0.001, "Cd": 0.2},
+    "regulators": {"current_limit_a": 20.0, "voltage_limit_v": 100.0},
+}
+
+
+def machine(tmp_path: Path, units: str = "mm") -> Machine:
+    (tmp_path / "mill.ini").write_text(SERVO_INI.format(units=units))
+    (tmp_path / "servo.hal").write_text(SERVO_HAL)
+    return read_linuxcnc(tmp_path / "mill.ini")
+
+
+def answers(**x: Any) -> dict[str, Any]:
+    hal = {"current": "hm2_7i92.0.7i77.0.1.analogin0"}
+    z = {**AXIS, "drive": {"hal": {"current": "hm2_7i92.0.7i77.0.1.analogin1"}}}
+    return {"axis": {"X": {**AXIS, "drive": {"hal": hal}} | x, "Z": z}}
+
+
+def made(
+    tmp_path: Path, nc: Machine, given: dict[str, Any], pins: list[str] | None = None
+) -> tuple[Draft, MachineConfig]:
+    draft = make(tmp_path / "mill.toml", given, nc, pins=pins or [])
+    return draft, parse(toml_document(conclude(draft, tmp_path / "mill.toml").encode(), "made"))
+
+
+def test_pins_and_gains_are_taken_from_the_files(tmp_path: Path) -> None:
+    draft, config = made(tmp_path, machine(tmp_path), answers(correction={}))
+    x, z = (config.axis[name].drive.hal for name in "XZ")
+    assert x is not None
+    assert z is not None
+    assert (x.position_command, x.position_feedback) == ("joint.0.motor-pos-cmd", "hm2_7i92.0.encoder.00.position")
+    assert (x.speed, x.enabled) == ("hm2_7i92.0.encoder.00.velocity", "joint.0.amp-enable-out")
+    assert z.speed == "hm2_7i92.0.stepgen.01.velocity-fb"
+    loop = config.axis["X"].regulators
+    assert (loop.structure, loop.pid_output, loop.position_gain_per_s) == ("linuxcnc_pid", "speed", 50.0)
+    assert (loop.speed_feedforward, loop.acceleration_feedforward_s, loop.deadband_mm) == (0.98, 0.0012, 0.001)
+    assert not loop.error_previous_target
+    assert config.g0.source == "linuxcnc"
+    assert config.bus["hal"].offset_lead_cycles > 0
+    told = "\n".join(draft.notes)
+    assert "the card measures no current" in told
+    assert "position is that of the pulses" in told
+    assert "switch this loop off" not in told
+
+
+def test_a_pid_that_commands_current_has_its_gains_converted(tmp_path: Path) -> None:
+    x: dict[str, Any] = {"regulators": {**AXIS["regulators"], "pid_output": "current"}}
+    x["drive"] = {"hal": {"current": "pid.x.output", "current_a_per_unit": 3.0}}
+    _, config = made(tmp_path, machine(tmp_path), answers(**x))
+    loop = config.axis["X"].regulators
+    assert (loop.position_gain_per_s, loop.position_derivative, loop.speed_ki) == (25.0, 1.0, 0.0)
+    assert loop.speed_kp == pytest.approx(2 * 3.0 * 5.0 / (2 * 3.14159265), rel=1e-5)
+
+
+def test_a_pid_that_commands_current_needs_a_derivative() -> None:
+    with pytest.raises(ValueError, match="needs a Dgain"):
+        current_gains({"position_gain_per_s": 50.0}, 1.0, 1.0, 5.0)
+
+
+def test_inches_are_converted(tmp_path: Path) -> None:
+    _, config = made(tmp_path, machine(tmp_path, "inch"), answers())
+    pins = config.axis["X"].drive.hal
+    assert pins is not None
+    assert (pins.position_mm_per_unit, pins.speed_mm_s_per_unit) == (25.4, 25.4)
+    assert config.axis["X"].regulators.deadband_mm == pytest.approx(0.0254)
+
+
+def test_without_a_current_the_axis_is_refused_by_its_key(tmp_path: Path) -> None:
+    given = answers()
+    given["axis"]["X"] = AXIS
+    with pytest.raises(ConfigError) as refused:
+        made(tmp_path, machine(tmp_path), given)
+    (fault,) = refused.value.faults
+    assert fault.path == "axis.X.drive.hal.current"
+
+
+def test_a_pin_that_a_running_hal_lacks_is_refused_by_its_name(tmp_path: Path) -> None:
+    running = ["joint.0.motor-pos-cmd", "joint.0.amp-enable-out", "hm2_7i92.0.encoder.00.position"]
+    running += ["joint.1.motor-pos-cmd", "joint.1.amp-enable-out", "hm2_7i92.0.stepgen.01.position-fb"]
+    with pytest.raises(ConfigError) as refused:
+        made(tmp_path, machine(tmp_path), answers(), running)
+    told = {fault.path: fault.what for fault in refused.value.faults}
+    assert told == {
+        f"axis.{x}.drive.hal.current": f"HAL has no pin hm2_7i92.0.7i77.0.1.analogin{k}" for k, x in enumerate("XZ")
+    }
+
+
+def test_an_unknown_component_is_named() -> None:
+    hal = Hal()
+    parse_hal("net fb mydrive.0.where => joint.0.motor-pos-fb\n", Ini({}), lambda _name: "", hal)
+    (note,) = propose_axis(hal, "X", 0, 1.0).notes
+    assert "component mydrive.0 is unknown" in note
+
+
+def test_the_offset_goes_between_the_motion_controller_and_the_loop(tmp_path: Path) -> None:
+    nc = machine(tmp_path)
+    _, config = made(tmp_path, nc, answers(correction={"max_offset_um": 40.0}))
+    text = correction_hal(config, "mill.toml", nc.joint_count, splices_of(nc.hal, nc.joints, "X"), nc.hal)
+    written = Hal(threads={"servo-thread": list(nc.hal.threads["servo-thread"])})
+    parse_hal(text, Ini({}), lambda _name: "", written)
+    order = written.threads["servo-thread"]
+    assert order.index("fdhil-offset-x.update-feedback") < order.index("motion-controller")
+    behind = ("motion-controller", "streamer.0", "fdhil-limit-x", "fdhil-offset-x.update-output", "pid.x.do-pid-calcs")
+    assert [f for f in order if f in behind] == list(behind)
+    assert written.joined("fdhil-offset-x.out") == ["pid.x.command"]
+    assert written.joined("fdhil-offset-x.fb-out") == ["joint.0.motor-pos-fb"]
+    assert {"fdhil-gate.out", "fdhil-limit-x.enable"} == written.nets["fdhil-on"]
+    assert float(written.given["fdhil-limit-x.max"]) == pytest.approx(0.04)
+    assert "--also ffssff" in text
+    assert "limit-z" not in text
+
+
+def test_a_component_that_is_loaded_already_is_named(tmp_path: Path) -> None:
+    nc = machine(tmp_path)
+    nc.hal.loaded.add("limit3")
+    _, config = made(tmp_path, nc, answers(correction={}))
+    text = correction_hal(config, "mill.toml", nc.joint_count, splices_of(nc.hal, nc.joints, "X"), nc.hal)
+    assert "# limit3 is loaded by your HAL files already" in text
+
+
+@pytest.mark.parametrize(
+    ("hal", "text"),
+    [
+        ("net x joint.0.motor-pos-cmd => joint.0.motor-pos-fb\n", "commands no drive"),
+        ("net x joint.0.motor-pos-cmd => pid.0.command\n", "joint.0.motor-pos-fb is on no signal"),
+        ("", "joint.0.motor-pos-cmd is on no signal"),
+    ],
+)
+def test_a_joint_that_offsets_cannot_reach_is_refused_by_its_pin(hal: str, text: str) -> None:
+    found = Hal()
+    parse_hal(hal, Ini({}), lambda _name: "", found)
+    with pytest.raises(ConfigError, match=text):
+        splices_of(found, {"X": 0}, "X")
