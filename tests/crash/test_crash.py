@@ -15,6 +15,7 @@ from fdhil.commissioning.progress import Progress
 from fdhil.daemon import blackbox
 from fdhil.errors import StoreError
 from fdhil.store import atomic
+from fdhil.system_clock import Clock
 from tests.crash import clocks, disks, injected
 from tests.crash.keepers import KEEPERS, Plain
 from tests.crash.loops import KINDS, Kind, tried
@@ -95,24 +96,22 @@ def test_steps_that_cannot_be_read_now_are_not_written_over(tmp_path: Path, monk
 
 
 @pytest.mark.fault("F9")
-def test_the_newest_black_box_stays_whatever_the_clock_shows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Clock:
+def test_the_newest_black_box_stays_whatever_the_clock_shows(tmp_path: Path) -> None:
+    class BackwardClock(Clock):
         """A clock that goes back a day each time."""
 
-        strptime = datetime.strptime
-        shown = datetime(2026, 11, 23, tzinfo=UTC)
+        shown_s = datetime(2026, 11, 23, tzinfo=UTC).timestamp()
 
-        @classmethod
-        def now(cls, zone: Any) -> datetime:
+        def wall_s(self) -> float:
             """Return what it shows."""
-            cls.shown -= timedelta(days=1)
-            return cls.shown.astimezone(zone)
+            self.shown_s -= timedelta(days=1).total_seconds()
+            return self.shown_s
 
-    monkeypatch.setattr(blackbox, "datetime", Clock)
+    clock = BackwardClock()
     (tmp_path / blackbox.FOLDER).mkdir()
     (tmp_path / blackbox.FOLDER / "20261120T010203.000004Z-Old.log").write_text("of before there were numbers")
     for number in range(12):
-        assert blackbox.dump(tmp_path, f"Made{number}", dict).code == "BlackBox"
+        assert blackbox.dump(tmp_path, f"Made{number}", dict, clock).code == "BlackBox"
     assert [box.code for box in blackbox.kept(tmp_path)] == [f"Made{number}" for number in range(4, 12)]
 
 

@@ -116,7 +116,7 @@ def settle_axis(
         draft.tell(f"axis.{axis}.{key}", told)
     _settle_scale(draft, axis, scale, others)
     for question in QUESTIONS:
-        if _applies(question.key, profile) and (question.key != "radius_mm" or _is_rotary(draft, axis)):
+        if _applies(question.key, profile, _is_rotary(draft, axis)):
             _settle(draft, axis, question, others)
     if drive is not None:
         _tell_window(draft, axis, drive.window_increments)
@@ -155,7 +155,7 @@ def settle_hal_axis(draft: Draft, axis: str, others: Sequence[str], nc: Machine,
     _settle_pid(draft, here, nc.unit_mm)
     profile = load_profile(Drive(source="hal", hal=ANY_PINS))
     for question in QUESTIONS:
-        if question.key != "drive.increments_per_rev" and _applies(question.key, profile):
+        if question.key != "drive.increments_per_rev" and _applies(question.key, profile, rotary=False):
             _settle(draft, axis, question, others)
     for key in (*HAL_WHERE, "speed", "torque", "voltage", "enabled", "position_command"):
         pin = draft.get(f"{here}.drive.hal.{key}")
@@ -313,7 +313,9 @@ def _path(draft: Draft, axis: str, key: str) -> str:
     return f"axis.{axis}.{angular(key) if _is_rotary(draft, axis) else key}"
 
 
-def _applies(key: str, profile: DriveProfile | None) -> bool:
+def _applies(key: str, profile: DriveProfile | None, rotary: bool) -> bool:
+    if key == "radius_mm":
+        return rotary
     if key in UNITS_OF_CURRENT:
         return profile is not None and profile.current_unit in UNITS_OF_CURRENT[key]
     return key != "drive.dc_link_v" or needs_dc_link(profile)

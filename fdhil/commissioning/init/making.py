@@ -8,14 +8,14 @@ from typing import Any
 from fdhil.commissioning.init.draft import Ask, Draft
 from fdhil.commissioning.init.drives import FoundBus
 from fdhil.commissioning.init.interview import Found, axis_names, settle_axis, settle_hal_axis, settle_machine
-from fdhil.commissioning.init.linuxcnc import Machine
+from fdhil.commissioning.init.linuxcnc import ROTARY, Machine
 from fdhil.commissioning.init.told import Told
-from fdhil.config import CanBus, CorrectionLimits, parse, toml_document, unlikely
+from fdhil.config import CanBus, CorrectionLimits, is_second_drive, parse, toml_document, unlikely
 from fdhil.config.axis import Axis
 from fdhil.config.offset_bounds import limit_faults
 from fdhil.config.reading import checked
 from fdhil.config.template import filled
-from fdhil.errors import ConfigError
+from fdhil.errors import ConfigError, ConfigFault
 
 Look = Callable[[str, CanBus], FoundBus]
 """Find the drives on a bus; ConnectError."""
@@ -78,9 +78,17 @@ def _of_hal(draft: Draft, file: Path, nc: Machine, pins: Collection[str]) -> Dra
         draft.tell(f"bus.hal.{key}", Told(value, "the bridge's"))
     draft.tell("g0.source", Told("linuxcnc", "fdhil's HAL file loads the bridge"))
     settle_machine(draft, (), file.stem, nc)
-    names = axis_names(draft, nc, ())
+    names = [axis for axis in axis_names(draft, nc, ()) if axis not in ROTARY]
+    for axis in set(nc.axes) & set(ROTARY):
+        draft.values = {path: told for path, told in draft.values.items() if not path.startswith(f"axis.{axis}.")}
+        draft.values.pop("nc.wrapped_axes", None)
+        draft.notes.append(f"axis {axis}: rotary axes are not read from HAL pins; programs that move it are refused")
     for place, axis in enumerate(names):
-        settle_hal_axis(draft, axis, names[:place], nc, pins)
+        if is_second_drive(axis):
+            text, advice = "is the second drive of a gantry: HAL pins of two are not supported", "leave the axis out"
+            draft.missing.append(ConfigFault(f"axis.{axis}", text, advice))
+        else:
+            settle_hal_axis(draft, axis, names[:place], nc, pins)
     if draft.missing:
         raise ConfigError(str(file), draft.missing)
     for axis in names:
