@@ -49,7 +49,7 @@ def advise(
     out: Path | None,
     as_json: bool,
 ) -> int:
-    """Tell the highest feed within a tolerance for each line of a PROGRAM (NC program), or zone of a demand CSV.
+    """Compute the highest feed that keeps a tolerance, for each line of PROGRAM or each zone of a demand CSV.
 
     Only what leaves the tolerance as programmed is listed, lines that follow each other in one range: F as programmed
     and as it may be (mm/min), the worst place and why, and the highest feed there with the inverse correction. All

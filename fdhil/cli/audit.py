@@ -18,7 +18,7 @@ from fdhil.cli.options import AS_JSON, CONFIG
 @AS_JSON
 @verdict
 def audit(config: Path, last: int, as_json: bool) -> int:
-    """Show who asked the machine of CONFIG for what, what he was answered, and whether no line was changed since.
+    """Show the audit log of CONFIG's machine, and check that no line of it was changed.
 
     Exit 1 when a line was changed, left out or moved, or was cut off by a power failure.
     """

@@ -59,11 +59,11 @@ def commission(
     Reads and compares the drive's set-up, asks, switches the drive on, moves the axis by 10 um, finds out where the
     offset acts, proves the drive's watchdog, and writes the signed record into the store. Where --room allows it, the
     axis is then jogged, moved as by G0, identified, and compared with what the identified model predicts; each step
-    says before what it moves. A step that was done is not done again while drive and configuration are the same, so
-    what was stopped goes on where it ended. Whatever fails, also Ctrl-C, the axis is braked, the offset goes back to
-    zero and the drive is switched off. With --set-pdos nothing moves: what differs from the profile in the drive's PDOs
-    is written and saved, and that is all. Exit codes: 0 commissioned, 1 refused, by you or because the drive is not set
-    up as it must be, 2 wrong option or configuration, 3 the drive or the bus cannot be reached.
+    says before what it moves. Completed steps are skipped unless the drive or the configuration changed, so a run
+    that was stopped continues where it ended. Whatever fails, also Ctrl-C, the axis is braked, the offset goes back
+    to zero and the drive is switched off. With --set-pdos nothing moves: what differs from the profile in the
+    drive's PDOs is written and saved, and that is all. Exit codes: 0 commissioned, 1 refused, by you or because the
+    drive is not set up as it must be, 2 wrong option or configuration, 3 the drive or the bus cannot be reached.
     """
     machine = machine_config.load(config)
     # an axis of HAL pins without offsets has nothing to prove

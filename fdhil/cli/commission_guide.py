@@ -79,4 +79,4 @@ def room_of(given: tuple[float, float] | None) -> Room | None:
 def confirm(axis: str, question: str, advice: str) -> None:
     """DriveFault unless the operator says yes; ``advice`` says how things stand then, and what to do."""
     if not agreed(question):
-        raise DriveFault(f"drive {axis}", f"nobody said yes; {advice}")
+        raise DriveFault(f"drive {axis}", f"not confirmed; {advice}")

@@ -39,7 +39,7 @@ STATES: Mapping[bool | None, tuple[str, str]] = {
               help="EDS or DCF file, or a folder of them; left out: the folder of CONFIG.")  # fmt: skip
 @AS_JSON
 def scan(config: Path, places: tuple[Path, ...], as_json: bool) -> None:
-    """List what is on the CAN buses of CONFIG: node-IDs, identity, device name, NMT state, heartbeat, fitting EDS.
+    """List the nodes on CONFIG's CAN buses: node-ID, identity, device name, NMT state, heartbeat, matching EDS.
 
     Listens for some seconds and then only reads, by SDO. Where an NC runs the bus (SYNC, NMT commands, set-points or
     SDO requests are heard) nothing at all is sent, and the list holds what was heard. Exit codes: 0 something was
@@ -112,7 +112,7 @@ def _node_row(node: Node, unanswered: str) -> list[str]:
 @AS_JSON
 @verdict
 def check(config: Path, as_json: bool) -> int:
-    """Check that the machine on the bus is the one in CONFIG: identity, mapping, scales, cycle, rapid signal, sensors.
+    """Compare the drives on the bus with CONFIG: identity, mapping, scales, cycle, rapid signal, sensors.
 
     Each point is ok, differs (with what was expected, what was found and what to do), or could not be compared. Only
     listens and reads; where an NC runs the bus it only listens, and what belongs to the NC's SDO channel is not

@@ -33,7 +33,7 @@ MOST_NAMED = 6
 @AS_JSON
 @verdict
 def eds(file: Path, name: str | None, as_json: bool) -> int:
-    """Tell from FILE, an EDS or DCF, what fdhil can and cannot do with this drive, and why.
+    """Show what fdhil can and cannot do with the drive that FILE, an EDS or DCF, describes, and why.
 
     Suggests a profile by the maker, and the PDOs to set up; names the objects that may be a motor voltage, a DC link or
     a current. Nothing is sent. An EDS is what the maker says: the drive itself may differ. Exit codes: 0 it can be

@@ -35,7 +35,7 @@ def with_extra() -> Iterator[None]:
 @CONFIG
 @LINES
 def uplink(config: Path, as_json: bool) -> None:
-    """Send what the daemon of CONFIG records to the works, over NATS JetStream.
+    """Send the records of CONFIG's daemon to the fleet server, over NATS JetStream.
 
     A process of its own that reads the store: the daemon never waits for it, and what is recorded while the server is
     away is sent later, each record once and in its order. [uplink] of CONFIG says where to; without it nothing is sent,
@@ -70,7 +70,7 @@ class Questions(click.Group):
 
 @click.group(cls=Questions)
 def fleet() -> None:
-    """Gather what many machines tell, and ask all of them.
+    """Collect and compare the histories of many machines.
 
     FLEET is a file of the works, not of a machine: which NATS server, which PostgreSQL database, where windows are
     kept. Needs the extra 'fleet'.
@@ -81,7 +81,7 @@ def fleet() -> None:
 @FLEET
 @LINES
 def collect(fleet: Path, as_json: bool) -> None:
-    """Gather what the machines tell in the database of FLEET.
+    """Collect the machines' records in the database of FLEET.
 
     It comes from JetStream. Any number of these may run, on one computer or several. Makes the stream and the tables
     where there are none yet. Stops on SIGTERM or Ctrl-C.
@@ -113,7 +113,7 @@ def _answer(fleet: Path, question: str, **given: str | None) -> dict[str, Any]:
 @FLEET
 @AS_JSON
 def status(fleet: Path, as_json: bool) -> None:
-    """Show all machines, and what is due.
+    """Show all machines and their due maintenance.
 
     When each was heard, which records are missing, how many notices wait, its parameters.
     """
@@ -131,7 +131,7 @@ def status(fleet: Path, as_json: bool) -> None:
 @AS_JSON
 @verdict
 def trend(fleet: Path, machine: str, axis: str, parameter: str, as_json: bool) -> int:
-    """Show how one parameter of one axis moved.
+    """Show the history of one parameter of one axis.
 
     With its slope per 30 days. Exit 1 when nothing is known of it.
     """
@@ -166,7 +166,7 @@ def compare(fleet: Path, parameter: str, by: str, axis: str | None, as_json: boo
 @AS_JSON
 @verdict
 def outliers(fleet: Path, by: str, axis: str | None, as_json: bool) -> int:
-    """Name the axes that are unlike their sisters.
+    """List the axes that differ from comparable axes.
 
     Exit 1 when there are some. Sisters are the same axis of machines with the same label; at least five are needed.
     Temperature and age, since the first set or the newest service, are taken into account. Of a hundred groups without

@@ -23,7 +23,7 @@ from fdhil.config.fleet import load
 def service(
     fleet: Path, machine: str, axis: str | None, at: datetime | None, note: str, remove: bool, as_json: bool
 ) -> None:
-    """Enter that an axis was serviced.
+    """Record a service of an axis.
 
     Its age and its limits count from there; fdhil fleet services tells what each service changed.
     """
@@ -48,7 +48,7 @@ def service(
 @click.option("--machine", help="One machine only.")
 @AS_JSON
 def services(fleet: Path, machine: str | None, as_json: bool) -> None:
-    """Show all services, and what each changed.
+    """Show all services and what each changed.
 
     The newest first; the sets before and after it, with the 95 % interval.
     """
@@ -63,7 +63,7 @@ def services(fleet: Path, machine: str | None, as_json: bool) -> None:
 @FLEET
 @AS_JSON
 def retain(fleet: Path, as_json: bool) -> None:
-    """Let go of what [retention] of FLEET does not keep.
+    """Delete records that [retention] of FLEET does not keep.
 
     Whole months of records, and the files of windows. Started once a day, by a timer. The first parameters of each axis
     stay, and nothing that goes is called missing.
@@ -87,7 +87,7 @@ def retain(fleet: Path, as_json: bool) -> None:
 @click.option("--key", type=FILE, help="The key of the names; left out: anonymous.key beside FLEET, made at first.")
 @AS_JSON
 def export(fleet: Path, folder: Path, labels: tuple[str, ...], key: Path | None, as_json: bool) -> None:
-    """Write what the machines told, without names.
+    """Export the machines' records without names.
 
     Parquet files: machines have a keyed digest for a name, times are ages in months, texts and labels are left out but
     for those that are asked for. Who keeps the key can find a machine again; never give it away.
@@ -111,7 +111,7 @@ def export(fleet: Path, folder: Path, labels: tuple[str, ...], key: Path | None,
 @click.option("--port", type=click.IntRange(0, 65535), help="TCP port; 0 takes a free one. Left out: web.port.")
 @click.option("--json", "as_json", is_flag=True, help="Tell the address as a JSON object on stdout.")
 def web(fleet: Path, host: str | None, port: int | None, as_json: bool) -> None:
-    """Serve the page of all machines to browsers.
+    """Serve the page of all machines.
 
     What is due, who is unlike its sisters, how each axis moved. It reads the database and reaches no machine. It
     listens on this computer alone; beyond it only with TLS and users ([web] of FLEET, as of a machine). Stops on
@@ -141,7 +141,7 @@ def web(fleet: Path, host: str | None, port: int | None, as_json: bool) -> None:
 @click.option("--remove", is_flag=True, help="Take the user out.")
 @AS_JSON
 def web_user(fleet: Path, name: str, remove: bool, as_json: bool) -> None:
-    """Say who may log in to the page of all machines.
+    """Manage the users of the page of all machines.
 
     Gives the user NAME a password, or takes the user out. The password is asked for, or is the first line of standard
     input where that is no terminal.

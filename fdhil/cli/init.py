@@ -57,7 +57,7 @@ def init(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Make the configuration FILE of a machine, from nothing: an NC's own files, the drives, then questions.
+    """Create the configuration FILE of a machine from the NC's own files, the drives, and questions.
 
     Reads LinuxCNC's files where they are named, listens to the CAN bus and, where no NC runs it, asks the drives for
     their scales and ratings; what nobody tells is asked, with a proposal where one can be made. Nothing is written to a

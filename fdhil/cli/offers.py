@@ -26,7 +26,7 @@ MOST_BY, MOST_REASON = 64, 200
 
 @click.group()
 def offers() -> None:
-    """Look at the changes of the configuration that the works offers, and accept or reject them.
+    """List, accept or reject proposed configuration changes.
 
     An offer is signed, comes by fdhil uplink or as a file, and does nothing by itself. Needs the extra 'fleet'.
     """
@@ -38,7 +38,7 @@ def offers() -> None:
 @AS_JSON
 @verdict
 def list_(config: Path, files: tuple[Path, ...], as_json: bool) -> int:
-    """Show the offers for the machine of CONFIG.
+    """List the changes that are proposed for CONFIG's machine.
 
     And those of FILES: what each would change, and what that costs. Nothing is changed. Exit 1 when one of FILES cannot
     be accepted.
@@ -63,7 +63,7 @@ def list_(config: Path, files: tuple[Path, ...], as_json: bool) -> int:
 @AS_JSON
 @verdict
 def accept(config: Path, offer: Path, by: str, may_loosen: bool, as_json: bool) -> None:
-    """Write what OFFER changes into CONFIG.
+    """Write the changes of OFFER into CONFIG.
 
     The old file is kept beside it. OFFER is a name of the list, or a file. Signature, time, version and the new
     configuration are looked at once more. A daemon that runs goes on as it is until it is started anew; nothing is
@@ -88,7 +88,7 @@ def accept(config: Path, offer: Path, by: str, may_loosen: bool, as_json: bool) 
 @click.option("--reason", required=True, help="Why not, for the works.")
 @AS_JSON
 def reject(config: Path, offer: Path, by: str, reason: str, as_json: bool) -> None:
-    """Note that OFFER is not wanted, and why.
+    """Reject OFFER, with a reason.
 
     The works is told; nothing else is changed at the machine of CONFIG.
     """

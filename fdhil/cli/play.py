@@ -209,7 +209,7 @@ def _ask(bench: Bench, program: Path, here: list[int]) -> None:
         "Is everybody out of reach, is the emergency stop within it, and may the axes move?"
     )
     if not agreed(question):
-        raise DriveFault("the bench", "nobody said yes, and nothing moved; start again, with --yes where nobody is")
+        raise DriveFault("the bench", "not confirmed; nothing moved; start again, with --yes where nobody is")
 
 
 def _document(as_json: bool, more: Mapping[str, Any]) -> None:

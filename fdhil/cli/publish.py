@@ -24,11 +24,11 @@ EXTRAS: Mapping[str, str] = {"prometheus": "web", "mtconnect": ""}  # the others
 )
 @LINES
 def publish(protocol: str, config: Path, devices: Path | None, as_json: bool) -> None:
-    """Publish over PROTOCOL what the daemon of CONFIG knows: parameters with intervals, verdicts, alarms, offsets.
+    """Publish the values of CONFIG's daemon over PROTOCOL: parameters with intervals, verdicts, alarms, offsets.
 
     A process of its own for each protocol, which only asks the daemon for its status: nothing that comes over the
     network reaches the machine. [publish.PROTOCOL] of CONFIG says where; by default no other computer can reach it.
-    While the daemon is silent no value is told, and it is asked on. Stops on SIGTERM or Ctrl-C.
+    While the daemon does not respond, no values are published; polling continues. Stops on SIGTERM or Ctrl-C.
     """
     if devices is not None and protocol != "mtconnect":
         raise click.UsageError("--devices is of use with mtconnect alone")

@@ -30,7 +30,7 @@ HEALTH = ("slopes", "trends", "limits", "changes", "windows")
 @AS_JSON
 @verdict
 def replay(recordings: tuple[Path, ...], config: Path | None, method: str | None, as_json: bool) -> None:
-    """Analyse recorded windows (.parquet) or recordings (.csv) again, bit by bit as the daemon did.
+    """Repeat the analysis of recorded windows (.parquet) or recordings (.csv), bit for bit as the daemon does.
 
     Windows of one axis are fed in the order given, so that a pool of them is repeated too. Exit 1 when a window is not
     validated, or there is none.
@@ -117,7 +117,7 @@ def _config_of(window: Window) -> machine_config.MachineConfig:
 )
 @AS_JSON
 def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) -> None:
-    """Show how the parameters of CONFIG's machine moved: revisions, slopes, changes, maintenance dates, notices."""
+    """Show the history of CONFIG's machine: revisions, slopes, changes, maintenance dates, notices."""
     machine = machine_config.load(config)
     from fdhil.report.history_reading import by_axis, read_history, read_notices
 
@@ -159,7 +159,7 @@ def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) ->
 @COLUMNS
 @AS_JSON
 def export(recording: Path, out: Path, format_name: str | None, columns: Path | None, as_json: bool) -> None:
-    """Write RECORDING in another file format.
+    """Convert RECORDING to another file format.
 
     RECORDING is a stored window (.parquet), a recording in any format (csv, parquet, mat, mdf4, hdf5), or with
     --columns another program's file. A log of the bus (.log of the black box or candump, .blf, .asc, .trc) becomes

@@ -65,7 +65,7 @@ def _ask(
 @CONFIG
 @AS_JSON
 def status(config: Path, as_json: bool) -> None:
-    """Ask the running daemon of CONFIG how it is: parameters, windows, frames, guard, notices."""
+    """Show the status of CONFIG's daemon: parameters, windows, frames, guard, notices."""
     from fdhil.daemon.status import config_difference
 
     answer = _ask(config, {"request": "status"})
@@ -205,7 +205,7 @@ def _disarm_at_the_guard(config: Path, silent: DeviceError) -> Mapping[str, Any]
 @AS_JSON
 @verdict
 def adopt(config: Path, yes: bool, as_json: bool) -> None:
-    """Ramp to zero what an earlier correction may have left in the drives of CONFIG (the guard's state FROZEN).
+    """Take over the offsets that CONFIG's drives still apply (the guard's state FROZEN), and ramp them to zero.
 
     Says what may still be applied, asks, and has the guard take it over and ramp it to zero. The guard is asked itself:
     no daemon is needed. Hold the feed first. Exit 0 only when zero was read back, 1 when the guard refuses or zero is
@@ -252,7 +252,7 @@ def _adopted(guard: GuardClient, token: Callable[[], str], yes: bool, quiet: boo
     if not quiet:
         click.echo(f"the guard is {state}: {stands}", err=True)
     if not yes and not agreed("Is the feed held? Ramp it to zero now?"):
-        raise DriveFault("adoption", f"nobody said yes, and nothing was sent; {stands}; {UNASKED}")
+        raise DriveFault("adoption", f"not confirmed; nothing was sent; {stands}; {UNASKED}")
     try:
         answer = guard.adopt(token())
         return verdict(landed(guard.status)) if answer["ok"] else {**answer, "may_stand_um": dict(stands.offset_um)}

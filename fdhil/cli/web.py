@@ -20,7 +20,7 @@ from fdhil.errors import ConfigError, ConfigFault
 @click.option("--port", type=click.IntRange(0, 65535), help="TCP port; 0 takes a free one. Left out: web.port.")
 @click.option("--json", "as_json", is_flag=True, help="Tell the address as a JSON object on stdout.")
 def web(config: Path, host: str | None, port: int | None, as_json: bool) -> None:
-    """Serve the pages of the machine in CONFIG to browsers: what the daemon and the store know.
+    """Serve the pages that show CONFIG's machine in a browser, from its daemon and store.
 
     It is a client of the daemon and opens no bus, so that a browser cannot disturb the machine. It listens on this
     computer alone; beyond it only with TLS and users. Acting needs a login with the role operate and web.acting = true.

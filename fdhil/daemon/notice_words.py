@@ -52,7 +52,7 @@ WORDS: Mapping[str, tuple[str, str]] = {
     "ScaleSuspect": ("what is identified is wrong by that share", "compare the scaling with the drive: fdhil check"),
     "PitchSuspect": ("what is identified is wrong by that share", "compare screw_pitch_mm with the machine"),
     "MovesNotUsed": ("no rapid of this axis is identified", "see the reason in the text; look at [g0]"),
-    "NcSilent": ("which moves are rapids is not known, none is used", "see that the NC and its interface run"),
+    "NcSilent": ("rapid moves cannot be recognised; none is used", "see that the NC and its interface run"),
     "GantrySkew": (
         "the beam may be skewed; a correction of this machine is ramped to zero",
         "stop the axis, compare both drives' positions and couplings, then arm again",
@@ -76,7 +76,7 @@ WORDS: Mapping[str, tuple[str, str]] = {
     "ValidationFailed": (_OLD_SET, "look at the newest rapids and why they were refused"),
     "LoadChanged": ("predictions are made for the load before it", "see whether the load is meant"),
     "ParameterJump": (_OLD_SET + " until more rapids agree", "look at the axis; more rapids confirm it or not"),
-    "MaintenanceDue": ("the axis works on, but not as it was", "plan the maintenance of this axis"),
+    "MaintenanceDue": ("the axis still works, but its condition has degraded", "plan the maintenance of this axis"),
     "CalibrationSuspect": ("a sensor's gain may be wrong, and K, R with it", "compare the sensor with another one"),
     # this PC
     "ResourceHigh": ("the system ends the daemon when nothing is left", "restart it at rest, and report what grew"),

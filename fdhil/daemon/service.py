@@ -333,7 +333,7 @@ class Service:
         if request["request"] == "stop":
             self._begin_to_stop()
             return {"ok": True, "text": "stopping"}
-        text = f"{request['request']!r} is no request"
+        text = f"{request['request']!r} is an unknown request"
         return refusal("BadRequest", text, "send status, live, arm, disarm, acknowledge or stop")
 
     async def _socket_lost(self, trouble: str) -> None:

@@ -111,7 +111,7 @@ def read(document: bytes, trusted: Collection[str]) -> Offer:
     line, _, rest = document.partition(b"\n")
     found = _SIGNED.fullmatch(rest.removesuffix(b"\n"))
     if len(document) > LARGEST or found is None or not rest.endswith(b"\n"):
-        raise OfferRefused("it is no offer of a works, or was cut off; have the file written again")
+        raise OfferRefused("it is not a valid change file (corrupt or truncated); export it again")
     key = found[1].decode()
     if key not in trusted:
         text = f"it is signed with {key}, which is no key of [offers] trust"

@@ -105,7 +105,9 @@ class Client:
         self.inbox, self.heard_s = rest, now_s
         document = parse_line(line)
         if document is None:
-            self.reply({}, ok=False, code="BadRequest", text="the line is no request", advice="send a JSON object")
+            self.reply(
+                {}, ok=False, code="BadRequest", text="the line is no valid request", advice="send a JSON object"
+            )
         return document
 
     def _receive(self) -> None:

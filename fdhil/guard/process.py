@@ -362,7 +362,7 @@ class Guard:
         elif kind in DECIDED:
             self._queue(client, document, parse_request(kind, document, self.settings))
         else:
-            told = f"{kind[:40]!r} is no request" if isinstance(kind, str) else "the request has no name"
+            told = f"{kind[:40]!r} is an unknown request" if isinstance(kind, str) else "the request has no name"
             client.reply(document, ok=False, code="BadRequest", text=told, advice=f"use one of {', '.join(DECIDED)}")
 
     def _queue(self, client: Client, document: Document, request: Request) -> None:

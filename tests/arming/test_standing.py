@@ -335,7 +335,7 @@ def test_adopt_says_what_stands_asks_and_ends_at_zero(
         code, _, err = fdhil("adopt", machine, capsys=capsys)
         assert (code, guard.heard) == (3, ["status"])
         assert f"the guard is FROZEN: {STANDS}" in err
-        assert f"nobody said yes, and nothing was sent; {STANDS}; hold the feed and run it again" in err
+        assert f"not confirmed; nothing was sent; {STANDS}; hold the feed and run it again" in err
         guard.heard.clear()
         now.insert(0, FROZEN)
     monkeypatch.setattr("click.termui.visible_prompt_func", lambda _text: "y")

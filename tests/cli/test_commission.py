@@ -184,7 +184,7 @@ def test_who_does_not_agree_is_not_moved(said: str, code: int, bench: Bench) -> 
     got, out, err = bench.commission(said=said)
     assert (got, "jog: " in out) == (code, False)
     assert ("is not tried by moving it" in out) is (code == 0)
-    assert ("nobody said yes; the axis was not moved, its record holds" in err) is ("130" in said)
+    assert ("not confirmed; the axis was not moved, its record holds" in err) is ("130" in said)
     assert ("'far' is not two numbers" in err) is ("far" in said)
     assert load_record(bench.store, "X") is not None
     assert bench.peer.drive.power.state.name == "SWITCH_ON_DISABLED"

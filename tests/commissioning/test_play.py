@@ -199,7 +199,7 @@ def refused(floor: Floor, text: str = STROKE, *options: str) -> str:
 @pytest.mark.usefixtures("long_computation")
 def test_what_is_not_as_it_must_be_is_refused(floor: Floor, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stdin", io.StringIO())
-    assert "nobody said yes" in refused(floor)
+    assert "not confirmed" in refused(floor)
     floor.peers["X"].drive.set_object(0x6007, 0, 0)
     assert "0x6007" in refused(floor, STROKE, "--yes")
     (floor.config.store.directory / "commissioning-X.void").write_text("{}")

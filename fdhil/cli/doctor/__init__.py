@@ -31,7 +31,7 @@ SCHEMA = "fdhil-doctor-1"
 @AS_JSON
 @verdict
 def doctor(config: Path, offline: bool, as_json: bool) -> int:
-    """Tell what is wrong with this PC, bus, drives, sensors, store, clock and rights: what to mend first comes first.
+    """Diagnose the PC, bus, drives, sensors, store, clock and rights; the most urgent problem comes first.
 
     Only looks: it writes nothing, and sends nothing where an NC runs the bus (with the NC off the drives are read, as
     by fdhil check). What cannot be examined before something else is mended is left out, so mend, and run it again.
