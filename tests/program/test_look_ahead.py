@@ -17,7 +17,7 @@ from fdhil.correction import plan as correct
 from fdhil.correction import streaming
 from fdhil.prediction.models import nominal_models
 from fdhil.program import Arc, Dwell, Feed, Motion, Rapid, plan
-from fdhil.program.motions import BLEND, Corner
+from fdhil.program.motions import BLEND, ORIGIN, Corner, Place, reached
 from fdhil.program.planner import stream
 from fdhil.program.planner.limits import AxisLimits
 from fdhil.program.planner.pieces import LENGTH, piece, points
@@ -63,13 +63,14 @@ def random_moves(seed: int, count: int = 12) -> list[Motion]:
 
 def dense_path(moves: Sequence[Motion], config: MachineConfig) -> Float:
     """The programmed path itself, finely."""
-    at, parts = (0.0, 0.0, 0.0), []
+    at: Place = ORIGIN
+    parts = []
     for move in moves:
         assert not isinstance(move, Dwell)
         row = np.array(piece(move, at, AxisLimits.of(config)))
         share = np.linspace(0.0, row[LENGTH], 10001)
         parts.append(points(np.repeat(row[None], share.size, axis=0), share))
-        at = move.end
+        at = reached(move, at)
     return np.concatenate(parts)[:, :2]
 
 
