@@ -152,6 +152,7 @@ def _best(problem: Problem, tolerance_um: float, configured: bool) -> Fit:
 
 def _grown(made: Fit, tolerance_um: float) -> Fit:
     """Let keys join, the likeliest first, as long as it is worth it; two at once where that is worth more."""
+    begun = made.problem.names
     while beyond_rounding_um(made) > enough_um(tolerance_um):
         options = [option for option in (*SINGLE_KEYS, *FILTERS) if not {*option} & {*made.problem.names}]
         starts = loop_fit.likeliest(made, options)[:MOST_TRIED] if options else []
@@ -160,6 +161,18 @@ def _grown(made: Fit, tolerance_um: float) -> Fit:
         if not made.unexplained_um - grown.unexplained_um > worth_um(made, tolerance_um):
             break
         made = grown
+    return _without_spare_keys(made, [name for name in made.problem.names if name not in begun], tolerance_um)
+
+
+def _without_spare_keys(made: Fit, joined: Sequence[str], tolerance_um: float) -> Fit:
+    """Return the fit without those of several keys that joined whose part the others take."""
+    for name in joined if len(joined) > 1 else ():
+        problem, place = made.problem, made.problem.names.index(name)
+        names = tuple(other for other in problem.names if other != name)
+        fewer = replace(problem, axis=with_regulators(problem.axis, **{name: 0}), names=names)
+        without = loop_fit.fit(fewer, np.delete(made.coordinates, place))
+        if without.unexplained_um - made.unexplained_um <= worth_um(without, tolerance_um):
+            made = without
     return made
 
 

@@ -224,6 +224,17 @@ def difference_covariance(one: tuple[Window, Estimate], other: tuple[Window, Est
     return covariance
 
 
+def change_covariance(window: Window, estimate: Estimate) -> Float:
+    """Return the covariance (6, 6) by which an estimate is compared with earlier ones of the same drive.
+
+    How set-points step within long rows is the same in all of them, and hides no change.
+    """
+    own, systematic, alias = _of_six(*_parts(window, estimate))
+    part = _unshared(window, systematic)
+    covariance: Float = own + part @ part.T + np.diag(alias**2)
+    return covariance
+
+
 def _unshared(window: Window, systematic: Float) -> Float:
     """Return the doubts (k, q) that windows of one drive may have in part for themselves: not how set-points step."""
     return systematic[:, :2] if leaves_steps_open(window) else systematic

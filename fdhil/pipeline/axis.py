@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from fdhil.config import Identification, MachineConfig
 from fdhil.identification.between import HISTORY, Member
 from fdhil.identification.drift import LEAST_JUMP, DriftTracker, Point
-from fdhil.identification.pooling import member
+from fdhil.identification.pooling import change_covariance, member
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline.own_loops import OwnLoops
 from fdhil.pipeline.pooling import one_sided, refuses_the_model, together
@@ -225,7 +225,8 @@ class AxisPipeline:
         window = outcome.window
         self._place += 1
         found = _Pooled(outcome, member(window, estimate, self._place))
-        notices = self._tracker.update(estimate.parameters(), estimate.covariance, window.start_tick, window.direction)
+        covariance = change_covariance(window, estimate)
+        notices = self._tracker.update(estimate.parameters(), covariance, window.start_tick, window.direction)
         if self._tracker.holding:
             self._held.append(found)
             return notices

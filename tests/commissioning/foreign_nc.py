@@ -12,7 +12,7 @@ import can
 
 Frame = tuple[int, bytes]
 SYNC, NMT, TARGET, OFFSET, SDO, HEARTBEAT = 0x080, 0x000, 0x201, 0x301, 0x601, 0x764
-A_FEW = 20  # SYNC: it is noticed, the offset goes to zero, the drive is switched off: 11, and what a busy host adds
+A_FEW = 40  # SYNC: it is noticed, the offset goes to zero, the drive is switched off: 11, and what a busy host adds
 FOREIGN: dict[str, Frame] = {
     "SYNC": (SYNC, b""),
     "NMT": (NMT, b"\x01\x00"),

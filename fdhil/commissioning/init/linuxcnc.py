@@ -138,9 +138,10 @@ def _unit(ini: Ini, path: Path, letter: str, unit_mm: float) -> _Unit:
     if letter not in ROTARY:
         return _Unit("mm", unit_mm)
     named = ini.text("TRAJ", "ANGULAR_UNITS").lower() or "degree"
-    if named not in UNITS_DEG:
+    per_deg = finite(named)
+    if named not in UNITS_DEG and not (per_deg and per_deg > 0):
         raise _fault(path, "TRAJ.ANGULAR_UNITS", f"is {named[:40]!r}", f"one of {', '.join(UNITS_DEG)}")
-    return _Unit("deg", UNITS_DEG[named])
+    return _Unit("deg", 1.0 / per_deg if per_deg else UNITS_DEG[named])
 
 
 def _travel(ini: Ini, joints: Mapping[str, int], units: Mapping[str, _Unit]) -> Iterator[str]:
