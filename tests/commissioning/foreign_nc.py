@@ -27,7 +27,10 @@ LEFT_TO_IT = {"target": TARGET, "offset": OFFSET}
 
 @dataclass
 class ForeignNc:
-    """Hears a bus, and is switched on by a frame; ``sent`` are the frames of fdhil from then on."""
+    """Hears a bus, and is switched on by a frame; ``sent`` are the frames of fdhil after its own first one.
+
+    What fdhil had sent before that is in the queue still where this thread was late, and is left out.
+    """
 
     channel: str
     frame: Frame
@@ -42,16 +45,19 @@ class ForeignNc:
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def _run(self) -> None:
-        due = 0.0
+        due, queued = 0.0, 0
         while not self._stopping.is_set():
             message = self._bus.recv(0.001)
             if message is not None and message.arbitration_id in (SYNC, NMT, TARGET, OFFSET, SDO, HEARTBEAT, 0x765):
                 heard = (message.arbitration_id, bytes(message.data))
-                self.sent += [heard] if self.on else []
+                self.sent += [heard] if due and queued <= 0 else []
                 self.on = self.on or self.when(heard)
+            queued -= message is not None
             if self.on and time.monotonic() >= due:
+                first = not due
                 due = time.monotonic() + 0.002 if self.often else float("inf")
                 self._bus.send(can.Message(arbitration_id=self.frame[0], data=self.frame[1], is_extended_id=False))
+                queued = self._bus.queue.qsize() if first else queued
 
     def __enter__(self) -> ForeignNc:
         self._thread.start()
