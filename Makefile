@@ -19,7 +19,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # folders that make test and make test-processes leave out, as .ci/run does for the guard's, which make guard tests
 EXCEPT  ?=
 
-.PHONY: help setup foreign docs demo test test-system test-linuxcnc test-processes test-full test-vcan near nightly swarm faults fuzz guard mutants audit loaded lint bench study lock clean
+.PHONY: help setup foreign docs demo test test-system test-linuxcnc test-processes test-full test-vcan near nightly swarm faults fuzz guard proof mutants audit loaded lint bench study lock clean
 
 help:            ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -105,6 +105,9 @@ guard: setup     ## the guard's own tests, in its processes too; a branch of it 
 	@$(BIN)/python -m coverage combine -q
 	@$(BIN)/python -m coverage report --include 'fdhil/guard/*' --show-missing --skip-covered --fail-under 100
 	@$(BIN)/python -m coverage erase
+
+proof: setup     ## the proof that the guard keeps its limits and comes to zero; docs/explanation/proof.md says what is proven
+	@$(BIN)/python -m pytest -q tests/proof
 
 mutants: setup   ## what the guard's tests notice of mistakes put into it, one at a time (hours); the page is docs/studies/mutants.md
 	@$(BIN)/python -m studies mutants

@@ -129,7 +129,8 @@ def violation(limits: OffsetLimits, before: int, rate: int, offset: int) -> str 
         return "OffsetLimit"
     if not abs(speed) <= limits.hard_rate or not abs(speed - rate) <= limits.hard_acceleration:
         return "OffsetRate"
-    if not (offset * speed <= 0 or abs(offset) + stopping(abs(speed), limits.hard_acceleration) <= limits.offset):
+    outward = speed > 0 if offset > 0 else speed < 0 if offset < 0 else False
+    if outward and not abs(offset) + stopping(abs(speed), limits.hard_acceleration) <= limits.offset:
         return "OffsetLimit"
     return None
 

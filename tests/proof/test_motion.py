@@ -133,11 +133,11 @@ def clamp(value: Integer, low: Integer | int, high: Integer | int) -> Integer:
 def larger(one: Integer | int, other: Integer | int) -> Integer | int:
     """Return the larger one without following two paths."""
     both_known = isinstance(one, int) and isinstance(other, int)
-    return max(one, other) if both_known else choose(as_claim(one, other), one, other)  # type: ignore[type-var]
+    return max(one, other) if both_known else choose(as_claim(one, other), one, other)
 
 
 def as_claim(one: Integer | int, other: Integer | int) -> Claim:
-    return one >= other if isinstance(one, Integer) else other <= one  # type: ignore[operator, return-value]
+    return one >= other if isinstance(one, Integer) else other <= one  # type: ignore[return-value] # one of the two is unknown
 
 
 # --- what follows for every offset ---
@@ -154,7 +154,7 @@ class Axis:
         monkeypatch.setattr(limits, "max", larger, raising=False)
         self.offset, self.rate, most, rate, self.acceleration = integers("offset rate L S A")
         assume(most >= 1, rate >= 1, self.acceleration >= 1)
-        self.limits = OffsetLimits(most, rate, self.acceleration, 1, 1)  # type: ignore[arg-type] # unknowns
+        self.limits = OffsetLimits(most, rate, self.acceleration, 1, 1)
         assume(self.is_safe(self.offset, self.rate))
 
     def is_safe(self, offset: Integer, rate: Integer) -> Claim:
@@ -164,28 +164,30 @@ class Axis:
         downward = (rate < 0).implies(-offset + self.contracts.one_step(-rate, hardest) <= most)
         return (abs(rate) <= self.limits.hard_rate) & upward & downward
 
-    def keeps_limits(self, following: Integer) -> Claim:
-        """Value, rate and acceleration of the next frame."""
-        move = following - self.offset
-        value = abs(following) <= choose(abs(self.offset) > self.limits.offset, abs(self.offset), self.limits.offset)
-        bent = abs(move - self.rate) <= self.limits.hard_acceleration
+    def keeps_limits(self, following: Integer, offset: Integer, rate: Integer) -> Claim:
+        """Value, rate and acceleration of the frame after ``offset`` that came there at ``rate``."""
+        move = following - offset
+        value = abs(following) <= choose(abs(offset) > self.limits.offset, abs(offset), self.limits.offset)
+        bent = abs(move - rate) <= self.limits.hard_acceleration
         return value & (abs(move) <= self.limits.hard_rate) & bent
+
+    def is_good(self, following: Integer, offset: Integer, rate: Integer) -> Claim:
+        """Whether the frame keeps the limits and leaves a state that is safe again."""
+        return self.is_safe(following, following - offset) & self.keeps_limits(following, offset, rate)
 
 
 def follow_keeps_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     axis = Axis(monkeypatch)
     wanted, wanted_rate = integers("wanted wanted_rate")
     following = limits.follow(axis.limits, axis.offset, axis.rate, wanted, wanted_rate)
-    prove(axis.is_safe(following, following - axis.offset))
-    prove(axis.keeps_limits(following))
+    prove(axis.is_good(following, axis.offset, axis.rate))
 
 
 def brake_keeps_limits_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     axis = Axis(monkeypatch)
     following = limits.brake(axis.limits, axis.offset, axis.rate)
     move = following - axis.offset
-    prove(axis.is_safe(following, move))
-    prove(axis.keeps_limits(following))
+    prove(axis.is_good(following, axis.offset, axis.rate))
     prove((axis.rate == 0).implies(move == 0))
     prove((axis.rate != 0).implies(abs(move) < abs(axis.rate)))
 
@@ -193,7 +195,7 @@ def brake_keeps_limits_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
 def check_lets_pass_what_is_safe(monkeypatch: pytest.MonkeyPatch) -> None:
     axis = Axis(monkeypatch)
     (following,) = integers("following")
-    assume(axis.is_safe(following, following - axis.offset), axis.keeps_limits(following))
+    assume(axis.is_good(following, axis.offset, axis.rate))
     prove(limits.violation(axis.limits, axis.offset, axis.rate, following) is None)
 
 
@@ -202,8 +204,7 @@ def check_lets_pass_only_what_keeps_limits(monkeypatch: pytest.MonkeyPatch) -> N
     axis = Axis(monkeypatch)
     following, before, rate = integers("following before any_rate")
     if limits.violation(axis.limits, before, rate, following) is None:
-        axis.offset, axis.rate = before, rate
-        prove(axis.keeps_limits(following))
+        prove(axis.keeps_limits(following, before, rate))
 
 
 def ramp_to_zero_ends(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -224,7 +225,7 @@ def ramp_to_zero_ends(monkeypatch: pytest.MonkeyPatch) -> None:
         return inward & (abs(rate) <= fastest + axis.acceleration)
 
     closing = closes_in(offset, rate)
-    following = limits.follow(axis.limits, offset, rate, 0, 0)  # type: ignore[arg-type] # unknowns
+    following = limits.follow(axis.limits, offset, rate, 0, 0)
     move = following - offset
     closing_next = closes_in(following, move)
     prove((closing & (offset != 0)).implies(closing_next & (abs(following) < abs(offset))))

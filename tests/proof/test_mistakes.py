@@ -1,0 +1,63 @@
+"""The proof fails where a limit or a transition is put wrong: else it would prove nothing."""
+
+from __future__ import annotations
+
+import inspect
+import textwrap
+from collections.abc import Callable
+from functools import partial
+from types import ModuleType
+
+import pytest
+
+from fdhil.guard import core, limits
+from fdhil.guard.protocol import Mode
+from tests.proof import test_frames, test_motion
+from tests.proof.symbolic import NotProven, for_every_path
+
+pytestmark = pytest.mark.usefixtures("long_computation")
+
+Theorem = Callable[[pytest.MonkeyPatch], None]
+PASSED_ON = partial(test_frames.frames_keep_limits, Mode.RAMP_DOWN)
+LEFT_BEHIND = partial(test_frames.frames_leave, Mode.RAMP_DOWN)
+
+MISTAKES: tuple[tuple[ModuleType, str, str, str, Theorem], ...] = (
+    (limits, "follow", "-limits.hard_rate, limits.hard_rate", "-limits.hard_rate, limits.hard_rate + 1",
+     test_motion.follow_keeps_limits),
+    (limits, "follow", "rate + limits.acceleration)", "rate + limits.acceleration + 3)",
+     test_motion.follow_keeps_limits),
+    (limits, "follow", "missing = wanted - offset - wanted_rate", "missing = offset - wanted - wanted_rate",
+     test_motion.ramp_to_zero_ends),
+    (limits, "_inside", "limits.offset - outward * offset", "limits.offset + outward * offset",
+     test_motion.follow_keeps_limits),
+    (limits, "_inside", "max(0, limits.offset - outward * offset)", "limits.offset", test_motion.follow_keeps_limits),
+    (limits, "brake", "speed = rate - clamp", "speed = rate + clamp", test_motion.brake_keeps_limits_and_ends),
+    (limits, "brake", "-limits.acceleration, limits.acceleration)", "0, limits.acceleration)",
+     test_motion.brake_keeps_limits_and_ends),
+    (limits, "violation", "abs(speed) <= limits.hard_rate", "speed <= limits.hard_rate",
+     test_motion.check_lets_pass_only_what_keeps_limits),
+    (limits, "violation", "speed > 0 if offset > 0", "speed > 0 if offset < 0",
+     test_motion.check_lets_pass_what_is_safe),
+    (core, "_move", "if wrong is not None", "if wrong is not None and state.measuring", PASSED_ON),
+    (core, "_wrong_frame", "abs(offset) <= ceiling", "offset <= ceiling", PASSED_ON),
+    (core, "_sent", "move = offset - axis.offset", "move = axis.offset - offset", PASSED_ON),
+    (core, "_sent", "offset=offset", "offset=axis.offset", PASSED_ON),
+    (core, "_move", "state = _arrived(", "return state, Output()\n    state = _arrived(", LEFT_BEHIND),
+)  # fmt: skip
+
+
+def put_mistake(module: ModuleType, function: str, right: str, wrong: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compile a function with one piece of it replaced, in its module's place."""
+    source = textwrap.dedent(inspect.getsource(getattr(module, function)))
+    assert right in source
+    monkeypatch.setattr(module, function, getattr(module, function))  # so that it is put back
+    exec(compile("from __future__ import annotations\n" + source.replace(right, wrong), function, "exec"), vars(module))
+
+
+@pytest.mark.parametrize(("module", "function", "right", "wrong", "theorem"), MISTAKES)
+def test_mistake_breaks_the_proof(
+    module: ModuleType, function: str, right: str, wrong: str, theorem: Theorem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put_mistake(module, function, right, wrong, monkeypatch)
+    with pytest.raises(NotProven):
+        for_every_path(partial(theorem, monkeypatch))

@@ -1,0 +1,201 @@
+"""Shows by every case there is that each fault ends what is sent, and that only arming or adopting begins it.
+
+The core looks at alarms by their classes alone, so that all of them, in pairs, are all it can meet: the worst reaction
+counts, and whether ``OffsetHijack`` and ``NodeRebooted`` are among them.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+
+import pytest
+
+import fdhil.guard
+from fdhil.guard import core
+from fdhil.guard.conditions import ARMING_INTERLOCKS, AXIS_INTERLOCKS, BUS_INTERLOCKS
+from fdhil.guard.interlocks import CATALOGUE, FACTS, Alarm, Alarms, Reaction
+from fdhil.guard.path import Place
+from fdhil.guard.protocol import AT_REST, HOLD_CYCLES, IN_CHARGE, LANDING, ON_PATH, SENDING, Mode
+from fdhil.guard.settings import MOST_LEAD, Settings
+from fdhil.guard.state import BusView, Inputs, Request, State, initial
+from fdhil.guard.transitions import NEXT, ZEROS_UNCONFIRMED, Event
+from tests.guard.machine import FACTS_GIVEN, settings
+
+pytestmark = pytest.mark.usefixtures("long_computation")
+
+QUIET = Inputs(True, (), BusView(silent=False, sync_regular=True))
+CODES = sorted(CATALOGUE)
+
+
+def state_in(mode: Mode, made: Settings, *, offset: int = 7, **changes: object) -> State:
+    """A state of which nothing but its mode and the offsets matters."""
+    blank = initial(made)
+    axes = tuple(axis._replace(offset=offset, sent=(offset,) * len(axis.sent)) for axis in blank.axes)
+    return blank._replace(mode=mode, axes=axes, places=(Place(5),), **changes)
+
+
+def alarm_sets() -> Iterator[Alarms]:
+    yield ()
+    yield from ((Alarm(code),) for code in CODES)
+    yield from ((Alarm(one), Alarm(other)) for one, other in product(CODES, CODES) if one != other)
+
+
+def test_every_alarm_ends_what_is_sent_as_its_reaction_says() -> None:
+    for synchronous, measuring, offset in product((True, False), (0, 1), (0, 7)):
+        made = settings(offset_synchronous=synchronous)
+        for mode, alarms in product(Mode, alarm_sets()):
+            before = state_in(mode, made, measuring=measuring, offset=offset)
+            after = core._react(before, QUIET._replace(alarms=alarms), alarms, made).mode
+            worst = max((core._reaction(alarm, made) for alarm in alarms), default=Reaction.REFUSE)
+            if mode in AT_REST:
+                assert after is mode
+            elif worst is Reaction.FREEZE:
+                assert after in AT_REST
+            elif worst is Reaction.RAMP_DOWN:
+                assert after in LANDING | AT_REST
+            else:
+                assert after is mode
+
+
+@pytest.mark.parametrize("mode", sorted(IN_CHARGE))
+def test_lost_daemon_withdrawn_fact_and_frames_that_do_not_leave_end_it(mode: Mode) -> None:
+    made = settings()
+    for lost in (
+        QUIET._replace(main_alive=False),
+        *(QUIET._replace(withdrawn=(Alarm(code),)) for code in FACTS.values()),
+    ):
+        assert core._react(state_in(mode, made), lost, (), made).mode in LANDING
+    unsent = state_in(mode, made, failed_run=2 * core.FAILED_SENDS)
+    assert core._react(unsent, QUIET, (), made).mode is Mode.FROZEN
+
+
+@pytest.mark.parametrize("kind", ["disarm", "stop"])
+@pytest.mark.parametrize("mode", sorted(IN_CHARGE))
+def test_disarming_needs_nothing(mode: Mode, kind: str) -> None:
+    made = settings()
+    asked = QUIET._replace(request=Request(kind))
+    state, refused = core._request(state_in(mode, made), asked, (), (), made)
+    assert (state.mode, refused) == (Mode.RAMP_DOWN, ())
+
+
+def test_hold_lasts_no_longer_than_it_may() -> None:
+    made = settings()
+    for mode, code in product((Mode.ARMED, *sorted(ON_PATH)), CODES):
+        state, cycles = state_in(mode, made), 0
+        while state.mode in IN_CHARGE:
+            state, cycles = core._held(state, Alarm(code), made), cycles + 1
+        assert state.mode is Mode.RAMP_DOWN
+        assert cycles == 1 + (made.cycles(core.FEED_HOLD_S) if code == "FeedHold" else HOLD_CYCLES)
+
+
+def test_landing_ends_once_zeros_are_sent_whatever_the_drives_show() -> None:
+    for lead, shown, mode in product(range(MOST_LEAD + 1), product((True, False), repeat=2), sorted(LANDING)):
+        made = settings(lead=lead)
+        state = state_in(mode, made, offset=0)
+        axes = tuple(axis._replace(zero_shown=each) for axis, each in zip(state.axes, shown, strict=True))
+        state, cycles = state._replace(axes=axes), 0
+        while state.mode in LANDING:
+            state, cycles = core._arrived(state, None, lead), cycles + 1
+        assert state.mode is (Mode.OFF if all(shown) else Mode.FROZEN)
+        assert cycles <= ZEROS_UNCONFIRMED + lead + 1
+
+
+# --- what begins it ---
+
+
+def test_nothing_but_arming_and_adopting_leaves_rest() -> None:
+    ways = {(mode, event): after for (mode, event), after in NEXT.items() if mode in AT_REST and after is not mode}
+    assert {event for (_, event), after in ways.items() if after in SENDING} == {Event.ARM, Event.ADOPT}
+    assert [mode for mode, event in ways if event is Event.ARM] == [Mode.OFF]
+    for mode, event in product(SENDING, Event):
+        assert NEXT.get((mode, event)) not in ({Mode.ADOPT, Mode.ARMED} - {mode})
+
+
+def guard_trees() -> dict[str, ast.Module]:
+    folder = Path(fdhil.guard.__file__).parent
+    return {path.name: ast.parse(path.read_text()) for path in sorted(folder.glob("*.py"))}
+
+
+def test_mode_changes_by_the_table_alone() -> None:
+    """No call but the one in ``State.after`` gives a state another mode; the shadow's copy is never sent."""
+    found = [
+        (name, ast.unparse(keyword.value))
+        for name, tree in guard_trees().items()
+        for call in ast.walk(tree)
+        if isinstance(call, ast.Call) and ast.unparse(call.func).endswith("_replace")
+        for keyword in call.keywords
+        if keyword.arg == "mode"
+    ]
+    assert sorted({(name, value) for name, value in found if name != "feedforward.py"}) == [
+        ("shadow.py", "Mode.ARMED"),
+        ("state.py", "NEXT[self.mode, event]"),
+    ]
+
+
+def test_arming_and_adopting_stand_in_one_place_each() -> None:
+    used = [
+        (name, function.name, event)
+        for name, tree in guard_trees().items()
+        for function in ast.walk(tree)
+        if isinstance(function, ast.FunctionDef)
+        for call in ast.walk(function)
+        if isinstance(call, ast.Call) and ast.unparse(call.func).endswith(".after")
+        for event in [ast.unparse(call.args[0])]
+        if event in ("Event.ARM", "Event.ADOPT") and name != "feedforward.py"
+    ]
+    assert sorted(used) == [("adoption.py", "adopting", "Event.ADOPT"), ("core.py", "_armed", "Event.ARM")]
+
+
+class _Table:
+    """A table of the program that is asked for, the machine at its begin."""
+
+    program_digest, first = "program", 0
+
+    def standing_rows(self) -> int:
+        return 0
+
+
+def arming(made: Settings, **changes: object) -> tuple[State, Inputs, Request]:
+    """State, inputs and request that nothing forbids, but for the ``changes`` of any of the three."""
+    values: dict[str, object] = {
+        "mode": Mode.OFF, "good_for": core.SETTLED_CYCLES, "main_alive": True, "path": _Table(),
+        "token_valid": True, "program_digest": "program", "facts": FACTS_GIVEN,
+    } | changes  # fmt: skip
+    state = initial(made)._replace(mode=values["mode"], good_for=values["good_for"])
+    inputs = QUIET._replace(main_alive=values["main_alive"], path=values["path"])
+    asked = Request("arm", values["token_valid"], values["program_digest"], values["facts"])
+    return state, inputs, asked
+
+
+FORBIDDEN: tuple[dict[str, object], ...] = (
+    *({"mode": mode} for mode in Mode if mode is not Mode.OFF),
+    {"good_for": core.SETTLED_CYCLES - 1},
+    *({"main_alive": value} for value in (False, None)),
+    *({"token_valid": value} for value in (False, None, 1, "yes")),
+    {"path": None},
+    *({"program_digest": value} for value in ("", "another")),
+    *({"facts": {**FACTS_GIVEN, fact: value}} for fact in FACTS for value in (False, None, 1, "yes")),
+    *({"facts": {k: v for k, v in FACTS_GIVEN.items() if k != fact}} for fact in FACTS),
+)
+
+
+def test_arming_needs_everything() -> None:
+    made = settings()
+    state, inputs, asked = arming(made)
+    assert core._refusals(state, inputs, asked, (), (), made) == ()
+    for one in FORBIDDEN:
+        for other in ({}, *FORBIDDEN):
+            state, inputs, asked = arming(made, **one, **{k: v for k, v in other.items() if k not in one})
+            assert core._refusals(state, inputs, asked, (), (), made), (one, other)
+            assert core._request(state, inputs._replace(request=asked), (), (), made)[0].mode is state.mode
+    state, inputs, asked = arming(made)
+    for alarms in alarm_sets():
+        assert bool(core._refusals(state, inputs, asked, alarms, (), made)) is bool(alarms)
+
+
+@pytest.mark.parametrize("table", [BUS_INTERLOCKS, AXIS_INTERLOCKS, ARMING_INTERLOCKS])
+def test_every_interlock_has_a_reaction(table: tuple[tuple[str, object], ...]) -> None:
+    assert {code for code, _ in table} <= set(CATALOGUE)
