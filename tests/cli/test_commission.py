@@ -66,7 +66,9 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+def bench(
+    virtual_threads: object, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Bench]:
     shorten_waits(monkeypatch, WAITS)
     monkeypatch.setattr(sys, "argv", ["fdhil"])
     monkeypatch.setattr(sys, "stdin", io.StringIO())
