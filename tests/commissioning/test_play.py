@@ -95,7 +95,7 @@ def floor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Iterator[Floor]
     text = bench_toml("", corrected=False) + AXIS.format(*"XXXXXXXX"[: AXIS.count("{}")])
     text += AXIS.format(*"YYYYYYYY"[: AXIS.count("{}")])
     text += f'[bus.can0]\ninterface = "virtual"\nchannel = "{uuid.uuid4().hex}"\n'
-    text += '[guard]\nclock = "sync"\n[play]\nheartbeat_s = 1.0\n'
+    text += '[guard]\nclock = "sync"\n'
     path = tmp_path / "machine.toml"
     path.write_text(text)
     config = load(path)

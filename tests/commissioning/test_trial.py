@@ -69,7 +69,7 @@ def quick_trial(quick_commissioning: None, monkeypatch: pytest.MonkeyPatch) -> N
 def bench(quick_trial: None, tmp_path: Path) -> Iterator[Bench]:
     bus: dict[str, object] = {"interface": "virtual", "channel": uuid.uuid4().hex}
     period = {"name": "bench", "sync_period_s": 0.002}
-    config = machine(tmp_path, bus=bus, guard={"clock": "sync"}, play={"heartbeat_s": 1.0}, machine=period)
+    config = machine(tmp_path, bus=bus, guard={"clock": "sync"}, machine=period)
     with DrivePeer(config) as peer:
         sign_off(config)
         record = load_record(config.store.directory, "X")
