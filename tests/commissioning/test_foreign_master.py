@@ -44,6 +44,7 @@ from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
 from tests.integration.conftest import sign_off
 from tests.tiers import sampled
+from tests.virtual_threads import VirtualThreads
 
 pytestmark = pytest.mark.usefixtures("quick_commissioning")
 
@@ -156,6 +157,15 @@ def test_another_master_ends_a_step_within_a_few_sync(step: str, what: str, rig:
     }
     assert left.get(what, "X was stopped, its offset taken to zero and its drive switched off") in str(told.value)
     assert ("0x1016 may be as fdhil wrote" in str(told.value)) is (step in ("watchdog test", "rapid"))
+
+
+@pytest.mark.usefixtures("long_computation")
+@pytest.mark.parametrize("virtual_threads", [1, 2, 3], indirect=True)
+@pytest.mark.parametrize("step", STEPS)
+def test_another_master_is_noticed_in_whatever_order_threads_run(
+    step: str, virtual_threads: VirtualThreads, rig: Rig
+) -> None:
+    test_another_master_ends_a_step_within_a_few_sync(step, "offset", rig)
 
 
 @pytest.mark.usefixtures("long_computation")
