@@ -14,7 +14,7 @@ from hypothesis import Phase, settings
 
 from fdhil.guard.signals import KEPT
 
-pytest_plugins = ["tests.tiers"]
+pytest_plugins = ["tests.tiers", "tests.virtual_threads"]
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported; as the command line does
 gc.disable()  # until all tests are collected
 # in the background of a shell it is ignored, by all that tests start too: but they send it

@@ -1,7 +1,6 @@
 """Waits for what may come on a bus, shortened for drives that a thread of this process simulates.
 
-On a real bus commissioning listens for seconds before it sends; a simulated drive answers at once. How long it may take
-to answer is longer than on a real machine, because the host may be busy.
+On a real bus commissioning listens for seconds before it sends; a simulated drive answers at once.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ SHORT_WAITS: dict[str, float] = {
     "cli.consent.LOOK_S": 0.01,
     "drivers.can.bus.POLL_S": 0.01,
     "drivers.can.sdo.QUIET_S": 0.05,
-    "drivers.can.sdo.RESPONSE_TIMEOUT_S": 5.0,
     "commissioning.steps.SETTLE_CYCLES": 120,
     "commissioning.steps.AVERAGE_CYCLES": 60,
 }

@@ -66,14 +66,14 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+def bench(
+    virtual_threads: object, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Bench]:
     shorten_waits(monkeypatch, WAITS)
     monkeypatch.setattr(sys, "argv", ["fdhil"])
     monkeypatch.setattr(sys, "stdin", io.StringIO())
     file = tmp_path / "machine.toml"
     bus = f'[bus.can0]\ninterface = "virtual"\nchannel = "{uuid.uuid4().hex}"\n[guard]\nclock = "sync"\n'
-    bus += "[play]\nheartbeat_s = 0.5\n"  # a busy computer is late
-
     slow = bench_toml("X").replace("sync_period_s = 0.001", "sync_period_s = 0.002")
     file.write_text(slow + "[axis.X.drive]\nnode_id = 1\n" + bus)
     with DrivePeer(machine_config.load(file)) as peer:

@@ -30,7 +30,7 @@ from tests.short_waits import shorten_waits
 
 
 @pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+def quick(virtual_threads: object, monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorter waits than on a real machine, and a PC that nobody else uses."""
     shorten_waits(monkeypatch, {"drivers.can.sdo.RESPONSE_TIMEOUT_S": 0.2})
     monkeypatch.setattr("os.getloadavg", lambda: (0.1, 0.1, 0.1))

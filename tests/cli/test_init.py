@@ -58,7 +58,7 @@ def bus() -> dict[str, Any]:
 
 
 @pytest.fixture
-def peer(bus: dict[str, Any]) -> Iterator[DrivePeer]:
+def peer(virtual_threads: object, bus: dict[str, Any]) -> Iterator[DrivePeer]:
     """A simulated drive on that bus."""
     with DrivePeer(machine(bus=bus["can0"])) as running:
         yield running

@@ -8,6 +8,6 @@ from tests.short_waits import shorten_waits
 
 
 @pytest.fixture
-def quick_commissioning(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shorter waits than on a real machine; the simulated drive settles sooner."""
+def quick_commissioning(virtual_threads: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run on virtual time, with shorter waits than on a real machine: the simulated drive settles sooner."""
     shorten_waits(monkeypatch)

@@ -33,6 +33,7 @@ from tests.commissioning.foreign_nc import (
     SDO,
     SYNC,
     TARGET,
+    TO_BRAKE,
     ForeignNc,
     Frame,
     is_offset,
@@ -43,6 +44,7 @@ from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
 from tests.integration.conftest import sign_off
 from tests.tiers import sampled
+from tests.virtual_threads import VirtualThreads
 
 pytestmark = pytest.mark.usefixtures("quick_commissioning")
 
@@ -67,7 +69,7 @@ class Rig:
         assert nc.count(SDO) <= 1  # it was under way
         assert nc.count(HEARTBEAT) <= 2
         if what in LEFT_TO_IT:
-            assert nc.count(LEFT_TO_IT[what]) <= A_FEW  # what left before it was heard
+            assert nc.count(LEFT_TO_IT[what]) <= 1
         if what != "offset":
             assert [offset_of(frame) for frame in nc.sent if frame[0] == OFFSET][-1:] in ([], [0])
             assert self.holds(lambda: self.peer.drive.dictionary.number(0x60B0) == 0)
@@ -76,10 +78,8 @@ class Rig:
             assert self.holds(lambda: self.peer.drive.power.state.name in off)
 
     def holds(self, condition: Callable[[], bool]) -> bool:
-        """Whether it becomes true: the simulated drive takes its frames a little later."""
-        deadline = time.monotonic() + 60
-        while not condition() and time.monotonic() < deadline:
-            time.sleep(0.01)
+        """Whether it is true when the simulated drive has taken its frames."""
+        time.sleep(0.01)
         return condition()
 
 
@@ -132,7 +132,7 @@ STEPS: dict[str, tuple[Callable[[Master], None], Callable[[Frame], bool], int]] 
     "feed-forward test": (feedforward_test, is_offset, 0),
     "watchdog test": (proved_watchdog, is_heartbeat, 0),
     "question": (held_while_asked, is_held, 0),
-    "rapid": (rapid, moves, 200),  # it brakes first
+    "rapid": (rapid, moves, TO_BRAKE),
 }
 
 
@@ -159,7 +159,16 @@ def test_another_master_ends_a_step_within_a_few_sync(step: str, what: str, rig:
     assert ("0x1016 may be as fdhil wrote" in str(told.value)) is (step in ("watchdog test", "rapid"))
 
 
-@pytest.mark.usefixtures("real_time")
+@pytest.mark.usefixtures("long_computation")
+@pytest.mark.parametrize("virtual_threads", [1, 2, 3], indirect=True)
+@pytest.mark.parametrize("step", STEPS)
+def test_another_master_is_noticed_in_whatever_order_threads_run(
+    step: str, virtual_threads: VirtualThreads, rig: Rig
+) -> None:
+    test_another_master_ends_a_step_within_a_few_sync(step, "offset", rig)
+
+
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("what", FOREIGN)
 def test_a_single_frame_of_another_master_is_enough(what: str, rig: Rig) -> None:
     with rig.nc(what, is_offset, often=False) as nc:
@@ -182,8 +191,7 @@ def test_a_drive_is_asked_no_more_once_another_master_is_heard(
     with rig.nc(what, lambda frame: frame[0] == SDO) as nc:
         with pytest.raises(ForeignMaster, match="nothing more was sent"):
             ask(rig.config)
-        assert {can_id for can_id, _ in nc.sent} <= {SDO}
-        assert nc.count(SDO) <= A_FEW  # of more than a hundred: those that left before its frame was received
+        assert nc.sent == []
 
 
 def test_a_record_holds_where_an_nc_comes_while_a_guard_starts(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -192,7 +200,7 @@ def test_a_record_holds_where_an_nc_comes_while_a_guard_starts(rig: Rig, monkeyp
     said: list[str] = []
     with rig.nc("SYNC", lambda frame: frame[0] == SDO) as nc:
         compare_again(rig.config, "can0", said.append)
-        assert nc.count(SDO) <= A_FEW
+        assert nc.sent == []
     assert said == []
 
 
@@ -240,13 +248,12 @@ def test_a_drive_that_an_nc_stops_for_good_may_hold_an_offset_and_that_is_report
     with rig.nc("stop", is_offset, often=False) as nc:
         with pytest.raises(ForeignMaster, match="which stopped its node, and may hold an offset: power it off and on"):
             led_through(rig.config, sign_test)
-        assert nc.count(TARGET) <= 5
+        assert nc.count(TARGET) == 0
         assert nc.count(SYNC) <= A_FEW
 
 
-def test_no_frame_leaves_before_the_bus_was_listened_to(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_frame_leaves_before_the_bus_was_listened_to(rig: Rig) -> None:
     """Where a connection is opened next to an NC nothing has been received yet."""
-    monkeypatch.setattr("fdhil.commissioning.transmit.LOOK_S", 0.5)  # time for the NC's thread on a busy host
     with rig.nc("SYNC", lambda _frame: True) as nc:
         nc.on = True
         with Master(rig.config, "X") as master, pytest.raises(ForeignMaster):

@@ -144,7 +144,6 @@ def test_rpdo_that_cannot_be_read_is_reported(peer: tuple[DrivePeer, MachineConf
     assert "not all of its RPDOs can be read" in finding.cause
 
 
-@pytest.mark.usefixtures("real_time")
 def test_second_writer_is_refused_by_check_and_commission_and_nothing_is_sent(
     peer: tuple[DrivePeer, MachineConfig],
 ) -> None:
@@ -157,7 +156,6 @@ def test_second_writer_is_refused_by_check_and_commission_and_nothing_is_sent(
     assert set(drive.heard) == {0x601}
 
 
-@pytest.mark.usefixtures("real_time")
 def test_record_keeps_the_other_rpdos(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
     give_rpdo(drive, 4, 0x501, [OUTPUTS])
@@ -168,7 +166,6 @@ def test_record_keeps_the_other_rpdos(peer: tuple[DrivePeer, MachineConfig]) -> 
         assert check_axis(master).fingerprint == record.mapping_fingerprint
 
 
-@pytest.mark.usefixtures("real_time")
 def test_record_is_void_where_a_second_writer_was_set_up_since(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Before the guard starts, with the NC off, by SDO."""
     monkeypatch.setattr("fdhil.commissioning.compare.LISTEN_S", 0.2)

@@ -26,17 +26,17 @@ from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, fra
 from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.errors import ConnectError, DriveFault, ForeignMaster
 from fdhil.sim.drive.dictionary import AbortCode, TransferAbort
-from tests.dressed.test_set_up import until_it_answers
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import Row, Wire, machine
 from tests.short_waits import shorten_waits
+from tests.virtual_threads import VirtualThreads
 
 WHO = Identity(1, 2, 3, 4)
 
 
 @pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shorter waits than on a real machine."""
+def quick(virtual_threads: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Virtual time, and shorter waits than on a real machine."""
     shorten_waits(monkeypatch)
 
 
@@ -93,7 +93,10 @@ def test_a_sync_that_was_late_once_does_not_change_the_period() -> None:
     assert traffic(*((t, 0x703, b"\x7f") for t in stamps)).heartbeat_s(3) == pytest.approx(1e-3)
 
 
-def test_a_node_that_comes_while_it_is_looked_who_is_there_disturbs_nobody(request: pytest.FixtureRequest) -> None:
+def test_a_node_that_comes_while_it_is_looked_who_is_there_disturbs_nobody(
+    virtual_threads: VirtualThreads, request: pytest.FixtureRequest
+) -> None:
+    virtual_threads.release()
     request.addfinalizer(partial(sys.setswitchinterval, sys.getswitchinterval()))
     sys.setswitchinterval(1e-6)  # threads take turns as often as they can
     ids = range(0x181, 0x1FF)
@@ -150,12 +153,9 @@ def test_a_drives_text_cannot_steer_a_terminal(text: bytes) -> None:
     assert len(printable(text)) <= 80
 
 
-@pytest.mark.usefixtures("real_time")
 def test_a_node_that_lacks_objects_is_listed_all_the_same(
     peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fdhil.commissioning.scan.ANSWER_S", 2.0)
-    monkeypatch.setattr(BusScanner, "answering", until_it_answers)
     _, settings = peer
     exact = Description(Path("b.eds"), 0x46444849, 0x402, 0x10000)
     other = Description(Path("a.eds"), 0x46444849, 0x402, 7)
@@ -319,7 +319,6 @@ def test_a_drive_says_so_itself_or_as_the_first_of_several_devices(
     assert finding.ok is ok
 
 
-@pytest.mark.usefixtures("real_time")
 def test_a_bus_of_another_bit_rate_is_not_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     for where in ("scan", "config_check"):
         monkeypatch.setattr(f"fdhil.commissioning.{where}.LISTEN_S", 2.0)

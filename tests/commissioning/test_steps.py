@@ -66,9 +66,7 @@ def test_a_good_drive_is_signed_off_and_left_as_it_was(peer: tuple[DrivePeer, Ma
     assert steps[0] == "listen"
     assert steps[-1] == "restore"
     assert drive.drive.power.state.name == "SWITCH_ON_DISABLED"
-    deadline = time.monotonic() + 300
-    while drive.drive.nmt != 0x7F and time.monotonic() < deadline:
-        time.sleep(0.01)  # the peer's thread has yet to hear the last command
+    time.sleep(0.01)  # the peer has yet to hear the last command
     assert drive.drive.nmt == 0x7F
     assert drive.drive.dictionary.number(0x60B0) == 0
     assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == consumers
@@ -98,7 +96,7 @@ class SleepyPeer(DrivePeer):
         return super().take(can_id, data)
 
 
-@pytest.mark.usefixtures("real_time")
+@pytest.mark.usefixtures("long_computation")
 def test_a_simulated_drive_may_sleep() -> None:
     settings = config()
     with SleepyPeer(settings), Master(settings, "X") as master:
@@ -125,7 +123,7 @@ class SlowPeer(DrivePeer):
             super()._send([frame])
 
 
-@pytest.mark.usefixtures("real_time")
+@pytest.mark.usefixtures("long_computation")
 def test_a_simulated_drive_that_slept_answers_one_sync_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """The TPDOs of every tenth SYNC are waited for as well: a guard counts in which SYNC they come."""
     settings = config()
@@ -334,7 +332,7 @@ def fed(peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch) 
 def test_a_feeding_that_this_computer_missed_is_tried_again(fed: LateCycle) -> None:
     fed.late = 2
     run_steps(fed.master, lambda m: watchdog(m) == "proven" or pytest.fail("not proven"))
-    assert 2 < fed.feedings <= FEEDING_TRIES  # this computer may be late once by itself
+    assert fed.feedings == 3
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -464,11 +462,8 @@ def test_full_heartbeat_consumers_are_refused(peer: tuple[DrivePeer, MachineConf
 @pytest.mark.parametrize(
     ("can_id", "shown"), [(0x080, "SYNC or set-points"), (0x302, "SYNC or set-points"), (0x605, "SDO requests")]
 )
-def test_an_nc_on_the_bus_is_left_alone(
-    can_id: int, shown: str, peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_nc_on_the_bus_is_left_alone(can_id: int, shown: str, peer: tuple[DrivePeer, MachineConfig]) -> None:
     """Whatever it is that only a master sends, also to another drive: its SDO channels are its own."""
-    monkeypatch.setattr(survey, "LISTEN_S", 60.0)  # until it is heard
     drive, settings = peer
     with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as nc, Master(settings, "X") as master:
         nc.send(can.Message(arbitration_id=can_id, is_extended_id=False))
@@ -492,7 +487,6 @@ def test_on_a_silent_bus_the_drive_alone_is_asked_what_it_is(monkeypatch: pytest
         assert sent == {(0x601, read), (0x601, given_up)}
 
 
-@pytest.mark.usefixtures("real_time")
 @pytest.mark.fault("A29")
 def test_a_bus_of_another_bit_rate_gets_no_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(survey, "LISTEN_S", 2.0)
@@ -567,7 +561,7 @@ def enabled_and_rolled_back(settings: MachineConfig, step: Callable[[Master], ob
         step(master)
 
 
-@pytest.mark.usefixtures("real_time")
+@pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("interrupt_at", [12, 33])
 def test_a_ramp_that_is_stopped_on_its_way_turns_round_there(interrupt_at: int) -> None:
     settings = config()

@@ -69,7 +69,7 @@ def quick_trial(quick_commissioning: None, monkeypatch: pytest.MonkeyPatch) -> N
 def bench(quick_trial: None, tmp_path: Path) -> Iterator[Bench]:
     bus: dict[str, object] = {"interface": "virtual", "channel": uuid.uuid4().hex}
     period = {"name": "bench", "sync_period_s": 0.002}
-    config = machine(tmp_path, bus=bus, guard={"clock": "sync"}, play={"heartbeat_s": 1.0}, machine=period)
+    config = machine(tmp_path, bus=bus, guard={"clock": "sync"}, machine=period)
     with DrivePeer(config) as peer:
         sign_off(config)
         record = load_record(config.store.directory, "X")
@@ -99,7 +99,7 @@ def test_no_room_sends_nothing(bench: Bench) -> None:
     assert bench.peer.heard == []
 
 
-@pytest.mark.usefixtures("real_time")
+@pytest.mark.usefixtures("long_computation")
 def test_software_limits_that_are_nearer_are_respected(bench: Bench) -> None:
     bench.peer.drive.set_object(0x607D, 1, -3277)
     bench.peer.drive.set_object(0x607D, 2, 820_000)
@@ -124,7 +124,7 @@ def test_a_drive_that_was_set_up_anew_is_not_moved(bench: Bench) -> None:
 @pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize(
     ("step", "braking", "what"),
-    [("jog", 50, "target"), ("jog", 50, "offset"), ("test rapids", 200, "SYNC"), ("test rapids", 200, "target")],
+    [("jog", 22, "target"), ("jog", 22, "offset"), ("test rapids", 0, "SYNC"), ("test rapids", 0, "target")],
 )
 def test_another_master_ends_the_trial(step: str, braking: int, what: str, bench: Bench) -> None:
     """Braked within its acceleration, switched off or left to the other master; nothing is kept of the step."""
@@ -140,5 +140,5 @@ def test_another_master_ends_the_trial(step: str, braking: int, what: str, bench
         assert nc.on
         assert nc.count(SYNC) <= A_FEW + braking
         assert nc.count(NMT) == nc.count(SDO) == 0
-        assert what != "target" or nc.count(TARGET) <= 5  # what left before it was heard
+        assert what != "target" or nc.count(TARGET) == 0
     assert step not in progress.done()

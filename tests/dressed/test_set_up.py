@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -12,7 +12,7 @@ import pytest
 
 from fdhil.commissioning.config_check import check_machine
 from fdhil.commissioning.finding import Finding
-from fdhil.commissioning.scan import BusScanner, read_descriptions, scan_bus
+from fdhil.commissioning.scan import read_descriptions, scan_bus
 from fdhil.commissioning.steps import commission
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, DriveFault
@@ -25,26 +25,9 @@ EVERY = pytest.mark.parametrize("outfit", OUTFITS, ids=lambda outfit: outfit.nam
 
 
 @pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shorter waits than on a real machine where nothing comes, longer ones for a drive that a thread here plays."""
-    monkeypatch.setattr(BusScanner, "answering", until_it_answers)
-    longer = {
-        "drivers.can.sdo.RESPONSE_TIMEOUT_S": 60.0,
-        "drivers.can.sdo.DEADLINE_S": 60.0,
-        "commissioning.cycle.LOCKSTEP_WAIT_S": 1.0,
-        "commissioning.steps.ENABLE_TIMEOUT_S": 60.0,
-        "commissioning.watchdog.STARVE_TIMEOUT_S": 60.0,
-    }
-    shorten_waits(monkeypatch, {"commissioning.scan.ANSWER_S": 0.1, **longer})
-
-
-def until_it_answers(
-    scanner: BusScanner, answering: Callable[[BusScanner], set[int]] = BusScanner.answering
-) -> set[int]:
-    """Ask all nodes until the drive has answered, which is on the bus for certain."""
-    while not (found := answering(scanner)):
-        pass
-    return found
+def quick(virtual_threads: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Virtual time, and shorter waits than on a real machine."""
+    shorten_waits(monkeypatch)
 
 
 @contextmanager
@@ -57,7 +40,6 @@ def on_a_bus(outfit: Outfit, folder: Path) -> Iterator[tuple[DrivePeer, MachineC
         network.connect(interface="virtual", channel=channel)
         try:
             node = network.add_node(config.node_id("X"), str(folder / f"{outfit.sheet}.eds"))
-            node.sdo.RESPONSE_TIMEOUT = 60.0
 
             def write(index: int, sub: int, value: int, size: int) -> None:
                 node.sdo.download(index, sub, value.to_bytes(size, "little"))

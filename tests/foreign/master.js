@@ -1,5 +1,6 @@
 'use strict';
-/* A CANopen master of another make: produces SYNC with a counter, starts a drive, enables it where it stands. */
+/* A CANopen master of another make: produces SYNC with a counter, starts a drive, enables it where it stands.
+   It waits for the drive's answer to each SYNC: drive and master are processes that a busy computer holds up. */
 
 const { canopen, join, tell, settings } = require('./link');
 const { Device, DataType } = canopen;
@@ -9,10 +10,12 @@ const drive = settings.node;
 device.eds.setSyncCobId(0x80);
 device.eds.addSdoClientParameter(drive, 0x600 + drive, 0x580 + drive);
 
-let counter = 0, position = null, statusword = 0, controlword = 0, told = false;
+let counter = 0, answered = true, position = null, statusword = 0, controlword = 0, told = false;
 const TOWARD = [[0x4f, 0x40, 0x06], [0x6f, 0x21, 0x07], [0x6f, 0x23, 0x0f], [0x6f, 0x27, 0x0f]]; // CiA 402-2, 6.3
 
 function cycle() {
+    if (!answered) return;
+    answered = false;
     counter = settings.overflow ? counter % settings.overflow + 1 : 0;
     device.emit('message', { id: 0x80, data: Buffer.from(settings.overflow ? [counter] : []) });
     if (position === null) return;
@@ -42,7 +45,10 @@ async function main() {
     device.nmt.startNode(drive);
     const raw = device.receive.bind(device);
     device.receive = (message) => {
-        if (message.id === 0x280 + drive) statusword = message.data.readUInt16LE(0);
+        if (message.id === 0x280 + drive) {
+            statusword = message.data.readUInt16LE(0);
+            answered = true;
+        }
         raw(message);
     };
     setInterval(cycle, settings.period_ms);

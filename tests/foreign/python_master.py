@@ -1,6 +1,7 @@
 """A CANopen master made with the canopen library: a process of its own, no code of fdhil in it.
 
-It starts a drive, produces SYNC without a counter and enables the drive where it stands.
+It starts a drive, produces SYNC without a counter and enables the drive where it stands. It waits for the drive's
+answer to each SYNC: drive and master are processes that a busy computer holds up.
 """
 
 from __future__ import annotations
@@ -36,9 +37,11 @@ def main() -> None:
     drive.sdo.download(0x6060, 0, bytes([8]))
     position = int.from_bytes(drive.sdo.upload(0x6064, 0), "little", signed=True)
     words = {"status": 0, "control": 0}
+    answered = threading.Event()
 
     def status(_can_id: int, data: bytearray, _stamp: float) -> None:
         words["status"] = int.from_bytes(data[:2], "little")
+        answered.set()
 
     network.subscribe(0x280 + node, status)
     drive.nmt.send_command(1)
@@ -50,6 +53,7 @@ def main() -> None:
 
     threading.Thread(target=until_input_ends, daemon=True).start()
     while not ended.wait(period_s):
+        answered.clear()
         network.sync.transmit()
         for mask, value, word in TOWARD:
             if words["status"] & mask == value:
@@ -58,6 +62,8 @@ def main() -> None:
         if not told and words["status"] & 0x6F == 0x27:
             told = True
             tell("enabled", statusword=words["status"], position=position)
+        while not (answered.wait(period_s) or ended.is_set()):
+            pass
     network.disconnect()
 
 

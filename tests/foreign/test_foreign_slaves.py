@@ -18,7 +18,6 @@ from fdhil.drivers.bus_source import BusSource
 from fdhil.records import AxisSamples, Notice
 from fdhil.sim.wire.hub import Hub
 from tests.daemon.shop import fdhil
-from tests.dressed.test_set_up import until_it_answers
 from tests.foreign.peers import ForeignProcess
 from tests.sim.hub_thread import joined, serving
 from tests.sim.twin_process import write_config
@@ -62,6 +61,15 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(BusScanner, "answering", until_it_answers)
     monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 60.0)
     monkeypatch.setattr("fdhil.drivers.can.sdo.DEADLINE_S", 60.0)
+
+
+def until_it_answers(
+    scanner: BusScanner, answering: Callable[[BusScanner], set[int]] = BusScanner.answering
+) -> set[int]:
+    """Ask all nodes until the drive has answered, which is on the bus for certain."""
+    while not (found := answering(scanner)):
+        pass
+    return found
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import queue
 import struct
 import time
 from collections.abc import Collection, Iterator
@@ -54,9 +55,11 @@ def test_sdo_by_a_stock_client_expedited_segmented_and_block(bench: Bench) -> No
         assert node.sdo[0x1018][1].raw > 0
         assert len(str(node.sdo[0x1008].raw)) > 4
         network.nmt.state = "OPERATIONAL"
+        answers: queue.Queue[int] = queue.Queue()
+        network.subscribe(0x181, lambda can_id, _data, _stamp: answers.put(can_id))
         for _ in range(200):
-            bus.send(can.Message(arbitration_id=0x080, is_extended_id=False))
-            time.sleep(0.002)  # a receive buffer of the kernel holds 278 frames
+            send(bus, 0x080)
+            answers.get(timeout=PATIENCE_S)
         with node.sdo[0x2120].open("rb", block_transfer=True) as stream:
             assert len(stream.read()) > 1000  # the trace of those cycles
         with pytest.raises(canopen.SdoAbortedError) as aborted:
