@@ -130,6 +130,8 @@ def _head(window: Window) -> dict[str, Any]:
     slow = plain.pop("slow_voltage")
     if plain["torque_constant_nm_per_a"] is None:  # as in windows of before there was one: their digest stays
         del plain["torque_constant_nm_per_a"]
+    if plain["is_rapid"]:  # as all windows of before there were laboratory moves
+        del plain["is_rapid"]
     nc = plain.pop("nc")
     if nc is not None:
         plain["nc"] = asdict(nc)

@@ -52,7 +52,7 @@ def interruptions(evidence: Evidence) -> Iterator[Reason]:
     reason = (
         _left_behind(window, b)
         or _moves_on(window, a, b, plateau)
-        or _dip(window, seen, plateau, a)
+        or _dip(window, seen, plateau, a, np.maximum.accumulate(speed[a:b]) - plateau)
         or _held(window, seen, plateau, a)
     )
     reason = reason or _quick_stop(window, a, b)
@@ -97,12 +97,13 @@ def _course(position_mm: Float, window: Window, seconds: float = SMOOTHING_S) ->
     return course
 
 
-def _dip(window: Window, seen: Float, plateau: float, begin: int) -> str | None:
+def _dip(window: Window, seen: Float, plateau: float, begin: int, overshoot: Float) -> str | None:
+    """Return where the speed falls and rises again; not beneath a plateau that it had overshot by more before."""
     before = np.maximum.accumulate(seen)
     after = np.maximum.accumulate(seen[::-1])[::-1]
     depth = np.minimum(before, after) - seen
     k = int(np.argmax(depth))
-    if depth[k] <= LEAST_DIP * plateau:
+    if depth[k] <= max(LEAST_DIP * plateau, overshoot[k]):
         return None
     return f"the speed falls from {plateau:.4g} to {seen[k]:.4g} mm/s at {_at(window, begin + k)} s and rises again"
 
