@@ -50,7 +50,8 @@ def estimate_locked(window: Window) -> Estimate:
     spread = inverse_gram(found.jac)[0] * float(found.fun @ found.fun) / max(1, current.size - 2)
     shares = np.sqrt(np.diag(spread) * correlation_factor(found.fun))
     values, covariance = np.full(6, np.nan), np.full((6, 6), np.nan)
-    missing = {name: Reason("LowExcitation", f"the rotor does not turn: {name} stays open", ADVICE) for name in PARAMETERS}
+    still = "the rotor does not turn, which leaves {} open"
+    missing = {name: Reason("LowExcitation", still.format(name), ADVICE) for name in PARAMETERS}
     for k, name in enumerate(PARAMETERS[:2]):
         if 0.0 < shares[k] <= RELATIVE_STD_LIMIT[name]:
             values[k] = math.exp(found.x[k])

@@ -8,7 +8,7 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationError
@@ -60,8 +60,9 @@ _IN_NAME = (
     re.compile(r"[\s_](\S{2,})$"),  # one letter may as well be a channel's, or stand for the motor
 )
 Signal = Literal[
-    "time_s", "voltage_V", "current_A", "torque_Nm", "speed_rad_per_s", "angle_rad", "position_m", "demand_m", "table_mm", "table_m_s2"
-]
+    "time_s", "voltage_V", "current_A", "torque_Nm", "speed_rad_per_s", "angle_rad", "position_m", "demand_m",
+    "table_mm", "table_m_s2",
+]  # fmt: skip
 
 
 class Column(Section):
@@ -90,14 +91,19 @@ class ColumnMap(Section):
 
 def read_column_map(path: Path) -> ColumnMap:
     """Read a map; ConfigError with every fault of it."""
+    return check_map(read_toml(path, "a column map"), str(path))
+
+
+def check_map(document: Mapping[str, Any], source: str) -> ColumnMap:
+    """Return the map that a document is; ConfigError with every fault of it."""
     try:
-        told = ColumnMap.model_validate(read_toml(path, "a column map"))
+        told = ColumnMap.model_validate(document)
     except ValidationError as error:
         items = error.errors(include_url=False)
         faults = [ConfigFault(".".join(map(str, e["loc"])), e["msg"], "see the how-to on recordings") for e in items]
-        raise ConfigError(str(path), faults) from None
+        raise ConfigError(source, faults) from None
     if faults := [*_faults(told)]:
-        raise ConfigError(str(path), faults)
+        raise ConfigError(source, faults)
     return told
 
 
@@ -167,21 +173,22 @@ def _whole_rows(columns: Mapping[str, Float], source: str) -> dict[str, Float]:
     return {name: values[whole] for name, values in columns.items()}
 
 
+def whole_heading(raw: RecordingTable, name: str, source: str) -> str:
+    """Return the heading that has ``name`` or is it, else ``name`` itself; RecordingError where several have it."""
+    names = list(dict.fromkeys(n for table in (raw, *raw.others) for n in (*table.columns, *table.doubts)))
+    if name in names or name.startswith("#") or len(name) < LEAST_PART:
+        return name
+    found = [each for each in names if name.lower() in each.lower()]
+    if len(found) > 1:
+        listed = " and ".join(map(shown, found[:SHOWN_NAMES]))
+        raise RecordingError(f"{source}: {shown(name)} is a part of {listed}: write more of the one that is meant")
+    return found[0] if found else name
+
+
 def _with_whole_names(raw: RecordingTable, told: ColumnMap, source: str) -> ColumnMap:
     """Return the map with the whole heading where it has a part of one; RecordingError where several have that part."""
-    names = list(dict.fromkeys(n for table in (raw, *raw.others) for n in (*table.columns, *table.doubts)))
-
-    def whole(name: str) -> str:
-        if name in names or name.startswith("#") or len(name) < LEAST_PART:
-            return name
-        found = [each for each in names if name.lower() in each.lower()]
-        if len(found) > 1:
-            listed = " and ".join(map(shown, found[:SHOWN_NAMES]))
-            raise RecordingError(f"{source}: {shown(name)} is a part of {listed}: write more of the one that is meant")
-        return found[0] if found else name
-
     columns = {
-        signal: tuple(column.model_copy(update={"name": whole(column.name)}) for column in _as_tuple(of))
+        signal: tuple(c.model_copy(update={"name": whole_heading(raw, c.name, source)}) for c in _as_tuple(of))
         for signal, of in told.columns.items()
     }
     return told.model_copy(update={"columns": columns})
@@ -274,15 +281,20 @@ def _check_places(raw: RecordingTable, told: ColumnMap, source: str) -> None:
 def _check_unit(raw: RecordingTable, signal: str, column: Column, source: str) -> None:
     """Refuse a unit that is not the one that stands above the column, where the map scales nothing itself."""
     known = {**FACTORS[signal], **(PER_REVOLUTION if signal == "speed_rad_per_s" else {})}
-    names = [column.name.strip(), *raw.texts.get(column.name, ())]
-    texts = [*names, *(found[1] for name in names for form in _IN_NAME if (found := form.search(name.strip())))]
-    units = [unit for unit in map(_unit, texts) if unit in known]
+    units = [unit for unit in units_of_heading(raw, column.name) if unit in known]
     wrong = units and not any(math.isclose(known[unit], known[column.unit]) for unit in units)
     if wrong and "factor" not in column.model_fields_set and column.name not in raw.clocks:
         raise RecordingError(
             f"{source} has {shown(column.name)} in {units[0]}, the column map says {column.unit}: correct unit in the "
             "map, or give factor = 1 where the file is wrong"
         )
+
+
+def units_of_heading(raw: RecordingTable, heading: str) -> list[str]:
+    """Return what may be the unit of a column: texts of the file about it, and ends of its heading."""
+    names = [heading.strip(), *raw.texts.get(heading, ())]
+    ends = (found[1] for name in names for form in _IN_NAME if (found := form.search(name.strip())))
+    return [_unit(text) for text in (*names, *ends)]
 
 
 def _unit(text: str) -> str:

@@ -1,4 +1,4 @@
-"""Makes the columns of a recording from what was recorded in their place: an angle for a speed, a torque for a current."""
+"""Makes columns of a recording from what was recorded instead: a speed from an angle, a current from a torque."""
 
 import math
 

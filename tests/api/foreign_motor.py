@@ -27,7 +27,9 @@ class Measured:
     speed: Floats
 
 
-def run(drive: Drive, seconds: float, dt: float = 1e-3, *, noise: float = 2e-3, locked: bool = False, seed: int = 1) -> Measured:
+def run(
+    drive: Drive, seconds: float, dt: float = 1e-3, *, noise: float = 2e-3, locked: bool = False, seed: int = 1
+) -> Measured:
     """Run the motor, and measure it with white noise of ``noise`` times each signal's largest value."""
     p, h = TRUTH, dt / SUBSTEPS
     rows = round(seconds / dt)
