@@ -127,7 +127,7 @@ class Recording:
     @property
     def time(self) -> Float:
         """The times of the samples (n,) in s, lost ones included."""
-        return np.arange(self.speed.size) * self.signals.dt_s
+        return np.arange(self.speed.size, dtype=np.float64) * self.signals.dt_s
 
     @property
     def voltage(self) -> Float | None:

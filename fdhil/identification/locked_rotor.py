@@ -47,7 +47,11 @@ def estimate_locked(window: Window) -> Estimate:
     start_ohm = max(abs(float(voltage @ current)) / float(current @ current), 1e-3)
     with np.errstate(over="ignore", under="ignore"):
         found = least_squares(left, np.log([start_ohm, START_L_H]), bounds=(-14.0, 7.0))
-    spread = inverse_gram(found.jac)[0] * float(found.fun @ found.fun) / max(1, current.size - 2)
+    spread = (
+        inverse_gram(np.asarray(found.jac, dtype=np.float64))[0]
+        * float(found.fun @ found.fun)
+        / max(1, current.size - 2)
+    )
     shares = np.sqrt(np.diag(spread) * correlation_factor(found.fun))
     values, covariance = np.full(6, np.nan), np.full((6, 6), np.nan)
     still = "the rotor does not turn, which leaves {} open"

@@ -121,7 +121,7 @@ def _window(outcome: WindowOutcome) -> Section:
 def _signals(outcome: WindowOutcome) -> Chart:
     """Return the chart of a window's signals with the model's."""
     window = outcome.window
-    time_s = np.arange(window.n) * window.dt_s
+    time_s = np.arange(window.n, dtype=np.float64) * window.dt_s
     model = _model(outcome)
     panels = []
     if window.voltage_v is not None:

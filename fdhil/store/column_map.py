@@ -19,8 +19,9 @@ from fdhil.csv_text import shown
 from fdhil.errors import ConfigError, ConfigFault, RecordingError
 from fdhil.records import Float
 from fdhil.store.counter_wraps import jump_of_reading, unwrap_counter, unwrap_turns
-from fdhil.store.derived_columns import ANGLE, TORQUE, check_sizes, derive_columns
+from fdhil.store.derived_columns import TORQUE, check_sizes, derive_columns
 from fdhil.store.recording_table import (
+    ANGLE,
     FORMAT,
     NOTES,
     PATH,

@@ -6,9 +6,9 @@ import numpy as np
 
 from fdhil.errors import RecordingError
 from fdhil.records import Float
-from fdhil.store.recording_table import NOTES, SAMPLING, VOLTAGE
+from fdhil.store.recording_table import ANGLE, NOTES, SAMPLING, VOLTAGE
 
-ANGLE, TORQUE = "angle_rad", "torque_Nm"
+TORQUE = "torque_Nm"
 CONSTANT = "torque_constant_nm_per_a"
 LARGEST = {  # beyond what drives have -> what the numbers may be
     "voltage_V": (3e3, "mV (multiply by 1e-3)"),
@@ -24,7 +24,7 @@ def derive_columns(headers: dict[str, str], columns: dict[str, Float]) -> None:
     A torque is divided by the header's torque constant. Without one it is the current of a motor with a constant of 1,
     and a voltage, which belongs to the real constant, is left out with a note.
     """
-    angle, torque = columns.pop(ANGLE, None), columns.pop(TORQUE, None)
+    angle, torque = columns.get(ANGLE), columns.pop(TORQUE, None)
     if angle is not None and "speed_rad_per_s" not in columns:
         columns["speed_rad_per_s"] = difference(angle, columns["time_s"])
         headers["speed_source"] = "difference"

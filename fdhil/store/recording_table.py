@@ -21,6 +21,7 @@ from fdhil.records import Float, Recording, SlowVoltage, VoltageSampling, frozen
 FORMAT = "fdhil-recording-1"
 COLUMNS = ("time_s", "current_A", "speed_rad_per_s")
 PATH = ("position_m", "demand_m")  # only for what is told in micrometres; they need a pitch
+ANGLE = "angle_rad"  # of the motor, where no position is
 VOLTAGE = "voltage_V"
 TABLE = ("table_mm", "table_m_s2")  # sensors at the table, which may have lost rows
 REQUIRED = ("format", "sample_rate_hz", "axis")
@@ -39,6 +40,7 @@ UNITS: Mapping[str, str] = {
     "speed_rad_per_s": "rad/s",
     "position_m": "m",
     "demand_m": "m",
+    "angle_rad": "rad",
     "table_mm": "mm",
     "table_m_s2": "m/s2",
 }
@@ -87,7 +89,7 @@ def recording_of(table: RecordingTable, source: str = "recording") -> Recording:
     check_headers(table.headers, table.columns, source)
     table, pitches = _as_lengths(table, source)
     headers = dict(table.headers)
-    names = [name for name in (*COLUMNS, *PATH, VOLTAGE, *TABLE) if name in table.columns]
+    names = [name for name in (*COLUMNS, *PATH, ANGLE, VOLTAGE, *TABLE) if name in table.columns]
     values = _rows(table, names, source)
     dt = 1.0 / _within(headers, "sample_rate_hz", RATE_HZ, source)
     rows, gaps = _place(values[:, 0], dt, source)
@@ -99,7 +101,9 @@ def recording_of(table: RecordingTable, source: str = "recording") -> Recording:
     paths = {name: _told(name, names, columns) for name in PATH}
     position_m, demand_m = paths["position_m"], paths["demand_m"]
     if position_m is None:
-        position_m = _travel(columns[:, 2], dt) * (pitch_m / (2 * math.pi))
+        angle = _told(ANGLE, names, columns)
+        angle = _travel(columns[:, 2], dt, headers.get("speed_source")) if angle is None else angle
+        position_m = angle * (pitch_m / (2 * math.pi))
     return Recording(
         axis=headers["axis"],
         dt_s=dt,
@@ -122,11 +126,15 @@ def recording_of(table: RecordingTable, source: str = "recording") -> Recording:
     )
 
 
-def _travel(speed_rad_s: Float, dt_s: float) -> Float:
-    """Return the angle (n,) that a speed turns, which stands in for a position that was not recorded; lost rows NaN."""
+def _travel(speed_rad_s: Float, dt_s: float, source: str | None) -> Float:
+    """Return the angle (n,) that a speed turns, which stands in for a position that was not recorded; lost rows NaN.
+
+    A speed that is a difference of positions is the mean over the row before.
+    """
     known = np.isfinite(speed_rad_s)
     speed = np.interp(np.arange(known.size), np.flatnonzero(known), speed_rad_s[known])
-    angle = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) * (dt_s / 2))])
+    means = speed[1:] if source == "difference" else (speed[1:] + speed[:-1]) / 2
+    angle = np.concatenate([[0.0], np.cumsum(means * dt_s)])
     return np.where(known, angle, np.nan)
 
 
