@@ -34,7 +34,7 @@ def file_document(result: FileResult, axes: Mapping[str, Axis], with_loops: bool
             "parameters": _parameters(result.pooled, result.verdict),
             "terms": _terms(result.pooled),
             "validated": result.verdict.accepted,
-            "windowswindows_used": windows_used(result),
+            "windows_used": windows_used(result),
             "held_out": None if result.held_out is None else asdict(result.held_out),
             **_verdict(result.verdict),
         },
@@ -45,6 +45,7 @@ def file_document(result: FileResult, axes: Mapping[str, Axis], with_loops: bool
 
 
 def windows_used(result: FileResult) -> int:
+    """Return how many windows the pool is made of."""
     if result.pooled is None:
         return 0
     return sum(outcome.verdict.accepted for outcome in result.outcomes)
@@ -72,7 +73,7 @@ def usable_estimate(outcome: WindowOutcome) -> Estimate | None:
     """Return the estimate of a window; of a validated one the drive that predict and correct take."""
     if outcome.estimate is None or not outcome.verdict.accepted:
         return outcome.estimate
-    return bounded(outcome.estimate, outcome.window.direction)
+    return bounded(outcome.estimate, outcome.window.direction if outcome.window.is_rapid else None)
 
 
 def _verdict(verdict: Verdict) -> dict[str, Any]:

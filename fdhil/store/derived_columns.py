@@ -15,7 +15,7 @@ LARGEST = {  # beyond what drives have -> what the numbers may be
     "current_A": (3e3, "mA (multiply by 1e-3)"),
     "speed_rad_per_s": (6e3, "1/min (multiply by 2 pi / 60) or degrees per second (by pi / 180)"),
 }
-LONGEST_STEP_S = 0.05
+LONGEST_STEP_S = 0.2
 
 
 def derive_columns(headers: dict[str, str], columns: dict[str, Float]) -> None:
