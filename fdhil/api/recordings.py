@@ -16,9 +16,8 @@ from fdhil.records import Recording as RecordedSignals
 from fdhil.store.column_map import check_map, mapped, read_column_map
 from fdhil.store.column_proposal import propose
 from fdhil.store.derived_columns import check_sizes, derive_columns
-from fdhil.store.recording_parquet import stored_window
 from fdhil.store.recording_table import FORMAT, NOTES, VOLTAGE, RecordingTable, recording_of
-from fdhil.store.recordings import read_raw, read_recording
+from fdhil.store.recordings import read_raw, read_recording, read_stored
 from fdhil.store.sample_times import even_times, usual_step
 
 PROPOSE = "?"
@@ -163,7 +162,7 @@ def read(path: str | Path, columns: str | Path | Mapping[str, Any] | None = None
     """
     path = Path(path)
     if columns is None:
-        stored = stored_window(path)
+        stored = read_stored(path)
         return Recording.of(stored if stored is not None else read_recording(path), str(path))
     if isinstance(columns, str | Path) and str(columns) != PROPOSE:
         return Recording.of(read_recording(path, read_column_map(Path(columns))), str(path))

@@ -19,8 +19,7 @@ from fdhil.records import Reason, Recording, Verdict, Window, WindowOutcome
 from fdhil.store import suffixes
 from fdhil.store.accelerometer_csv import with_accelerometer
 from fdhil.store.column_map import ColumnMap
-from fdhil.store.recording_parquet import stored_window
-from fdhil.store.recordings import read_recording
+from fdhil.store.recordings import read_recording, read_stored
 
 MANY_FILES = 16  # from here on further processes pay for their start
 MANY_WINDOWS = 48
@@ -97,7 +96,7 @@ def read_recorded(path: Path, accelerometer: Path | None, columns: ColumnMap | N
     if next(os.walk(path), None) is not None:  # a folder: what is in it would be given in its place
         known = ", ".join(suffixes.RECORDINGS)
         raise RecordingError(f"{path} has no recordings ({known}); give the folder that has them")
-    if accelerometer is None and columns is None and (stored := stored_window(path)) is not None:
+    if accelerometer is None and columns is None and (stored := read_stored(path)) is not None:
         return stored
     recording = read_recording(path, columns)
     return recording if accelerometer is None else with_accelerometer(recording, accelerometer)

@@ -5,7 +5,7 @@ from pathlib import Path
 from fdhil import tables
 from fdhil.csv_text import read_content
 from fdhil.errors import RecordingError
-from fdhil.records import Recording
+from fdhil.records import Recording, Window
 from fdhil.store import suffixes
 from fdhil.store.column_map import ColumnMap, mapped
 from fdhil.store.recording_table import RecordingTable, recording_of
@@ -18,6 +18,15 @@ def read_recording(path: Path, columns: ColumnMap | None = None) -> Recording:
     With ``columns`` the file may be of another program.
     """
     return recording_of(read_table(path, columns), str(path))
+
+
+def read_stored(path: Path) -> Window | None:
+    """Return the window of a file that is a stored one, None of any other. RecordingError where it is damaged."""
+    if path.suffix.lower() != ".parquet":
+        return None
+    from fdhil.store.recording_parquet import read_if_window  # late: an extra
+
+    return read_if_window(path)
 
 
 def read_table(path: Path, columns: ColumnMap | None = None) -> RecordingTable:

@@ -17,12 +17,11 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from fdhil.errors import RecordingError, StoreError
 from fdhil.records import Float, NcMove, SlowVoltage, Stages, Window, read_only
 from fdhil.store.atomic import make_folder, store_error, sync_folder, write_file
+from fdhil.store.parquet_library import pa, pq
 from fdhil.store.parquet_pages import uncompressed_bytes
 
 FORMAT = "fdhil-window-1"
