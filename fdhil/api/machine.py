@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fdhil import config, correction, prediction
+from fdhil.api.compiling import forewarn
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault, StoreError
 from fdhil.prediction import models as model_files
@@ -71,6 +72,7 @@ def predict(program: str | Path | Trajectory, machine: Machine | str | Path, mod
     >>> found.rms_um > 0, found.contour_um.shape == found.reference.time_s.shape
     (True, True)
     """
+    forewarn("predict")
     return prediction.predict(*read_inputs(program, machine, models))
 
 
@@ -86,6 +88,7 @@ def correct(
     ``refused`` has the reasons where a correction is not predicted to help: its offsets are 0. Errors as of
     :func:`plan`.
     """
+    forewarn("predict", "correct")
     return correction.plan(*read_inputs(program, machine, models), method)
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from fdhil import config
 from fdhil.api.analysis import FileResult, analyse_recordings, compare_with_data_sheet
+from fdhil.api.compiling import forewarn
 from fdhil.api.documents import identification_document
 from fdhil.api.loops import with_all_loops
 from fdhil.api.machine import Machine
@@ -229,6 +230,7 @@ def identify(
         axes = ", ".join(sorted({each.axis for each in read_in})) or "none"
         raise RecordingError(f"identify takes recordings of one axis, and these are of {axes}: call it for each axis")
     known = None if machine is None else Machine.of(machine)
+    forewarn("identify")
     settings = config.Identification() if known is None else known.config.identification
     if method is not None:
         settings = config.Identification(**{**settings.model_dump(), "method": method})

@@ -9,8 +9,8 @@ from functools import partial
 from pathlib import Path
 
 from fdhil.api.analysis import FileResult, Progress, analyse_recordings, ignore_progress
+from fdhil.api.compiling import forewarn
 from fdhil.child import end_with
-from fdhil.cli.compiling import forewarn
 from fdhil.cli.failing import error_document
 from fdhil.config import Identification, MachineConfig
 from fdhil.errors import FdhilError, RecordingError
