@@ -11,7 +11,7 @@ import fdhil
 from fdhil.errors import ConfigError, RecordingError
 
 TIME = np.arange(0.0, 1.0, 1e-3)
-GIVEN = {"time": TIME, "voltage": 12.0 + 0.0 * TIME, "current": np.sin(9 * TIME), "speed": 50.0 * np.sin(3 * TIME)}
+GIVEN: dict[str, Any] = {"time": TIME, "voltage": 12.0 + 0.0 * TIME, "current": np.sin(9 * TIME), "speed": 50.0 * np.sin(3 * TIME)}
 
 
 class Column:
@@ -27,7 +27,8 @@ class Column:
 def test_lists_and_columns_of_other_libraries_are_taken() -> None:
     plain = fdhil.Recording(**GIVEN)
     for convert in (list, Column, lambda v: v.astype(np.float32) if v is not TIME else v):
-        made = fdhil.Recording(**{name: convert(values) for name, values in GIVEN.items()})
+        given: dict[str, Any] = {name: convert(values) for name, values in GIVEN.items()}
+        made = fdhil.Recording(**given)
         assert made.speed == pytest.approx(plain.speed, rel=1e-5)
 
 
