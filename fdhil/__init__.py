@@ -10,9 +10,8 @@ The Python interface is imported when it is first used::
 """
 
 import os
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
+TYPE_CHECKING = False  # type checkers know it; importing typing takes longer than all of this
 if TYPE_CHECKING:
     from fdhil.api.machine import Machine as Machine
     from fdhil.api.machine import correct as correct
@@ -49,10 +48,12 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Return a name of the Python interface, which is imported now."""
     if name not in _MODULES:
         raise AttributeError(f"module 'fdhil' has no attribute {name!r}")
+    from importlib import import_module
+
     return getattr(import_module(f"fdhil.api.{_MODULES[name]}"), name)
 
 

@@ -19,8 +19,9 @@ from fdhil.records import (
     Verdict,
     Window,
     WindowOutcome,
+    read_only,
 )
-from fdhil.store.recording_table import NOTES, RECORD_HZ, SLOW_HZ, SOURCES
+from fdhil.store.recording_table import NOTES, PITCH, RECORD_HZ, SLOW_HZ, SOURCES
 from fdhil.validation.data_sheet import gain_error
 from fdhil.validation.signal_consistency import missing_move
 
@@ -68,6 +69,7 @@ def analyse_recordings(
     """
     first = recorded[0]
     axis = None if machine is None else machine.axis.get(first.axis)
+    recorded = [_with_pitch(each, axis) for each in recorded]
     windows = [window for each in recorded for window in _windows(each, axis, any_move=any_move)]
     settings = _told_by(first, settings)
     period_s = None if machine is None else machine.machine.sync_period_s
@@ -82,6 +84,14 @@ def analyse_recordings(
     step()
     verdict = _of_reading(first, verdict)
     return FileResult(name, first.axis, tuple(outcomes), estimate, verdict, None, loops, held_out)
+
+
+def _with_pitch(recorded: Recording | Window, axis: Axis | None) -> Recording | Window:
+    """Return a recording that has no pitch with that of its configured axis."""
+    if axis is None or isinstance(recorded, Window) or not recorded.headers or PITCH in recorded.headers:
+        return recorded
+    share = axis.screw_pitch_mm / recorded.pitch_mm
+    return replace(recorded, pitch_mm=axis.screw_pitch_mm, position_mm=read_only(share * recorded.position_mm))
 
 
 def _locked(windows: Sequence[Window], name: str, axis: str) -> FileResult:

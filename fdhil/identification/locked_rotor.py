@@ -22,6 +22,7 @@ NAME = "locked_rotor"
 TURNING = 8.0  # of the noise of the speed
 ADVICE = "add a recording in which the rotor turns"
 START_L_H = 1e-3
+OPEN_SHARE = np.array([5e-4, 1e-3])  # of R and L: what the voltage's course within a sample leaves open
 TOO_SLOW = "the current changes too little, or too slowly, to determine {}"
 
 
@@ -52,7 +53,7 @@ def estimate_locked(window: Window) -> Estimate:
         * float(found.fun @ found.fun)
         / max(1, current.size - 2)
     )
-    shares = np.sqrt(np.diag(spread) * correlation_factor(found.fun))
+    shares = np.sqrt(np.diag(spread) * correlation_factor(found.fun) + OPEN_SHARE**2)
     values, covariance = np.full(6, np.nan), np.full((6, 6), np.nan)
     still = "the rotor does not turn, which leaves {} open"
     missing = {name: Reason("LowExcitation", still.format(name), ADVICE) for name in PARAMETERS}

@@ -19,6 +19,7 @@ from fdhil.validation.evidence import Evidence
 
 CODE = "EpisodeAborted"
 ADVICE = "record a rapid without feed hold, override change or stop"
+LABORATORY = "record a whole move from rest to rest, or identify from any move with --any-move (any_move=True)"
 NC_ADVICE = "rapids teach at an override of 100 % and without feed hold"
 OVERRIDE = 0.005  # that is still 100 %
 SMOOTHING_S = 0.020
@@ -57,7 +58,7 @@ def interruptions(evidence: Evidence) -> Iterator[Reason]:
     )
     reason = reason or _quick_stop(window, a, b)
     if reason is not None:
-        yield Reason(CODE, reason, ADVICE)
+        yield Reason(CODE, reason, ADVICE if np.isfinite(window.demand_mm).any() else LABORATORY)
 
 
 def _said(nc: NcMove) -> str | None:
