@@ -109,9 +109,10 @@ def read_inputs(
         given, settings = model_files.validated_models(sets, settings, source)
     elif isinstance(models, str | Path):
         source = str(models)
-        given, loops, _ = model_files.load_model_file(Path(models))
-        _refuse_refuted_loops(settings, given.keys() - loops.keys(), source)
-        settings = model_files.with_loops(settings, loops, source)
+        file = model_files.load_model_file(Path(models))
+        given = file.parameters
+        _refuse_refuted_loops(settings, given.keys() - file.loops.keys(), source)
+        settings = model_files.with_loops(settings, file.loops, source)
     elif models is not None:
         given = {**given, **models}
     reference = program if isinstance(program, Trajectory) else load_trajectory(Path(program), settings)

@@ -211,16 +211,17 @@ def _analyse(
     *,
     any_move: bool,
 ) -> list[FileResult]:
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-
     from fdhil.cli.batch import analyse_files
-    from fdhil.cli.console import PrintableConsole
 
     analyse = partial(
         analyse_files, paths, settings, machine, accelerometer=accelerometer, columns=columns, any_move=any_move
     )
     if not sys.stderr.isatty():
         return list(analyse())
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    from fdhil.cli.console import PrintableConsole
+
     shown = (TextColumn("identifying"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with Progress(*shown, console=PrintableConsole(stderr=True), transient=True) as progress:
         task = progress.add_task("identifying", total=len(paths))
