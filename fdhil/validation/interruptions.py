@@ -123,6 +123,10 @@ def _held(window: Window, seen: Float, plateau: float, begin: int) -> str | None
     demand = _course(window.demand_mm, window, RAMP_S)
     if demand is not None and np.median(demand[begin + start : begin + end]) > BETWEEN[1] * plateau:
         return None  # the drive creeps towards a speed that is demanded already
+    fast = np.flatnonzero((middle >= BETWEEN[1] * plateau) | (rate >= HELD_RATE * rate.max()))
+    fast = fast[fast >= end - reach]
+    if demand is None and fast.size and middle[fast[0]] >= BETWEEN[1] * plateau:
+        return None  # it arrives there without another ramp: a regulator that settles
     return (
         f"the speed is held at {level:.4g} mm/s for {1e3 * (end - start) * window.dt_s:.0f} ms from "
         f"{_at(window, begin + start)} s, beside its plateau of {plateau:.4g} mm/s"

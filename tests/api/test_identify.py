@@ -14,7 +14,7 @@ import pytest
 
 import fdhil
 from fdhil.errors import FdhilError, RecordingError
-from tests.api.foreign_motor import TRUTH
+from tests.api.foreign_motor import TRUTH, run, speed_loop
 from tests.api.moves import measured
 
 DEVIATIONS = 4.0  # within which every one of some dozen values must lie
@@ -47,6 +47,27 @@ def test_any_move_gives_all_six(move: str) -> None:
     assert result.validated, result.reasons
     assert_true_within_intervals(result)
     assert not [w for w in result.warnings if w.code == "OneDirection"]
+
+
+@pytest.mark.parametrize(("gain", "rate"), [(0.9, 12.0), (0.2, 100.0)], ids=["creeps to its speed", "overshoots"])
+def test_settling_of_a_speed_loop_is_no_feed_hold(gain: float, rate: float) -> None:
+    def there_and_back(time_s: float) -> float:
+        return 100.0 * ((0.1 < time_s < 0.9) - (1.2 < time_s < 2.0))
+
+    m = run(speed_loop(there_and_back, gain=gain, rate=rate), 2.4)
+    result = fdhil.identify(fdhil.Recording(m.time, m.voltage, m.current, m.speed))
+    assert result.validated, result.reasons
+    assert len(result.windows) == 2
+
+
+def test_feed_hold_without_a_demand_is_still_seen() -> None:
+    def held(time_s: float) -> float:
+        return 100.0 * (0.1 < time_s < 1.0) - 60.0 * (0.4 < time_s < 0.6)
+
+    m = run(speed_loop(held, gain=0.3, rate=60.0), 1.4)
+    result = fdhil.identify(fdhil.Recording(m.time, m.voltage, m.current, m.speed))
+    assert [reason.code for reason in result.reasons] == ["EpisodeAborted"]
+    assert "any_move=True" in result.reasons[0].advice
 
 
 def test_several_recordings_give_narrower_intervals_than_one() -> None:

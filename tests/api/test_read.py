@@ -11,6 +11,7 @@ from scipy.io import savemat
 import fdhil
 from fdhil.errors import RecordingError
 from fdhil.store.column_proposal import propose_columns
+from tests.api.foreign_motor import TRUTH
 from tests.api.moves import measured
 from tests.api.test_identify import assert_true_within_intervals
 
@@ -74,3 +75,25 @@ def test_matlab_file_is_identified(tmp_path: Path) -> None:
     m = measured("chirp")
     savemat(tmp_path / "lab.mat", {"t": m.time, "u": m.voltage, "i": m.current, "omega": m.speed})
     assert_true_within_intervals(fdhil.identify(fdhil.read(tmp_path / "lab.mat", "?"), any_move=True))
+
+
+def test_map_takes_an_angle_for_the_speed_and_a_torque_for_the_current(tmp_path: Path) -> None:
+    m = measured("rapids")
+    angle = np.concatenate([[0.0], np.cumsum((m.speed[1:] + m.speed[:-1]) / 2 * 1e-3)])
+    counts, torque = np.rint(angle * 2**16 / (2 * np.pi)), 1e3 * TRUTH["K"] * m.current
+    table = np.column_stack([m.time, counts, torque])
+    np.savetxt(
+        tmp_path / "a.csv", table, delimiter=",", header="Time,Encoder counts,Torque mNm", comments="", fmt="%.7g"
+    )
+    (tmp_path / "map.toml").write_text(
+        f"""[headers]
+axis = "X"
+[columns]
+time_s = {{ name = "Time", unit = "s" }}
+angle_rad = {{ name = "Encoder", unit = "rev", factor = {2.0**-16} }}
+torque_Nm = {{ name = "Torque", unit = "mN.m" }}
+"""
+    )
+    result = fdhil.identify(fdhil.read(tmp_path / "a.csv", tmp_path / "map.toml"))
+    assert result.validated, result.reasons
+    assert result.parameters["Jt"].value == pytest.approx(TRUTH["Jt"], rel=0.03)

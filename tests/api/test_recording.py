@@ -11,7 +11,12 @@ import fdhil
 from fdhil.errors import ConfigError, RecordingError
 
 TIME = np.arange(0.0, 1.0, 1e-3)
-GIVEN: dict[str, Any] = {"time": TIME, "voltage": 12.0 + 0.0 * TIME, "current": np.sin(9 * TIME), "speed": 50.0 * np.sin(3 * TIME)}
+GIVEN: dict[str, Any] = {
+    "time": TIME,
+    "voltage": 12.0 + 0.0 * TIME,
+    "current": np.sin(9 * TIME),
+    "speed": 50.0 * np.sin(3 * TIME),
+}
 
 
 class Column:
