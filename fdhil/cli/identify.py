@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fdhil import report as reports
 from fdhil import tables
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import AS_JSON, FILE, OutputFile, Picture, Writing
@@ -97,6 +98,8 @@ def identify(
     for option, value in (("--accelerometer", accelerometer), ("--report", report), ("--plot", plot)):
         if value is not None and len(recordings) > 1:
             raise click.UsageError(f"{option} belongs to one recording: give each with its own")
+    if report is not None or plot is not None:
+        reports.require()
     settings, machine = _settings(config_path, method)
     axes = machine.axis if machine is not None else {}
     column_map = _column_map(columns, recordings, as_json=as_json)
@@ -157,9 +160,6 @@ def _draw(result: FileResult, report: Path | None, plot: Path | None) -> None:
     """Write the page and the picture of one recording where they were asked for."""
     if result.error is not None or (report is None and plot is None):
         return
-    from fdhil import report as reports
-
-    reports.require()
     from fdhil.report.identification import identification_page, save_picture
 
     if report is not None:
