@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations
@@ -21,7 +22,7 @@ from fdhil.csv_text import shown
 from fdhil.errors import RecordingError
 from fdhil.records import Float
 from fdhil.store.column_map import FACTORS, units_of_heading, whole_heading
-from fdhil.store.recording_table import RecordingTable
+from fdhil.store.recording_table import PATH, RecordingTable
 from fdhil.store.recordings import read_raw
 
 HEADINGS: Mapping[str, str] = {  # in this order: a "position demand" is a demand, a "speed voltage" a speed
@@ -34,6 +35,7 @@ HEADINGS: Mapping[str, str] = {  # in this order: a "position demand" is a deman
     "voltage_V": r"volt|spannung|tension|^u$|^u[_ ]|_u$|^v$",
 }
 KEPT_ROWS = 4000  # that the physics is asked about
+LEVELS = 20  # that a signal has at least: with fewer it is a state
 EXPLAINED = 0.5  # of both equations, from which three columns are taken for u, i and w
 RPM_FROM = 700.0  # a speed beyond that without a unit is hardly in rad/s
 ANGLE_UNITS = ("rad", "deg", "rev")
@@ -51,29 +53,32 @@ class Proposed:
 
 @dataclass(frozen=True)
 class Proposal:
-    """A column map to be checked: its columns, headers, the ``faults`` that keep it from being used."""
+    """A column map to be checked: its columns, headers, the ``faults`` that keep it from being used.
+
+    ``aside`` are columns that need a pitch, which no file says.
+    """
 
     columns: Sequence[Proposed]
     headers: Mapping[str, str | float]
     faults: Sequence[str]
+    aside: Sequence[Proposed] = ()
 
     @property
     def toml(self) -> str:
         """The map as TOML."""
         lines = ["# proposed by fdhil: check every line", "[headers]"]
         lines += [f"{key} = {json.dumps(value)}" for key, value in self.headers.items()]
-        if any(each.signal in ("position_m", "demand_m") for each in self.columns):
-            lines.append("pitch_m_per_rev = 0.0  # travel of a turn of the motor in m: fill it in")
+        if self.aside:
+            lines.append("# pitch_m_per_rev = 0.01  # with it the columns below that are commented out can be used")
         lines += ["", "[columns]"]
-        lines += [
-            f"{each.signal} = {{ name = {json.dumps(each.heading)}, unit = {json.dumps(each.unit)} }}  # {each.why}"
-            for each in self.columns
-        ]
+        for mark, each in [*(("", c) for c in self.columns), *(("# ", c) for c in self.aside)]:
+            name, unit = json.dumps(each.heading), json.dumps(each.unit)
+            lines.append(f"{mark}{each.signal} = {{ name = {name}, unit = {unit} }}  # {each.why}")
         return "\n".join(lines) + "\n"
 
     def lines(self) -> Iterator[str]:
         """Yield a line per column, for people."""
-        for each in self.columns:
+        for each in (*self.columns, *self.aside):
             yield f"  {each.signal:16} {each.heading!r} in {each.unit}: {each.why}"
 
 
@@ -109,14 +114,13 @@ def propose(
         faults.append("no column rises evenly as a time does: give sample_rate_hz under [headers]")
     if not found.keys() & {"current_A", "torque_Nm"}:
         faults.append("no current was recognised")
-    if not found.keys() & {"speed_rad_per_s", "position_m"}:
+    if not found.keys() & {"speed_rad_per_s", "angle_rad"}:
         faults.append("no speed was recognised")
     if "current_A" in found:
         found.pop("torque_Nm", None)
     proposed = [_with_unit(signal, *found[signal], columns, raw) for signal in FACTORS if signal in found]
-    if any(each.signal in ("position_m", "demand_m") for each in proposed):
-        faults.append("a position needs pitch_m_per_rev; without it, take position_m and demand_m out")
-    return Proposal(proposed, headers, faults)
+    aside = [each for each in proposed if each.signal in PATH]
+    return Proposal([each for each in proposed if each not in aside], headers, faults, aside)
 
 
 def _from_given(raw: RecordingTable, given: Mapping[str, str | Sequence[str]], source: str) -> Proposal:
@@ -145,12 +149,16 @@ def _distinct(raw: RecordingTable) -> dict[str, Float]:
         known = found.get(id(values))
         if known is None or (known.startswith("#") and not name.startswith("#")):
             found[id(values)] = name
-    return {name: raw.columns[name] for name in found.values() if name not in raw.doubts}
+    usable = {name: raw.columns[name] for name in found.values() if name not in raw.doubts}
+    sizes = Counter(values.size for values in usable.values()).most_common(1)
+    return {name: values for name, values in usable.items() if values.size == sizes[0][0]}
 
 
 def _named(heading: str, raw: RecordingTable) -> str | None:
     """Return the signal that a heading or its unit names."""
     text = heading.strip().lower()
+    if any("%" in unit for unit in units_of_heading(raw, heading)):
+        return None
     for signal, pattern in HEADINGS.items():
         if re.search(pattern, text):
             return "angle_rad" if signal == "position_m" and _unit(heading, raw, "angle_rad") else signal
@@ -179,16 +187,23 @@ def _by_physics(
     if all(signal in found for signal in wanted):
         return
     taken = {heading for signal, (heading, _) in found.items() if signal not in wanted}
-    free = [h for h, v in columns.items() if h not in taken and np.isfinite(v).all() and np.ptp(v) > 0.0]
+    free = [h for h, v in columns.items() if h not in taken and np.isfinite(v).all() and np.unique(v).size >= LEVELS]
     choices = []
     for triple in permutations(free, 3):
         fits = all(s not in found or found[s][0] == h for s, h in zip(wanted, triple, strict=True))
         fits = fits and all(s not in by_name or h in by_name[s] for s, h in zip(wanted, triple, strict=True))
+        fits = fits and not any(_is_of_another_unit(h, s) for s, h in zip(wanted, triple, strict=True))
         if fits:
             choices.append((obeys(*(columns[h][:KEPT_ROWS] for h in triple)), triple))
     if choices and (best := max(choices))[0] > EXPLAINED:
         for signal, heading in zip(wanted, best[1], strict=True):
             found.setdefault(signal, (heading, f"by the equations, which explain {best[0]:.0%}"))
+
+
+def _is_of_another_unit(heading: str, signal: str) -> bool:
+    """Return whether a heading ends in a unit in brackets that is none of the signal's."""
+    found = re.search(r"[\[(]([^\[\]():,]*[^\[\]():,\d\s][^\[\]():,]*)[\])]$", heading.strip())
+    return found is not None and found[1] not in FACTORS[signal]
 
 
 def obeys(voltage: Float, current: Float, speed: Float) -> float:

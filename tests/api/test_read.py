@@ -10,7 +10,8 @@ from scipy.io import savemat
 
 import fdhil
 from fdhil.errors import RecordingError
-from fdhil.store.column_proposal import propose_columns
+from fdhil.store.column_proposal import propose, propose_columns
+from fdhil.store.recording_table import RecordingTable
 from tests.api.foreign_motor import TRUTH
 from tests.api.moves import measured
 from tests.api.test_identify import assert_true_within_intervals
@@ -52,6 +53,29 @@ def test_columns_are_proposed_by_headings_and_physics(head: str, order: str, tmp
     assert proposal.faults == []
     assert proposal.headers["voltage_sampling"] == "interval_mean"
     assert_true_within_intervals(fdhil.identify(fdhil.read(path, "?"), any_move=True))
+
+
+def test_position_waits_for_a_pitch_and_states_are_no_signals(tmp_path: Path) -> None:
+    m = measured("steps of voltage")
+    angle = np.cumsum(m.speed) * 1e-3
+    state = (m.speed > 1.0).astype(float)
+    table = np.column_stack([m.time, state, angle, m.voltage, m.current, m.speed, angle % 7.0])
+    head = "Time (s),INP,Position (mm),CH1,CH2,CH3,Droop (pls.)"
+    np.savetxt(tmp_path / "a.csv", table, delimiter=",", header=head, comments="", fmt="%.6g")
+    proposal = propose_columns(tmp_path / "a.csv")
+    found = {p.signal: p.heading for p in proposal.columns}
+    assert found == {"time_s": "Time (s)", "voltage_V": "CH1", "current_A": "CH2", "speed_rad_per_s": "CH3"}
+    assert [(p.signal, p.unit) for p in proposal.aside] == [("position_m", "mm")]
+    assert '\n# position_m = { name = "Position (mm)", unit = "mm" }' in proposal.toml
+    assert fdhil.read(tmp_path / "a.csv", "?").speed == pytest.approx(m.speed, rel=1e-3, abs=1e-3)
+
+
+def test_column_of_another_length_is_not_proposed() -> None:
+    m = measured("steps of voltage")
+    columns = {"t": m.time, "u": m.voltage, "i": m.current[1:], "w": m.speed}
+    proposal = propose(RecordingTable({}, columns))
+    assert [p.signal for p in proposal.columns] == ["time_s", "voltage_V", "speed_rad_per_s"]
+    assert proposal.faults == ["no current was recognised"]
 
 
 def test_file_without_a_current_is_not_proposed_as_a_recording(tmp_path: Path) -> None:
