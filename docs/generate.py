@@ -1,4 +1,4 @@
-"""Generate what can be generated: configs/machine-template.toml and docs/reference/ (config, commands, errors,
+"""Generate what can be generated: configs/machine-template.toml and docs/reference/ (config, commands, python, errors,
 faults, guard, notices).
 
 ``python docs/generate.py`` writes them; a test fails when they are not what the code says.
@@ -7,8 +7,10 @@ faults, guard, notices).
 from __future__ import annotations
 
 import inspect
+import re
 import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,52 @@ from fdhil.guard.transitions import FEED_SENT, FEED_TRANSITIONS, SENT, TRANSITIO
 from fdhil.sim.fault_kinds import FAULTS
 
 ROOT = Path(__file__).resolve().parent.parent
+
+
+PYTHON_HEAD = """# Python interface
+
+Generated from `fdhil/api/`; the examples are run by the tests. `import fdhil` loads nothing else until one of these
+names is used. The command line uses the same functions. Arrays are (n,), units SI. Errors are those of the
+[table](errors.md): each says what happened, what it means and what to do. The names follow semantic versioning: within
+one major version they keep their meaning."""
+
+
+def python_reference() -> str:
+    """Return every name of the Python interface with its signature and docstring as Markdown."""
+    import fdhil
+
+    lines = [PYTHON_HEAD]
+    for name in fdhil.__all__:
+        item = getattr(fdhil, name)
+        lines += ["", f"## fdhil.{name}", "", _documented(item)]
+        if inspect.isclass(item):
+            members = [(m, getattr(item, m)) for m in vars(item) if not m.startswith("_")]
+            told = [(m, v) for m, v in members if callable(v) or isinstance(v, property | cached_property)]
+            lines += [f"- `{m}`: {_first_sentences(v.__doc__)}" for m, v in told]
+    return "\n".join(lines) + "\n"
+
+
+def _documented(item: Any) -> str:
+    """Return signature, text, and examples as code."""
+    text, examples = [], []
+    for paragraph in (inspect.getdoc(item) or "").split("\n\n"):
+        (examples if paragraph.startswith(">>>") else text).append(
+            _plain(paragraph) if not paragraph.startswith(">>>") else paragraph
+        )
+    signature = inspect.signature(item)
+    plain = [p.replace(annotation=inspect.Parameter.empty) for p in signature.parameters.values()]
+    signature = inspect.Signature(plain)
+    shown = ["```python", f"{item.__name__}{signature}", "```", "", "\n\n".join(text), ""]
+    return "\n".join([*shown, *(["```pycon", "\n\n".join(examples), "```", ""] if examples else [])])
+
+
+def _first_sentences(text: str | None) -> str:
+    return _plain(" ".join((text or "").split("\n\n")[0].split()))
+
+
+def _plain(text: str) -> str:
+    """Return a docstring's markup as Markdown."""
+    return re.sub(r":(?:class|func):`~?([\w.]+)`", r"`\1`", text.replace("``", "`"))
 
 
 def config_reference() -> str:
@@ -147,6 +195,7 @@ GENERATED = {
     ROOT / "configs" / "machine-template.toml": template,
     ROOT / "docs" / "reference" / "config.md": config_reference,
     ROOT / "docs" / "reference" / "commands.md": command_reference,
+    ROOT / "docs" / "reference" / "python.md": python_reference,
     ROOT / "docs" / "reference" / "errors.md": error_reference,
     ROOT / "docs" / "reference" / "faults.md": fault_reference,
     ROOT / "docs" / "reference" / "guard.md": guard_reference,

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from fdhil import correction
-from fdhil.cli.batch import FileResult
-from fdhil.cli.identify import _file_document
+from fdhil.api.analysis import FileResult
+from fdhil.api.documents import file_document
 from fdhil.cli.model_file import write_model
 from fdhil.config import Identification
 from fdhil.pipeline import analyse, pool
@@ -79,7 +79,7 @@ def model_of(told: dict[str, Any]) -> dict[str, Any]:
 @pytest.mark.parametrize("plant", sampled(PLANTS, every=4))
 def test_validated_model_is_taken(plant: str, tmp_path: Path) -> None:
     result = identified(PLANTS[plant])
-    document = _file_document(result, {}, with_loops=False)
+    document = file_document(result, {}, with_loops=False)
     told = [each for each in (*document["windows"], document["pooled"]) if each["validated"]]
     path = tmp_path / "model.json"
     for each in told:

@@ -41,7 +41,8 @@ def code_files(home: Path) -> dict[str, bytes]:
         for file in (place.with_suffix(".py"), place / "__init__.py"):
             if file.is_file():
                 content = found[str(file.relative_to(home))] = file.read_bytes()
-                waiting += _imported(content.decode())
+                if module != "fdhil":  # which offers the Python interface, and imports it for no row
+                    waiting += _imported(content.decode())
         waiting.append(module.rpartition(".")[0] or "fdhil")  # a package is imported with its modules
     return found
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from fdhil.cli.compiling import forewarn
+from fdhil.api.compiling import forewarn
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import AS_JSON, CONFIG, FILE, OutputFile, Positive, Writing
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from fdhil.cli.compiling import forewarn
+from fdhil.api.compiling import forewarn
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import AS_JSON, FILE, OutputFile, Positive, Writing
 from fdhil.cli.prediction import inputs

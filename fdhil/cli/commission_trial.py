@@ -26,7 +26,7 @@ def try_commissioned(
     machine: MachineConfig, record: CommissioningRecord, asked: Asked, progress: Progress
 ) -> dict[str, Any] | None:
     """Try a commissioned axis by moving it; None where nobody allowed that. DriveFault when it is refused."""
-    from fdhil.cli.compiling import forewarn
+    from fdhil.api.compiling import forewarn
     from fdhil.commissioning.trial import Operator, try_axis
 
     axis = record.axis

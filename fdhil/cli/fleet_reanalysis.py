@@ -71,9 +71,9 @@ def reanalyse(
         from fdhil.fleet.changes import changes
         from fdhil.fleet.window_work import Method, code_digest
         from fdhil.fleet.workers import workers as entered
+    from fdhil.api.compiling import forewarn
     from fdhil.cli import fleet_reanalysis_view as view
     from fdhil.cli import fleet_view
-    from fdhil.cli.compiling import forewarn
 
     asked = Method(Identification(method=method), machines, settings.objects.directory.resolve(), code_digest())
     scope = reanalysis.Scope(_utc(since), _utc(until), machine, axis)

@@ -3,30 +3,32 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from fdhil import report as reports
 from fdhil import tables
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, COLUMNS, FILE, OutputFile, Writing
+from fdhil.cli.options import AS_JSON, FILE, OutputFile, Picture, Writing
 from fdhil.records import INTERVAL_95, unit_of
 from fdhil.report.parameter_view import MEANING, cell, head
 from fdhil.store import suffixes
+from fdhil.store.output import open_output
 
 if TYPE_CHECKING:
-    from fdhil.cli.batch import FileResult
+    from fdhil.api.analysis import FileResult
     from fdhil.config import Axis, Identification, MachineConfig
-    from fdhil.records import Estimate, Verdict, WindowOutcome
+    from fdhil.records import Estimate, Verdict
+    from fdhil.store.column_map import ColumnMap
 
-SCHEMA = "fdhil-identify-1"
+PROPOSE = "?"  # of --columns
+BESIDE = "-"  # of --plot without a name
 UNREADABLE = 3
 
 
@@ -46,7 +48,22 @@ UNREADABLE = 3
     type=FILE,
     help="What an accelerometer at the table recorded of the same run (CSV, as Klipper writes it); for one RECORDING.",
 )
-@COLUMNS
+@click.option("--any-move", is_flag=True, help="Take each recording as one move of any kind: a laboratory's.")
+@click.option(
+    "--report", type=OutputFile(".html"), help="Write an HTML page of one RECORDING: signals, model, residuals."
+)
+@click.option(
+    "--plot",
+    is_flag=False,
+    flag_value=BESIDE,
+    type=Picture(),
+    help="Draw signals, model and residuals of one RECORDING (.png, .svg, .pdf); without a name next to it.",
+)
+@click.option(
+    "--columns",
+    type=FILE,
+    help="Column map (TOML) of another program's file; ? proposes one from names, units and physics, and writes it.",
+)
 @AS_JSON
 @verdict
 def identify(
@@ -56,6 +73,9 @@ def identify(
     model: Path | None,
     with_loops: bool,
     accelerometer: Path | None,
+    any_move: bool,
+    report: Path | None,
+    plot: Path | None,
     columns: Path | None,
     as_json: bool,
 ) -> int:
@@ -68,33 +88,84 @@ def identify(
     regulators do not explain the rapids, and with --loops always, the drive's own are identified; those that explain
     more are used. A RECORDING is CSV, Parquet, MATLAB, MDF 4 or HDF5; with --columns it is what another program wrote.
     Of a folder all recordings are taken, those of its folders too; many are spread over processes.
+
+    Voltage, current and speed are enough. A laboratory's recording (steps, ramps, chirps, a locked rotor) is taken
+    whole with --any-move; what it cannot determine is null, with the reason.
     Exit codes: 0 every file's pool is validated, 1 some pool is not, 2 wrong option or configuration, 3 a recording
     cannot be read (the others are identified all the same).
     """
     recordings = tuple(_files(recordings))
-    if accelerometer is not None and len(recordings) > 1:
-        raise click.UsageError("--accelerometer belongs to one recording: give each with its own")
+    for option, value in (("--accelerometer", accelerometer), ("--report", report), ("--plot", plot)):
+        if value is not None and len(recordings) > 1:
+            raise click.UsageError(f"{option} belongs to one recording: give each with its own")
+    if report is not None or plot is not None:
+        reports.require()
     settings, machine = _settings(config_path, method)
     axes = machine.axis if machine is not None else {}
-    results = _analyse(recordings, settings, machine, accelerometer, columns)
+    column_map = _column_map(columns, recordings, as_json=as_json)
+    if columns is not None and column_map is None:
+        return 1
+    results = _analyse(recordings, settings, machine, accelerometer, column_map, any_move=any_move)
+    from fdhil.api.analysis import compare_with_data_sheet
+    from fdhil.api.documents import identification_document
+
     if machine is not None:
-        results = [_against_data_sheet(result, axes) for result in results]
+        results = [compare_with_data_sheet(result, axes) for result in results]
     if with_loops:
-        from fdhil.cli.loops_view import with_all_loops
+        from fdhil.api.loops import with_all_loops
 
         results = with_all_loops(results, settings, machine)
     if model is not None:
         from fdhil.cli.model_file import write_model
 
         write_model(results, axes, model)
+    _draw(results[0], report, plot)
     if as_json:
-        document = {"schema": SCHEMA, "files": [_file_document(r, axes, with_loops) for r in results]}
-        click.echo(json.dumps(document, allow_nan=False))
+        click.echo(json.dumps(identification_document(results, axes, with_loops=with_loops), allow_nan=False))
     else:
         _show(results, axes, with_loops)
     if any(result.error for result in results):
         return UNREADABLE
     return 0 if all(r.verdict.accepted for r in results) else 1
+
+
+def _column_map(columns: Path | None, recordings: Sequence[Path], *, as_json: bool) -> ColumnMap | None:
+    """Read the map; with ``?`` propose one, write it next to the recording and ask. None where it is to be checked."""
+    from fdhil.store.column_map import read_column_map
+
+    if columns is None:
+        return None
+    if str(columns) != PROPOSE:
+        return read_column_map(columns)
+    from fdhil.store.column_proposal import propose_columns
+
+    proposal = propose_columns(recordings[0])
+    path = recordings[0].with_suffix(".columns.toml")
+    if path.exists():
+        raise click.UsageError(f"{path} exists and is left as it is: give it with --columns, or remove it")
+    with open_output(path) as file:
+        file.write(proposal.toml.encode())
+    for line in proposal.lines():
+        click.echo(line, err=True)
+    click.echo(f"proposed column map: {path}", err=True)
+    faults = proposal.faults
+    if faults or as_json or not sys.stdin.isatty():
+        what = f"It lacks {'; '.join(faults)}. " if faults else ""
+        click.echo(f"{what}Check it, then: fdhil identify {recordings[0]} --columns {path}", err=True)
+        return None
+    return read_column_map(path) if click.confirm("Identify with it?", err=True) else None
+
+
+def _draw(result: FileResult, report: Path | None, plot: Path | None) -> None:
+    """Write the page and the picture of one recording where they were asked for."""
+    if result.error is not None or (report is None and plot is None):
+        return
+    from fdhil.report.identification import identification_page, save_picture
+
+    if report is not None:
+        reports.write(identification_page(result), report)
+    if plot is not None:
+        save_picture(result, Path(result.file).with_suffix(".png") if str(plot) == BESIDE else plot)
 
 
 def _files(recordings: Sequence[Path]) -> Iterator[Path]:
@@ -131,154 +202,37 @@ def _settings(path: Path | None, method: str | None) -> tuple[Identification, Ma
     return (settings.model_copy(update={"method": method}) if method else settings), machine
 
 
-def _against_data_sheet(result: FileResult, axes: Mapping[str, Axis]) -> FileResult:
-    """Refuse a pool that only a sensor's gain takes to the axis' nominal values; warn where there is no such axis."""
-    from dataclasses import replace
-
-    from fdhil.records import Parameters, Reason
-    from fdhil.validation.data_sheet import gain_error
-
-    verdict = result.verdict
-    if result.axis is not None and result.axis not in axes:
-        text = f"axis {result.axis} is not in the configuration: nothing was compared with its nominal values"
-        unknown = Reason("NoSuchAxis", text, f"add [axis.{result.axis}], or give the configuration of its machine")
-        return replace(result, verdict=replace(verdict, warnings=(*verdict.warnings, unknown)))
-    if result.axis is None or result.pooled is None or not verdict.accepted:
-        return result
-    reason = gain_error(result.pooled, Parameters(**axes[result.axis].nominal.model_dump()))
-    if reason is None:
-        return result
-    return replace(result, verdict=replace(verdict, accepted=False, reasons=(reason,)))
-
-
 def _analyse(
     paths: Sequence[Path],
     settings: Identification,
     machine: MachineConfig | None,
     accelerometer: Path | None,
-    columns: Path | None,
+    columns: ColumnMap | None,
+    *,
+    any_move: bool,
 ) -> list[FileResult]:
+    from fdhil.cli.batch import analyse_files
+
+    analyse = partial(
+        analyse_files, paths, settings, machine, accelerometer=accelerometer, columns=columns, any_move=any_move
+    )
+    if not sys.stderr.isatty():
+        return list(analyse())
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-    from fdhil.cli.batch import analyse_files
     from fdhil.cli.console import PrintableConsole
-    from fdhil.store.column_map import read_column_map
 
-    told = None if columns is None else read_column_map(columns)
-    if not sys.stderr.isatty():
-        return list(analyse_files(paths, settings, machine, accelerometer=accelerometer, columns=told))
     shown = (TextColumn("identifying"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with Progress(*shown, console=PrintableConsole(stderr=True), transient=True) as progress:
         task = progress.add_task("identifying", total=len(paths))
-        return list(analyse_files(paths, settings, machine, partial(progress.advance, task), accelerometer, told))
-
-
-def _file_document(result: FileResult, axes: Mapping[str, Axis], with_loops: bool) -> dict[str, Any]:
-    from fdhil.cli.loops_view import compared
-
-    document = {
-        "file": result.file,
-        "axis": result.axis,
-        "windows": [_window_document(outcome) for outcome in result.outcomes],
-        "pooled": {
-            "parameters": _parameters(result.pooled, result.verdict),
-            "terms": _terms(result.pooled),
-            "validated": result.verdict.accepted,
-            "windows_used": _used(result),
-            "held_out": None if result.held_out is None else asdict(result.held_out),
-            **_verdict(result.verdict),
-        },
-    }
-    if with_loops or result.loops is not None:
-        document["loops"] = compared(result.loops, axes.get(result.axis or ""))
-    return document if result.error is None else document | {"error": result.error}
-
-
-def _used(result: FileResult) -> int:
-    if result.pooled is None:
-        return 0
-    return sum(outcome.verdict.accepted for outcome in result.outcomes)
-
-
-def _window_document(outcome: WindowOutcome) -> dict[str, Any]:
-    from fdhil.identification.windows import moving_range
-
-    window, estimate = outcome.window, _usable(outcome)
-    first, last = moving_range(window)
-    delay = _delay(estimate)
-    return {
-        "start_s": round(window.start_s + first * window.dt_s, 6),
-        "end_s": round(window.start_s + last * window.dt_s, 6),
-        "direction": window.direction,
-        "parameters": _parameters(estimate, outcome.verdict),
-        "terms": _terms(estimate),
-        "validated": outcome.verdict.accepted,
-        "fit_percent": outcome.verdict.fit_percent,
-        **_verdict(outcome.verdict),
-        **({"delay_s": delay} if delay is not None else {}),
-        **({"at_table": asdict(outcome.at_table)} if outcome.at_table is not None else {}),
-    }
-
-
-def _usable(outcome: WindowOutcome) -> Estimate | None:
-    """Return the estimate of a window; of a validated one the drive that predict and correct take."""
-    from fdhil.identification.physical_bounds import bounded
-
-    if outcome.estimate is None or not outcome.verdict.accepted:
-        return outcome.estimate
-    return bounded(outcome.estimate, outcome.window.direction)
-
-
-def _verdict(verdict: Verdict) -> dict[str, Any]:
-    return {
-        "unexplained_um": verdict.unexplained_um,
-        "reasons": [str(reason) for reason in verdict.reasons],
-        "warnings": [str(reason) for reason in verdict.warnings],
-    }
-
-
-def _terms(estimate: Estimate | None) -> dict[str, Any]:
-    if estimate is None:
-        return {}
-    return {n: {"value": estimate.value(n), "std": estimate.std(n), "unit": unit_of(n)} for n in estimate.terms}
-
-
-def _delay(estimate: Estimate | None) -> dict[str, Any] | None:
-    """Return by how much the voltage is late against current and speed; None where that was not estimated."""
-    if estimate is None or estimate.delay_s is None or estimate.delay_std_s is None:
-        return None
-    if not (math.isfinite(estimate.delay_s) and math.isfinite(estimate.delay_std_s)):
-        return None
-    return {"value": estimate.delay_s, "std": estimate.delay_std_s, "unit": "s"}
-
-
-def _parameters(estimate: Estimate | None, verdict: Verdict) -> dict[str, Any]:
-    """Return value, std and unit of each parameter, or null and the reason.
-
-    K may be given; R and L that the data sheet gives are none that this recording tells.
-    """
-    from fdhil.identification.without_voltage import NO_VOLTAGE
-    from fdhil.records import PARAMETERS, UNITS
-
-    answer: dict[str, Any] = {}
-    for name in PARAMETERS:
-        if estimate is not None and name in estimate.given:
-            told = {"value": estimate.value(name), "std": 0.0, "unit": UNITS[name]}
-            answer[name] = {**told, "given": True} if name == "K" else {"value": None, "reason": str(NO_VOLTAGE)}
-            continue
-        if estimate is not None and math.isfinite(estimate.value(name)) and math.isfinite(estimate.std(name)):
-            answer[name] = {"value": estimate.value(name), "std": estimate.std(name), "unit": UNITS[name]}
-            continue
-        reason = estimate.missing.get(name) if estimate is not None else None
-        reason = reason or (verdict.reasons[0] if verdict.reasons else None)
-        answer[name] = {"value": None, "reason": str(reason) if reason is not None else "NotFinite: no estimate"}
-    return answer
+        return list(analyse(progress=partial(progress.advance, task)))
 
 
 def _show(results: Sequence[FileResult], axes: Mapping[str, Axis], with_loops: bool) -> None:
     from rich import box
     from rich.table import Table
 
+    from fdhil.api.documents import usable_estimate, windows_used
     from fdhil.cli.console import PrintableConsole
     from fdhil.cli.loops_view import show_loops
     from fdhil.identification.windows import moving_range
@@ -306,9 +260,9 @@ def _show(results: Sequence[FileResult], axes: Mapping[str, Axis], with_loops: b
             window = outcome.window
             first, last = moving_range(window)
             span = f"{window.start_s + first * window.dt_s:.2f}-{window.start_s + last * window.dt_s:.2f}"
-            table.add_row(span, *_cells(_usable(outcome), outcome.verdict, weighed))
+            table.add_row(span, *_cells(usable_estimate(outcome), outcome.verdict, weighed))
         table.add_section()
-        table.add_row(f"all {_used(result)}", *_cells(result.pooled, result.verdict, weighed), style="bold")
+        table.add_row(f"all {windows_used(result)}", *_cells(result.pooled, result.verdict, weighed), style="bold")
         console.print(table)
         _show_terms(console, result)
         if (shown := result.held_out) is not None:
@@ -341,7 +295,9 @@ def _cell(estimate: Estimate, name: str) -> str:
 
 
 def _show_terms(console: Any, result: FileResult) -> None:
-    each = ((f"{o.window.start_s:.2f} s", _usable(o)) for o in result.outcomes)
+    from fdhil.api.documents import usable_estimate
+
+    each = ((f"{o.window.start_s:.2f} s", usable_estimate(o)) for o in result.outcomes)
     for who, estimate in each if result.pooled is None else (("all", result.pooled),):
         if estimate is not None and estimate.terms:
             told = (cell(n, estimate.value(n), INTERVAL_95 * estimate.std(n), " ") for n in estimate.terms)
@@ -363,13 +319,14 @@ def _show_table(console: Any, result: FileResult) -> None:
 
 def _show_reasons(console: Any, result: FileResult) -> None:
     """Write each reason, and what only widens the intervals, once and with what to do."""
+    from fdhil.api.documents import voltage_delay
     from fdhil.validation.plausibility import warnings_of
 
     verdicts = [*(outcome.verdict for outcome in result.outcomes), result.verdict]
     told = [r for verdict in verdicts for r in (*verdict.reasons, *verdict.warnings)]
     told += [r for outcome in result.outcomes for r in warnings_of(outcome.window)]
     for outcome in result.outcomes:
-        delay = _delay(outcome.estimate) if outcome.window.slow_voltage is not None else None
+        delay = voltage_delay(outcome.estimate) if outcome.window.slow_voltage is not None else None
         if delay is not None:
             late_ms, half_ms = 1e3 * delay["value"], 1e3 * INTERVAL_95 * delay["std"]
             text = f"  voltage is late by {late_ms:.3f} ± {half_ms:.3f} ms from {outcome.window.start_s:.2f} s on"

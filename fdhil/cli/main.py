@@ -8,6 +8,7 @@ from importlib import import_module
 
 import click
 
+from fdhil.cli.citation import cite
 from fdhil.cli.failing import prepare_streams, run_safely
 
 __all__ = ["COMMANDS", "cli", "main", "run_safely"]
@@ -86,6 +87,14 @@ def leaves(group: click.Group, before: str = "") -> Iterator[tuple[str, click.Co
 
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="fdhil", prog_name="fdhil")
+@click.option(
+    "--cite",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=cite,
+    help="Show how to cite fdhil and the paper that it follows, as BibTeX.",
+)
 def cli() -> None:
     """Identify feed drives during rapid moves, predict path errors, and feed corrections back.
 

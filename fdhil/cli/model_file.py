@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from fdhil.cli.batch import FileResult
+from fdhil.api.analysis import FileResult
 from fdhil.config import Axis
 from fdhil.identification.loops import better_loops, changed_regulators, regulators_of, with_loops
 from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Reason

@@ -53,6 +53,17 @@ class OutputFile(click.Path):
         return path
 
 
+class Picture(OutputFile):
+    """A picture to be written, ``-`` where its name follows from what is drawn."""
+
+    def __init__(self) -> None:
+        super().__init__(".png", ".svg", ".pdf")
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """Return the path. Errors as of an :class:`OutputFile`."""
+        return Path(value) if str(value) == "-" else super().convert(value, param, ctx)
+
+
 class Writing(click.Command):
     """A command that writes files: never over one that it reads, and each file once."""
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import tables
-from fdhil.cli.compiling import forewarn
+from fdhil.api.compiling import forewarn
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import AS_JSON, FILE, OutputFile, Positive, Writing
 from fdhil.records import INTERVAL_95
@@ -221,46 +220,13 @@ def inputs(
     """Read configuration, model and reference, in this order; loops of the model are in the configuration."""
     if model_path is not None and from_history:
         raise click.UsageError("--model and --from-history exclude each other: give one of them")
-    from fdhil import config as configuration
-    from fdhil.prediction import models as model_files
-    from fdhil.program import load_trajectory
+    from fdhil.api.machine import Machine, read_inputs
 
-    config = configuration.load(config_path)
-    given, source = model_files.nominal_models(config), str(config_path)
-    if model_path is not None:
-        source = str(model_path)
-        given, loops, _ = model_files.load_model_file(model_path)
-        _refuse_refuted_loops(config, given.keys() - loops.keys(), source)
-        config = model_files.with_loops(config, loops, source)
-    elif from_history:
-        from fdhil.store.newest_sets import read_newest_sets
-
-        source = str(config.store.directory)
-        newest = read_newest_sets(config.store.directory, config.axis, functools.partial(click.echo, err=True))
-        given, config = model_files.validated_models({axis: n.set for axis, n in newest.items()}, config, source)
-    reference = load_trajectory(program, config)
-    return reference, model_files.models_for(reference, given, config, source), config
+    return read_inputs(program, Machine.load(config_path), "history" if from_history else model_path, _warn)
 
 
-def _refuse_refuted_loops(config: MachineConfig, axes: Iterable[str], source: str) -> None:
-    """Raise ConfigError where a model file has no loops of an axis whose rapids refuted the configured ones.
-
-    A history that cannot be read refutes nothing.
-    """
-    from fdhil.errors import ConfigError, ConfigFault, StoreError
-    from fdhil.prediction.models import loops_apart
-    from fdhil.store.newest_sets import read_newest_sets
-
-    faults = []
-    with contextlib.suppress(StoreError):
-        for axis, newest in read_newest_sets(config.store.directory, config.axis.keys() & axes).items():
-            loops, same = newest.set.loops or {}, newest.set.config_digest == config.digest
-            if same and (apart := loops_apart(loops, config.axis[axis].regulators)):
-                text = f"LoopsDiffer: is missing, and the machine's rapids showed other loops than configured ({apart})"
-                advice = "write the model again with fdhil identify --write-model, or use --from-history"
-                faults.append(ConfigFault(f"{axis}.loops", text, advice))
-    if faults:
-        raise ConfigError(source, faults)
+def _warn(text: str) -> None:
+    click.echo(text, err=True)
 
 
 def _covariances(reference: Trajectory, past: Past) -> dict[str, Float]:

@@ -11,7 +11,7 @@ import click
 
 from fdhil import config as machine_config
 from fdhil import tables
-from fdhil.cli.compiling import forewarn
+from fdhil.api.compiling import forewarn
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import AS_JSON, COLUMNS, CONFIG, FILE, OutputFile, Writing
 from fdhil.errors import RecordingError

@@ -39,7 +39,7 @@ def run(config: Path, method: str | None, as_json: bool) -> int:
     to zero first. Exit 3 when an offset may still be applied then: the last line says which, and what to do.
     """
     machine = machine_config.load(config)
-    from fdhil.cli.compiling import forewarn
+    from fdhil.api.compiling import forewarn
     from fdhil.daemon import journal, service  # late: --help imports nothing heavy
     from fdhil.drivers import open_machine
 

@@ -14,12 +14,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, LiteralString
 
-import pyarrow as pa
-import pyarrow.parquet as pq
-
 from fdhil.errors import StoreError
 from fdhil.fleet.sets import Db
 from fdhil.store.atomic import make_folder, store_error
+from fdhil.store.parquet_library import pa, pq
 
 KEY_BYTES = 32
 NAME_CHARS = 16  # of the digest, 64 bits

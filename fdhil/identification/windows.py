@@ -95,6 +95,18 @@ def find_windows(recording: Recording, rapid_speed_rad_s: float | None = None) -
     return windows
 
 
+def whole_window(recording: Recording) -> Window:
+    """Return all of a recording as one window of any move, whose top speed stands in for the rapid speed.
+
+    Its direction is that in which it goes farther.
+    """
+    speed = smooth(recording.speed_rad_s, recording.dt_s)
+    top, n = float(np.max(np.abs(speed), initial=0.0)), speed.size
+    run = Run(0, n, 0, n, 1 if speed.sum() >= 0.0 else -1)
+    window = _cut(recording, speed, run, 0, n, max(top, 1e-9))
+    return replace(window, stages=Stages((0, n), None, None), is_rapid=False)
+
+
 def _runs(speed: Float, rapid: float, dt: float, noise: float) -> list[Run]:
     """Return the moves of either direction; ``speed`` is smoothed."""
     side = np.sign(speed) * (np.abs(speed) >= RUN_SHARE * rapid)

@@ -45,7 +45,7 @@ def pool(
     the windows' own estimates are pooled, which is as good when each window tells all six, and takes no time.
     """
     if not outcomes:
-        advice = "record moves at 60 % of the rapid speed or more"
+        advice = "record moves at 60 % of the rapid speed or more, or identify from any move with --any-move"
         return None, Verdict(False, None, (Reason("NoWindow", "the recording holds no rapid move", advice),))
     members = [member(o.window, o.estimate, k) for k, o in enumerate(outcomes) if o.verdict.accepted and o.estimate]
     estimate, verdict = together(outcomes, members, members, settings, refit=refit)
@@ -147,7 +147,7 @@ def _verdict(accepted: Sequence[WindowOutcome], reasons: Sequence[Reason]) -> Ve
     unexplained = [v.unexplained_um for v in verdicts if v.unexplained_um is not None]
     warnings = {_FIGURES.sub("", str(warning)): warning for v in verdicts for warning in v.warnings}
     told = list(warnings.values())
-    if len({o.window.direction for o in accepted}) == 1 and not reasons:
+    if len({o.window.direction for o in accepted}) == 1 and not reasons and accepted[0].window.is_rapid:
         text = "all moves go one way: a constant load is part of Cd, as nothing tells it apart"
         told.append(Reason("OneDirection", text, "record rapids in both directions"))
     figure = max(unexplained, default=None)

@@ -163,7 +163,8 @@ class Window:
     that they do not, None without them. ``start_s`` is the time of row 0 in its recording or since the first tick.
     ``offset_mm`` is the position offset in force, None where it was 0 throughout or is not known.
     ``torque_constant_nm_per_a`` is the K that the recording itself tells. ``nc`` is what the NC said of the move,
-    None where it was not heard. Two windows are equal when they are the same one.
+    None where it was not heard. Of a move that is no rapid (``is_rapid``), a whole laboratory recording, ``stages`` and
+    ``direction`` mean little. Two windows are equal when they are the same one.
     """
 
     axis: str
@@ -192,6 +193,7 @@ class Window:
     table_mm: Float | None = None
     table_m_s2: Float | None = None
     nc: NcMove | None = None
+    is_rapid: bool = True
 
     @property
     def n(self) -> int:

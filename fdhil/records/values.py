@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -107,14 +108,14 @@ class Parameters:
     terms: tuple[tuple[str, float], ...] = ()
 
     @classmethod
-    def of(cls, values: Mapping[str, float]) -> Parameters:
+    def of(cls, values: Mapping[str, float]) -> Self:
         """Return the parameters whose names and values these are, the six and perhaps terms; KeyError for fewer."""
         R, L, K, Jt, ft, Cd = (float(values[name]) for name in PARAMETERS)
         return cls(R, L, K, Jt, ft, Cd, tuple((n, float(v)) for n, v in values.items() if n not in PARAMETERS))
 
-    def changed(self, **values: float) -> Parameters:
+    def changed(self, **values: float) -> Self:
         """Return the parameters with some values, of terms too, changed or added."""
-        return Parameters.of({**self.as_dict(), **dict(self.terms), **values})
+        return type(self).of({**self.as_dict(), **dict(self.terms), **values})
 
     def as_dict(self) -> dict[str, float]:
         """Return the six by symbol, in the order of ``PARAMETERS``."""

@@ -1,13 +1,14 @@
 """A column map (TOML) says which column of another program's file is which signal, in which unit, and of which axis.
 
-Without a speed, it is the difference of positions; without a demand, none can be replayed and the map is refused.
+Without a speed, it is the difference of positions or angles; a torque stands in for a current. A part of a heading is
+enough to name a column, where one column alone has it.
 """
 
 import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationError
@@ -18,11 +19,13 @@ from fdhil.csv_text import shown
 from fdhil.errors import ConfigError, ConfigFault, RecordingError
 from fdhil.records import Float
 from fdhil.store.counter_wraps import jump_of_reading, unwrap_counter, unwrap_turns
+from fdhil.store.derived_columns import TORQUE, check_sizes, derive_columns
 from fdhil.store.recording_table import (
-    COLUMNS,
+    ANGLE,
     FORMAT,
     NOTES,
-    REQUIRED,
+    PATH,
+    PITCH,
     SAMPLING,
     VOLTAGE,
     RecordingTable,
@@ -32,6 +35,7 @@ from fdhil.store.sample_times import even_times, usual_step
 from fdhil.store.trace_text import TraceText
 
 SHOWN_NAMES = 12
+LEAST_PART = 3  # letters of a heading that name its column
 SHORTEST_S = 0.01  # of a recording
 PER_REVOLUTION = {"mm/s": 1e-3, "mm/min": 1e-3 / 60, "m/min": 1 / 60, "m/s": 1.0}  # of the table: by pitch to rad/s
 FACTORS: Mapping[str, Mapping[str, float]] = {
@@ -40,12 +44,14 @@ FACTORS: Mapping[str, Mapping[str, float]] = {
     "current_A": {"A": 1.0, "mA": 1e-3},
     "speed_rad_per_s": {"rad/s": 1.0, "rpm": 2 * math.pi / 60, "1/min": 2 * math.pi / 60, "rev/s": 2 * math.pi,
                         "deg/s": math.pi / 180},
+    "angle_rad": {"rad": 1.0, "deg": math.pi / 180, "rev": 2 * math.pi},
+    "torque_Nm": {"N.m": 1.0, "mN.m": 1e-3},
     "position_m": {"m": 1.0, "mm": 1e-3, "um": 1e-6},
     "demand_m": {"m": 1.0, "mm": 1e-3, "um": 1e-6},
     "table_mm": {"mm": 1.0, "m": 1e3, "um": 1e-3},
     "table_m_s2": {"m/s2": 1.0, "mm/s2": 1e-3, "g": 9.80665},
 }  # fmt: skip
-COUNTED = ("time_s", "position_m", "demand_m")  # what a counter may count
+COUNTED = ("time_s", "angle_rad", "position_m", "demand_m")  # what a counter may count
 SYNONYMS = {"sec": "s", "msec": "ms", "U/min": "rpm", "r/min": "rpm", "min-1": "rpm", "m/s^2": "m/s2", "m/s²": "m/s2"}
 _MICRO = str.maketrans({"\u00b5": "u", "\u03bc": "u"})
 # a unit at the end of a name: in brackets, "Current / mA", "Current, mA", "C1 in A", "Current mA", "current_mA"
@@ -55,8 +61,9 @@ _IN_NAME = (
     re.compile(r"[\s_](\S{2,})$"),  # one letter may as well be a channel's, or stand for the motor
 )
 Signal = Literal[
-    "time_s", "voltage_V", "current_A", "speed_rad_per_s", "position_m", "demand_m", "table_mm", "table_m_s2"
-]
+    "time_s", "voltage_V", "current_A", "torque_Nm", "speed_rad_per_s", "angle_rad", "position_m", "demand_m",
+    "table_mm", "table_m_s2",
+]  # fmt: skip
 
 
 class Column(Section):
@@ -85,22 +92,28 @@ class ColumnMap(Section):
 
 def read_column_map(path: Path) -> ColumnMap:
     """Read a map; ConfigError with every fault of it."""
+    return check_map(read_toml(path, "a column map"), str(path))
+
+
+def check_map(document: Mapping[str, Any], source: str) -> ColumnMap:
+    """Return the map that a document is; ConfigError with every fault of it."""
     try:
-        told = ColumnMap.model_validate(read_toml(path, "a column map"))
+        told = ColumnMap.model_validate(document)
     except ValidationError as error:
         items = error.errors(include_url=False)
         faults = [ConfigFault(".".join(map(str, e["loc"])), e["msg"], "see the how-to on recordings") for e in items]
-        raise ConfigError(str(path), faults) from None
+        raise ConfigError(source, faults) from None
     if faults := [*_faults(told)]:
-        raise ConfigError(str(path), faults)
+        raise ConfigError(source, faults)
     return told
 
 
 def _faults(told: ColumnMap) -> list[ConfigFault]:
+    needed = {"current_A": (TORQUE,), "speed_rad_per_s": (ANGLE, "position_m")}
     faults = [
-        ConfigFault(f"columns.{signal}", "is missing", "say which column it is")
-        for signal in COLUMNS
-        if signal not in told.columns and signal not in ("time_s", "speed_rad_per_s")
+        ConfigFault(f"columns.{signal}", "is missing", f"say which column it is, or give {' or '.join(instead)}")
+        for signal, instead in needed.items()
+        if not told.columns.keys() & {signal, *instead}
     ]
     for signal, columns in told.columns.items():
         units = {**FACTORS[signal], **(PER_REVOLUTION if signal == "speed_rad_per_s" else {})}
@@ -109,7 +122,8 @@ def _faults(told: ColumnMap) -> list[ConfigFault]:
             for c in _as_tuple(columns)
             if c.unit not in units
         ]
-    wanted = [key for key in REQUIRED if key not in ("format", "sample_rate_hz")]
+    per_revolution = [c.unit for c in _as_tuple(told.columns.get("speed_rad_per_s", ())) if c.unit in PER_REVOLUTION]
+    wanted = ["axis", *([PITCH] if per_revolution or told.columns.keys() & {*PATH} else [])]
     wanted += [SAMPLING] if VOLTAGE in told.columns else []
     missing = [key for key in wanted if key not in told.headers]
     return faults + [ConfigFault(f"headers.{key}", "is missing", "the file does not say it") for key in missing]
@@ -122,14 +136,17 @@ def mapped(raw: RecordingTable, told: ColumnMap, source: str) -> RecordingTable:
     the rest is wrong.
     """
     headers = {"format": FORMAT, **raw.headers, **{key: _text(value) for key, value in told.headers.items()}}
-    pitch_m = _positive(headers.get("pitch_m_per_rev"), "pitch_m_per_rev", "a length above 0, in m", source)
+    pitch_m = math.nan
+    if PITCH in headers:
+        pitch_m = _positive(headers[PITCH], PITCH, "a length above 0, in m", source)
     rate_hz = None
     if "sample_rate_hz" in headers:
         rate_hz = _positive(headers["sample_rate_hz"], "sample_rate_hz", "a number above 0", source)
+    told = _with_whole_names(raw, told, source)
     raw = _sampled_together(raw, told, source)
     columns, notes = _signals(raw, told, pitch_m, source)
     if "time_s" not in columns:
-        columns = {"time_s": _time(raw, rate_hz, len(columns["position_m"]), source), **columns}
+        columns = {"time_s": _time(raw, rate_hz, len(next(iter(columns.values()))), source), **columns}
     columns = _whole_rows(columns, source)
     if 0 < (lasts_s := np.ptp(columns["time_s"])) < SHORTEST_S:
         lasts = f"lasts {lasts_s:.3g} s by its times, in which no axis moves"
@@ -139,9 +156,10 @@ def mapped(raw: RecordingTable, told: ColumnMap, source: str) -> RecordingTable:
     _check_rising(columns["time_s"], source)
     if rate_hz is None:
         headers["sample_rate_hz"] = f"{1 / usual_step(columns['time_s']):.9g}"
-    if "speed_rad_per_s" not in columns:
-        columns["speed_rad_per_s"] = _difference(columns) * 2 * math.pi / pitch_m
-        headers["speed_source"] = "difference"
+    if "speed_rad_per_s" not in columns and ANGLE not in columns:
+        columns[ANGLE] = columns["position_m"] * (2 * math.pi / pitch_m)
+    derive_columns(headers, columns)
+    check_sizes(columns, source)
     if notes := [*notes, *([note] if note else [])]:
         headers[NOTES] = "; ".join(notes)
     return RecordingTable(headers, columns)
@@ -156,9 +174,25 @@ def _whole_rows(columns: Mapping[str, Float], source: str) -> dict[str, Float]:
     return {name: values[whole] for name, values in columns.items()}
 
 
-def _difference(columns: Mapping[str, Float]) -> Float:
-    """Return the speed of the table, m/s, by the positions; 0 in the first row."""
-    return np.concatenate([[0.0], np.diff(columns["position_m"]) / np.diff(columns["time_s"])])
+def whole_heading(raw: RecordingTable, name: str, source: str) -> str:
+    """Return the heading that has ``name`` or is it, else ``name`` itself; RecordingError where several have it."""
+    names = list(dict.fromkeys(n for table in (raw, *raw.others) for n in (*table.columns, *table.doubts)))
+    if name in names or name.startswith("#") or len(name) < LEAST_PART:
+        return name
+    found = [each for each in names if name.lower() in each.lower()]
+    if len(found) > 1:
+        listed = " and ".join(map(shown, found[:SHOWN_NAMES]))
+        raise RecordingError(f"{source}: {shown(name)} is a part of {listed}: write more of the one that is meant")
+    return found[0] if found else name
+
+
+def _with_whole_names(raw: RecordingTable, told: ColumnMap, source: str) -> ColumnMap:
+    """Return the map with the whole heading where it has a part of one; RecordingError where several have that part."""
+    columns = {
+        signal: tuple(c.model_copy(update={"name": whole_heading(raw, c.name, source)}) for c in _as_tuple(of))
+        for signal, of in told.columns.items()
+    }
+    return told.model_copy(update={"columns": columns})
 
 
 def _sampled_together(raw: RecordingTable, told: ColumnMap, source: str) -> RecordingTable:
@@ -248,15 +282,20 @@ def _check_places(raw: RecordingTable, told: ColumnMap, source: str) -> None:
 def _check_unit(raw: RecordingTable, signal: str, column: Column, source: str) -> None:
     """Refuse a unit that is not the one that stands above the column, where the map scales nothing itself."""
     known = {**FACTORS[signal], **(PER_REVOLUTION if signal == "speed_rad_per_s" else {})}
-    names = [column.name.strip(), *raw.texts.get(column.name, ())]
-    texts = [*names, *(found[1] for name in names for form in _IN_NAME if (found := form.search(name.strip())))]
-    units = [unit for unit in map(_unit, texts) if unit in known]
+    units = [unit for unit in units_of_heading(raw, column.name) if unit in known]
     wrong = units and not any(math.isclose(known[unit], known[column.unit]) for unit in units)
     if wrong and "factor" not in column.model_fields_set and column.name not in raw.clocks:
         raise RecordingError(
             f"{source} has {shown(column.name)} in {units[0]}, the column map says {column.unit}: correct unit in the "
             "map, or give factor = 1 where the file is wrong"
         )
+
+
+def units_of_heading(raw: RecordingTable, heading: str) -> list[str]:
+    """Return what may be the unit of a column: texts of the file about it, and ends of its heading."""
+    names = [heading.strip(), *raw.texts.get(heading, ())]
+    ends = (found[1] for name in names for form in _IN_NAME if (found := form.search(name.strip())))
+    return [_unit(text) for text in (*names, *ends)]
 
 
 def _unit(text: str) -> str:

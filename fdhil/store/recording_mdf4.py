@@ -18,7 +18,7 @@ import numpy as np
 from fdhil.errors import FdhilError
 from fdhil.records import Float
 from fdhil.store.reading_process import read_apart
-from fdhil.store.recording_table import COLUMNS, UNITS, UNREADABLE, RecordingTable, check_size, unreadable
+from fdhil.store.recording_table import COLUMNS, PATH, UNITS, UNREADABLE, RecordingTable, check_size, unreadable
 
 KIND = "MDF 4 file"
 TIME = 1  # what a master channel counts; others are an angle, a distance, an index
@@ -71,9 +71,8 @@ def read(content: bytes, source: str) -> RecordingTable:
     except (asammdf.blocks.utils.MdfException, ExpatError, *UNREADABLE) as error:
         raise unreadable(source, KIND, error) from None
     # of a recording of fdhil the group that has its columns, of any other the largest
-    tables.sort(
-        key=lambda table: (sum(n in table.columns for n in COLUMNS), table.columns["time_s"].size), reverse=True
-    )
+    own = {*COLUMNS, *PATH}
+    tables.sort(key=lambda table: (len(own & table.columns.keys()), table.columns["time_s"].size), reverse=True)
     return replace(tables[0], others=tuple(tables[1:])) if tables else RecordingTable({}, {})
 
 

@@ -5,12 +5,10 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from fdhil.records import Float, Window
 from fdhil.store.export import table_of
+from fdhil.store.parquet_library import pa, pc, pq
 from fdhil.store.recording_table import FORMAT, UNIT_KEYS, UNITS, UNREADABLE, RecordingTable, check_size, unreadable
 from fdhil.store.trace_cells import past_midnight
 from fdhil.store.windows import FORMAT as WINDOW_FORMAT
@@ -103,10 +101,9 @@ def is_recording(path: Path) -> bool:
     return _format_of(path) == FORMAT
 
 
-def stored_window(path: Path) -> Window | None:
-    """Return the window of a file that is a stored one, None of any other. RecordingError where it is damaged."""
-    is_one = path.suffix.lower() == ".parquet" and _format_of(path) == WINDOW_FORMAT
-    return read_window(path) if is_one else None
+def read_if_window(path: Path) -> Window | None:
+    """Return the window of a Parquet file that is a stored one, else None. RecordingError where it is damaged."""
+    return read_window(path) if _format_of(path) == WINDOW_FORMAT else None
 
 
 def _format_of(path: Path) -> object:

@@ -19,10 +19,14 @@ from fdhil.errors import RecordingError
 from fdhil.records import Float, Recording, SlowVoltage, VoltageSampling, frozen
 
 FORMAT = "fdhil-recording-1"
-COLUMNS = ("time_s", "current_A", "speed_rad_per_s", "position_m", "demand_m")
+COLUMNS = ("time_s", "current_A", "speed_rad_per_s")
+PATH = ("position_m", "demand_m")  # only for what is told in micrometres; they need a pitch
+ANGLE = "angle_rad"  # of the motor, where no position is
 VOLTAGE = "voltage_V"
 TABLE = ("table_mm", "table_m_s2")  # sensors at the table, which may have lost rows
-REQUIRED = ("format", "sample_rate_hz", "axis", "pitch_m_per_rev")
+REQUIRED = ("format", "sample_rate_hz", "axis")
+PITCH = "pitch_m_per_rev"  # required where there is a position or a demand
+STAND_IN_PITCH_M = 2e-3 * math.pi  # of a motor without a screw: 1 mm in a message stands for 1 rad
 SAMPLING = "voltage_sampling"  # required where there is a voltage
 NOTES = "import_notes"  # header: what was done to another program's numbers as they were read
 SOURCES: Mapping[str, tuple[str, ...]] = {
@@ -36,6 +40,7 @@ UNITS: Mapping[str, str] = {
     "speed_rad_per_s": "rad/s",
     "position_m": "m",
     "demand_m": "m",
+    "angle_rad": "rad",
     "table_mm": "mm",
     "table_m_s2": "m/s2",
 }
@@ -84,15 +89,21 @@ def recording_of(table: RecordingTable, source: str = "recording") -> Recording:
     check_headers(table.headers, table.columns, source)
     table, pitches = _as_lengths(table, source)
     headers = dict(table.headers)
-    names = [name for name in (*COLUMNS, VOLTAGE, *TABLE) if name in table.columns]
+    names = [name for name in (*COLUMNS, *PATH, ANGLE, VOLTAGE, *TABLE) if name in table.columns]
     values = _rows(table, names, source)
     dt = 1.0 / _within(headers, "sample_rate_hz", RATE_HZ, source)
     rows, gaps = _place(values[:, 0], dt, source)
     columns = _spread(values, rows)
     sampling = _sampling(headers, source) if SAMPLING in headers else "interval_mean"
     _check_sources(headers, source)
-    pitch_m = _within(headers, "pitch_m_per_rev", pitches, source)
+    pitch_m = _within(headers, PITCH, pitches, source) if PITCH in headers else STAND_IN_PITCH_M
     rapid_m_s = _within(headers, "rapid_speed_m_per_s", RAPID_M_S, source) if "rapid_speed_m_per_s" in headers else None
+    paths = {name: _told(name, names, columns) for name in PATH}
+    position_m, demand_m = paths["position_m"], paths["demand_m"]
+    if position_m is None:
+        angle = _told(ANGLE, names, columns)
+        angle = _travel(columns[:, 2], dt, headers.get("speed_source")) if angle is None else angle
+        position_m = angle * (pitch_m / (2 * math.pi))
     return Recording(
         axis=headers["axis"],
         dt_s=dt,
@@ -100,8 +111,8 @@ def recording_of(table: RecordingTable, source: str = "recording") -> Recording:
         voltage_v=_told(VOLTAGE, names, columns),
         current_a=frozen(columns[:, 1]),
         speed_rad_s=frozen(columns[:, 2]),
-        position_mm=frozen(columns[:, 3] * 1e3),
-        demand_mm=frozen(columns[:, 4] * 1e3),
+        position_mm=frozen(position_m * 1e3),
+        demand_mm=frozen(np.full(len(columns), np.nan) if demand_m is None else demand_m * 1e3),
         voltage_sampling=sampling,
         pitch_mm=pitch_m * 1e3,
         rapid_speed_rad_s=None if rapid_m_s is None else rapid_m_s / pitch_m * 2 * math.pi,
@@ -113,6 +124,18 @@ def recording_of(table: RecordingTable, source: str = "recording") -> Recording:
         table_mm=_told("table_mm", names, columns),
         table_m_s2=_told("table_m_s2", names, columns),
     )
+
+
+def _travel(speed_rad_s: Float, dt_s: float, source: str | None) -> Float:
+    """Return the angle (n,) that a speed turns, which stands in for a position that was not recorded; lost rows NaN.
+
+    A speed that is a difference of positions is the mean over the row before.
+    """
+    known = np.isfinite(speed_rad_s)
+    speed = np.interp(np.arange(known.size), np.flatnonzero(known), speed_rad_s[known])
+    means = speed[1:] if source == "difference" else (speed[1:] + speed[:-1]) / 2
+    angle = np.concatenate([[0.0], np.cumsum(means * dt_s)])
+    return np.where(known, angle, np.nan)
 
 
 def _as_lengths(table: RecordingTable, source: str) -> tuple[RecordingTable, tuple[float, float]]:
@@ -128,7 +151,7 @@ def _as_lengths(table: RecordingTable, source: str) -> tuple[RecordingTable, tup
     headers["pitch_m_per_rev"] = repr(_within(headers, PITCH_OF_ROTARY, PITCH_DEG, source) * m_per_deg)
     if (rapid := _optional(headers, "rapid_speed_deg_per_s", source)) is not None:
         headers["rapid_speed_m_per_s"] = repr(rapid * m_per_deg)
-    columns |= {name: columns.pop(angle) * m_per_deg for name, angle in ANGLES.items()}
+    columns |= {name: columns.pop(angle) * m_per_deg for name, angle in ANGLES.items() if angle in columns}
     return replace(table, headers=headers, columns=columns), (0.0, math.inf)
 
 
@@ -151,14 +174,15 @@ def unreadable(source: str, kind: str, error: BaseException) -> RecordingError:
 
 def check_headers(headers: Mapping[str, str], columns: Mapping[str, object], source: str) -> dict[str, str]:
     """Return the headers of a recording that has these columns; RecordingError names what is missing."""
-    required = (*REQUIRED, SAMPLING) if VOLTAGE in columns else REQUIRED
     rotary = PITCH_OF_ROTARY in headers
+    has_path = any(name in columns for name in PATH)
+    required = [*REQUIRED, *([PITCH] if has_path and not rotary else []), *([SAMPLING] if VOLTAGE in columns else [])]
     if rotary and "pitch_m_per_rev" in headers:
         raise RecordingError(f"{source} has pitch_m_per_rev and {PITCH_OF_ROTARY}: keep that of its axis' unit")
     if not rotary and (angles := [name for name in ANGLES.values() if name in columns]):
         what = f"{source} has {' and '.join(angles)}, and no header {PITCH_OF_ROTARY}"
         raise RecordingError(f"{what}: give it and radius_m, or name the columns position_m and demand_m")
-    missing = [key for key in required if not headers.get(key) and not (rotary and key == "pitch_m_per_rev")]
+    missing = [key for key in required if not headers.get(key)]
     if missing:
         raise RecordingError(
             f"{source} has no header {', '.join(missing)}: add a line such as '# {missing[0]}: ...', or give "
@@ -168,8 +192,8 @@ def check_headers(headers: Mapping[str, str], columns: Mapping[str, object], sou
         raise RecordingError(
             f"{source} has format {shown(headers['format'])}, which is not {FORMAT!r}: convert it first"
         )
-    wanted = [ANGLES.get(name, name) if rotary else name for name in COLUMNS]
-    absent = [name for name in wanted if name not in columns]
+    absent = [name for name in COLUMNS if name not in columns]
+    absent += [angle for name, angle in ANGLES.items() if rotary and name in columns]
     if absent:
         has = ", ".join([shown(name) for name in columns][:MOST_SHOWN]) or "no columns"
         raise RecordingError(

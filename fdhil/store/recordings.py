@@ -5,11 +5,11 @@ from pathlib import Path
 from fdhil import tables
 from fdhil.csv_text import read_content
 from fdhil.errors import RecordingError
-from fdhil.records import Recording
+from fdhil.records import Recording, Window
 from fdhil.store import suffixes
 from fdhil.store.column_map import ColumnMap, mapped
 from fdhil.store.recording_table import RecordingTable, recording_of
-from fdhil.store.trace_text import parse_trace
+from fdhil.store.trace_text import TraceText, parse_trace
 
 
 def read_recording(path: Path, columns: ColumnMap | None = None) -> Recording:
@@ -20,14 +20,30 @@ def read_recording(path: Path, columns: ColumnMap | None = None) -> Recording:
     return recording_of(read_table(path, columns), str(path))
 
 
+def read_stored(path: Path) -> Window | None:
+    """Return the window of a file that is a stored one, None of any other. RecordingError where it is damaged."""
+    if path.suffix.lower() != ".parquet":
+        return None
+    from fdhil.store.recording_parquet import read_if_window  # late: an extra
+
+    return read_if_window(path)
+
+
 def read_table(path: Path, columns: ColumnMap | None = None) -> RecordingTable:
     """Read headers and columns of a recording without looking at what they mean. Errors as :func:`read_recording`."""
-    content = read_content(path)
-    name = suffixes.RECORDINGS.get(path.suffix.lower(), "csv")
-    if columns is None:
-        return _decoded(name, content, str(path))
-    raw = parse_trace(content, columns.text, str(path)) if name == "csv" else _decoded(name, content, str(path))
-    return mapped(raw, columns, str(path))
+    if columns is not None:
+        return mapped(read_raw(path, columns.text), columns, str(path))
+    return _decoded(_format_of(path), read_content(path), str(path))
+
+
+def read_raw(path: Path, text: TraceText | None = None) -> RecordingTable:
+    """Read all columns of another program's file, ``text`` in the form that a column map gives. Errors as above."""
+    content, name = read_content(path), _format_of(path)
+    return parse_trace(content, text or TraceText(), str(path)) if name == "csv" else _decoded(name, content, str(path))
+
+
+def _format_of(path: Path) -> str:
+    return suffixes.RECORDINGS.get(path.suffix.lower(), "csv")
 
 
 def _decoded(name: str, content: bytes, source: str) -> RecordingTable:

@@ -17,12 +17,11 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from fdhil.errors import RecordingError, StoreError
 from fdhil.records import Float, NcMove, SlowVoltage, Stages, Window, read_only
 from fdhil.store.atomic import make_folder, store_error, sync_folder, write_file
+from fdhil.store.parquet_library import pa, pq
 from fdhil.store.parquet_pages import uncompressed_bytes
 
 FORMAT = "fdhil-window-1"
@@ -130,6 +129,8 @@ def _head(window: Window) -> dict[str, Any]:
     slow = plain.pop("slow_voltage")
     if plain["torque_constant_nm_per_a"] is None:  # as in windows of before there was one: their digest stays
         del plain["torque_constant_nm_per_a"]
+    if plain["is_rapid"]:  # as all windows of before there were laboratory moves
+        del plain["is_rapid"]
     nc = plain.pop("nc")
     if nc is not None:
         plain["nc"] = asdict(nc)

@@ -39,6 +39,14 @@ def _enough_rows(evidence: Evidence) -> bool:
     return evidence.window.n >= LEAST_ROWS
 
 
+def _is_rapid(evidence: Evidence) -> bool:
+    return evidence.window.is_rapid
+
+
+def _is_long_rapid(evidence: Evidence) -> bool:
+    return _is_rapid(evidence) and _enough_rows(evidence)
+
+
 def _has_voltage(evidence: Evidence) -> bool:
     return evidence.has_voltage
 
@@ -199,16 +207,16 @@ MODEL = (
 )
 BEFORE_ANY_FIT: Sequence[Check] = (
     Check("finite", not_finite),
-    Check("stages", missing_stages),
-    Check(PLATEAU, missing_plateau),
+    Check("stages", missing_stages, _is_rapid),
+    Check(PLATEAU, missing_plateau, _is_rapid),
     Check("gaps", gaps, _enough_rows, ("finite",)),
     Check("range", clipped, _enough_rows, ("finite",)),
     Check("dead signal", dead_signals, _enough_rows, ("finite",)),
     Check("copied signal", copied_signals, _enough_rows, ("finite",)),
-    Check("unrelated signal", unrelated_signals, _enough_rows, ("finite", "dead signal")),
+    Check("unrelated signal", unrelated_signals, _is_long_rapid, ("finite", "dead signal")),
     Check("position", position_parted, _enough_rows, ("finite",)),
     # what position tells of the move's course is worth nothing where it contradicts the speed
-    Check("whole move", interruptions, _enough_rows, ("finite", "position")),
+    Check("whole move", interruptions, _is_long_rapid, ("finite", "position")),
     Check("play", _play, _enough_rows, ("finite",)),
     Check("slow readings", slow_voltage_faults),
     Check("voltage", _no_voltage),

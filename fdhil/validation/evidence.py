@@ -93,6 +93,11 @@ class Evidence:
         """The sensors as they were read, each with its resolution."""
         return signals_of(self.recorded or self.window)
 
+    @property
+    def sensors(self) -> Sequence[Signal]:
+        """Those of the signals that vary by themselves: in a laboratory the voltage may be held on purpose."""
+        return [signal for signal in self.signals if self.window.is_rapid or signal.name != "voltage"]
+
     @cached_property
     def noise(self) -> Noise:
         """The noise of the three sensors."""

@@ -19,6 +19,7 @@ from fdhil.validation.evidence import Evidence
 
 CODE = "EpisodeAborted"
 ADVICE = "record a rapid without feed hold, override change or stop"
+LABORATORY = "record a whole move from rest to rest, or identify from any move with --any-move (any_move=True)"
 NC_ADVICE = "rapids teach at an override of 100 % and without feed hold"
 OVERRIDE = 0.005  # that is still 100 %
 SMOOTHING_S = 0.020
@@ -52,12 +53,12 @@ def interruptions(evidence: Evidence) -> Iterator[Reason]:
     reason = (
         _left_behind(window, b)
         or _moves_on(window, a, b, plateau)
-        or _dip(window, seen, plateau, a)
+        or _dip(window, seen, plateau, a, np.maximum.accumulate(speed[a:b]) - plateau)
         or _held(window, seen, plateau, a)
     )
     reason = reason or _quick_stop(window, a, b)
     if reason is not None:
-        yield Reason(CODE, reason, ADVICE)
+        yield Reason(CODE, reason, ADVICE if np.isfinite(window.demand_mm).any() else LABORATORY)
 
 
 def _said(nc: NcMove) -> str | None:
@@ -97,12 +98,13 @@ def _course(position_mm: Float, window: Window, seconds: float = SMOOTHING_S) ->
     return course
 
 
-def _dip(window: Window, seen: Float, plateau: float, begin: int) -> str | None:
+def _dip(window: Window, seen: Float, plateau: float, begin: int, overshoot: Float) -> str | None:
+    """Return where the speed falls and rises again; not beneath a plateau that it had overshot by more before."""
     before = np.maximum.accumulate(seen)
     after = np.maximum.accumulate(seen[::-1])[::-1]
     depth = np.minimum(before, after) - seen
     k = int(np.argmax(depth))
-    if depth[k] <= LEAST_DIP * plateau:
+    if depth[k] <= max(LEAST_DIP * plateau, overshoot[k]):
         return None
     return f"the speed falls from {plateau:.4g} to {seen[k]:.4g} mm/s at {_at(window, begin + k)} s and rises again"
 
@@ -121,6 +123,10 @@ def _held(window: Window, seen: Float, plateau: float, begin: int) -> str | None
     demand = _course(window.demand_mm, window, RAMP_S)
     if demand is not None and np.median(demand[begin + start : begin + end]) > BETWEEN[1] * plateau:
         return None  # the drive creeps towards a speed that is demanded already
+    fast = np.flatnonzero((middle >= BETWEEN[1] * plateau) | (rate >= HELD_RATE * rate.max()))
+    fast = fast[fast >= end - reach]
+    if demand is None and fast.size and middle[fast[0]] >= BETWEEN[1] * plateau:
+        return None  # it arrives there without another ramp: a regulator that settles
     return (
         f"the speed is held at {level:.4g} mm/s for {1e3 * (end - start) * window.dt_s:.0f} ms from "
         f"{_at(window, begin + start)} s, beside its plateau of {plateau:.4g} mm/s"

@@ -110,7 +110,7 @@ def _travels(window: Window, begin: int, end: int) -> bool:
 
 def clipped(evidence: Evidence) -> Iterator[Reason]:
     """Yield a reason for each extreme at which a signal stays for longer than its own rows explain."""
-    for signal in evidence.signals:
+    for signal in evidence.sensors:
         values = signal.values
         if not np.isfinite(values).any():
             continue

@@ -69,7 +69,7 @@ class Readings:
 def stuck_values(evidence: Evidence) -> Iterator[Reason]:
     """Yield a reason for each sensor that surely stuck during the move; without a fit, its own rows alone are asked."""
     begin, end = evidence.moving
-    for signal in evidence.signals:
+    for signal in evidence.sensors:
         if signal.step == 0.0:
             continue
         readings = Readings(signal, begin, end, evidence.window.dt_s)
@@ -109,7 +109,7 @@ def clipped_peaks(evidence: Evidence) -> Iterator[Reason]:
     fit, bridge = evidence.judged, evidence.bridge
     if bridge is None:
         return
-    for signal in evidence.signals:
+    for signal in evidence.sensors:
         noise, values = getattr(fit.problem.noises[0], NOISES[signal.name]), signal.values
         for rail in (np.nanmax(values), np.nanmin(values)):
             runs = runs_of(values == rail, RAIL_SAMPLES) if rail != 0.0 else []

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from fdhil.cli import compiling
+from fdhil.api import compiling
 from fdhil.correction import kernels
 
 

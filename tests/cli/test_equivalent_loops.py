@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fdhil.cli.loops_view import equivalent_loops
+from fdhil.api.loops import equivalent_loops
 from fdhil.config.regulators import Regulators
 from fdhil.model import closed_loop
 from fdhil.records import LoopEstimate, Parameters, Verdict, frozen

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdhil.cli.batch import FileResult
+from fdhil.api.analysis import FileResult
 from fdhil.cli.model_file import write_model
 from fdhil.identification.loops import DIFFER
 from fdhil.prediction.models import load_model_file, with_loops

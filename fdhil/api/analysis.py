@@ -1,0 +1,146 @@
+"""Analyses recordings as the command line and the Python interface do: windows, estimates, pool, verdict."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+from fdhil.config import Axis, Identification, MachineConfig
+from fdhil.identification.locked_rotor import estimate_locked, is_locked
+from fdhil.identification.windows import find_windows, whole_window
+from fdhil.pipeline import analyse_windows, pool_with_held_out
+from fdhil.records import (
+    Estimate,
+    HeldOut,
+    LoopEstimate,
+    Parameters,
+    Reason,
+    Recording,
+    Verdict,
+    Window,
+    WindowOutcome,
+    read_only,
+)
+from fdhil.store.recording_table import NOTES, PITCH, RECORD_HZ, SLOW_HZ, SOURCES
+from fdhil.validation.data_sheet import gain_error
+from fdhil.validation.signal_consistency import missing_move
+
+Work = Callable[[Window], WindowOutcome]
+Spread = Callable[[Work, Sequence[Window]], Iterable[WindowOutcome]]
+Progress = Callable[[float], None]
+
+
+def ignore_progress(share: float) -> None:
+    """Report the progress to nobody."""
+
+
+@dataclass(frozen=True, slots=True)
+class FileResult:
+    """One recording: its windows analysed, and their pool; one that cannot be read has an ``error`` and no axis.
+
+    ``loops`` are the drive's own, where the configured ones did not explain its rapids. ``held_out`` is what the pool
+    leaves of moves that it was not identified on.
+    """
+
+    file: str
+    axis: str | None
+    outcomes: tuple[WindowOutcome, ...]
+    pooled: Estimate | None
+    verdict: Verdict
+    error: Mapping[str, Any] | None = None
+    loops: LoopEstimate | None = None
+    held_out: HeldOut | None = None
+
+
+def analyse_recordings(
+    recorded: Sequence[Recording | Window],
+    name: str,
+    settings: Identification,
+    machine: MachineConfig | None = None,
+    *,
+    any_move: bool = False,
+    spread: Spread = map,
+    progress: Progress = ignore_progress,
+) -> FileResult:
+    """Return the windows of recordings of one axis analysed, and their pool.
+
+    With ``any_move`` each recording is one window, whatever its moves are. ``spread`` may use further processes, in
+    order; ``progress`` is told the share that each step was.
+    """
+    first = recorded[0]
+    axis = None if machine is None else machine.axis.get(first.axis)
+    recorded = [_with_pitch(each, axis) for each in recorded]
+    windows = [window for each in recorded for window in _windows(each, axis, any_move=any_move)]
+    settings = _told_by(first, settings)
+    period_s = None if machine is None else machine.machine.sync_period_s
+    step = partial(progress, 1.0 / (len(windows) + 1))
+    turning = [window for window in windows if not is_locked(window)]
+    outcomes, loops = analyse_windows(turning, settings, axis, period_s, spread, step)
+    if windows and not turning:
+        return _locked(windows, name, first.axis)
+    outcomes, estimate, verdict, held_out, loops = pool_with_held_out(outcomes, settings, axis, loops, period_s)
+    if not windows and isinstance(first, Recording) and (hidden := missing_move(first)) is not None:
+        verdict = replace(verdict, reasons=(*verdict.reasons, hidden))
+    step()
+    verdict = _of_reading(first, verdict)
+    return FileResult(name, first.axis, tuple(outcomes), estimate, verdict, None, loops, held_out)
+
+
+def _with_pitch(recorded: Recording | Window, axis: Axis | None) -> Recording | Window:
+    """Return a recording that has no pitch with that of its configured axis."""
+    if axis is None or isinstance(recorded, Window) or not recorded.headers or PITCH in recorded.headers:
+        return recorded
+    share = axis.screw_pitch_mm / recorded.pitch_mm
+    return replace(recorded, pitch_mm=axis.screw_pitch_mm, position_mm=read_only(share * recorded.position_mm))
+
+
+def _locked(windows: Sequence[Window], name: str, axis: str) -> FileResult:
+    """Return what recordings of a rotor that does not turn determine: R and L, of the last one."""
+    reason = Reason("LowExcitation", "the rotor does not turn, which leaves all but R and L open", "let it turn, too")
+    verdict = Verdict(False, None, (reason,))
+    measured = [window for window in windows if window.voltage_v is not None]
+    known = [WindowOutcome(window, estimate_locked(window), verdict) for window in measured]
+    return FileResult(name, axis, tuple(known), known[-1].estimate if known else None, verdict)
+
+
+def _of_reading(recorded: Recording | Window, verdict: Verdict) -> Verdict:
+    """Return the verdict with what its file explains: numbers changed as they were read, and samples far apart."""
+    notes = None if isinstance(recorded, Window) else recorded.headers.get(NOTES)
+    if notes is not None:
+        read = Reason("ReadOtherwise", notes, "compare with the file")
+        verdict = replace(verdict, warnings=(*verdict.warnings, read))
+    if verdict.accepted or recorded.dt_s <= 1 / SLOW_HZ:
+        return verdict
+    text = f"{1 / recorded.dt_s:.4g} Hz is too slow to follow how a drive accelerates"
+    slow = Reason("LowExcitation", text, f"record at {RECORD_HZ} Hz or faster")
+    return replace(verdict, reasons=(slow, *verdict.reasons))
+
+
+def _windows(recorded: Recording | Window, axis: Axis | None, *, any_move: bool) -> list[Window]:
+    if isinstance(recorded, Window):
+        return [recorded]
+    if any_move:
+        return [whole_window(recorded)]
+    return find_windows(recorded, None if axis is None else axis.rapid_speed_rad_s)
+
+
+def _told_by(recorded: Recording | Window, settings: Identification) -> Identification:
+    """Return the settings with what a recording itself says of where its speed and its voltage come from."""
+    headers = {} if isinstance(recorded, Window) else recorded.headers
+    told = {key: headers[key] for key in SOURCES if key in headers}
+    return settings.model_copy(update=told) if told else settings
+
+
+def compare_with_data_sheet(result: FileResult, axes: Mapping[str, Axis]) -> FileResult:
+    """Refuse a pool that only a sensor's gain takes to the axis' nominal values; warn where there is no such axis."""
+    verdict = result.verdict
+    if result.axis is not None and result.axis not in axes:
+        text = f"axis {result.axis} is not in the configuration: nothing was compared with its nominal values"
+        unknown = Reason("NoSuchAxis", text, f"add [axis.{result.axis}], or give the configuration of its machine")
+        return replace(result, verdict=replace(verdict, warnings=(*verdict.warnings, unknown)))
+    if result.axis is None or result.pooled is None or not verdict.accepted:
+        return result
+    reason = gain_error(result.pooled, Parameters(**axes[result.axis].nominal.model_dump()))
+    if reason is None:
+        return result
+    return replace(result, verdict=replace(verdict, accepted=False, reasons=(reason,)))

@@ -1,0 +1,119 @@
+"""Results of an identification as the JSON that ``fdhil identify --json`` writes (schema fdhil-identify-1)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+from fdhil.api.analysis import FileResult
+from fdhil.api.loops import compare_loops
+from fdhil.config import Axis
+from fdhil.identification.physical_bounds import bounded
+from fdhil.identification.windows import moving_range
+from fdhil.identification.without_voltage import NO_VOLTAGE
+from fdhil.records import PARAMETERS, UNITS, Estimate, Verdict, WindowOutcome, unit_of
+
+SCHEMA = "fdhil-identify-1"
+
+
+def identification_document(
+    results: Sequence[FileResult], axes: Mapping[str, Axis], *, with_loops: bool = False
+) -> dict[str, Any]:
+    """Return the whole document of several recordings."""
+    return {"schema": SCHEMA, "files": [file_document(result, axes, with_loops) for result in results]}
+
+
+def file_document(result: FileResult, axes: Mapping[str, Axis], with_loops: bool) -> dict[str, Any]:
+    document = {
+        "file": result.file,
+        "axis": result.axis,
+        "windows": [_window_document(outcome) for outcome in result.outcomes],
+        "pooled": {
+            "parameters": _parameters(result.pooled, result.verdict),
+            "terms": _terms(result.pooled),
+            "validated": result.verdict.accepted,
+            "windows_used": windows_used(result),
+            "held_out": None if result.held_out is None else asdict(result.held_out),
+            **_verdict(result.verdict),
+        },
+    }
+    if with_loops or result.loops is not None:
+        document["loops"] = compare_loops(result.loops, axes.get(result.axis or ""))
+    return document if result.error is None else document | {"error": result.error}
+
+
+def windows_used(result: FileResult) -> int:
+    """Return how many windows the pool is made of."""
+    if result.pooled is None:
+        return 0
+    return sum(outcome.verdict.accepted for outcome in result.outcomes)
+
+
+def _window_document(outcome: WindowOutcome) -> dict[str, Any]:
+    window, estimate = outcome.window, usable_estimate(outcome)
+    first, last = moving_range(window)
+    delay = voltage_delay(estimate)
+    return {
+        "start_s": round(window.start_s + first * window.dt_s, 6),
+        "end_s": round(window.start_s + last * window.dt_s, 6),
+        "direction": window.direction,
+        "parameters": _parameters(estimate, outcome.verdict),
+        "terms": _terms(estimate),
+        "validated": outcome.verdict.accepted,
+        "fit_percent": outcome.verdict.fit_percent,
+        **_verdict(outcome.verdict),
+        **({"delay_s": delay} if delay is not None else {}),
+        **({"at_table": asdict(outcome.at_table)} if outcome.at_table is not None else {}),
+    }
+
+
+def usable_estimate(outcome: WindowOutcome) -> Estimate | None:
+    """Return the estimate of a window; of a validated one the drive that predict and correct take."""
+    if outcome.estimate is None or not outcome.verdict.accepted:
+        return outcome.estimate
+    return bounded(outcome.estimate, outcome.window.direction if outcome.window.is_rapid else None)
+
+
+def _verdict(verdict: Verdict) -> dict[str, Any]:
+    return {
+        "unexplained_um": verdict.unexplained_um,
+        "reasons": [str(reason) for reason in verdict.reasons],
+        "warnings": [str(reason) for reason in verdict.warnings],
+    }
+
+
+def _terms(estimate: Estimate | None) -> dict[str, Any]:
+    if estimate is None:
+        return {}
+    return {n: {"value": estimate.value(n), "std": estimate.std(n), "unit": unit_of(n)} for n in estimate.terms}
+
+
+def voltage_delay(estimate: Estimate | None) -> dict[str, Any] | None:
+    """Return by how much the voltage is late against current and speed; None where that was not estimated."""
+    if estimate is None or estimate.delay_s is None or estimate.delay_std_s is None:
+        return None
+    if not (math.isfinite(estimate.delay_s) and math.isfinite(estimate.delay_std_s)):
+        return None
+    return {"value": estimate.delay_s, "std": estimate.delay_std_s, "unit": "s"}
+
+
+def _parameters(estimate: Estimate | None, verdict: Verdict) -> dict[str, Any]:
+    """Return value, std and unit of each parameter, or null and the reason.
+
+    K may be given; R and L that the data sheet gives are none that this recording tells.
+    """
+    answer: dict[str, Any] = {}
+    for name in PARAMETERS:
+        if estimate is not None and name in estimate.given:
+            told = {"value": estimate.value(name), "std": 0.0, "unit": UNITS[name]}
+            answer[name] = {**told, "given": True} if name == "K" else {"value": None, "reason": str(NO_VOLTAGE)}
+            continue
+        if estimate is not None and math.isfinite(estimate.value(name)) and math.isfinite(estimate.std(name)):
+            answer[name] = {"value": estimate.value(name), "std": estimate.std(name), "unit": UNITS[name]}
+            continue
+        reason = estimate.missing.get(name) if estimate is not None else None
+        reason = reason or (verdict.reasons[0] if verdict.reasons else None)
+        answer[name] = {"value": None, "reason": str(reason) if reason is not None else "NotFinite: no estimate"}
+    return answer

@@ -1,0 +1,78 @@
+"""Estimates R and L from a recording in which the rotor does not turn: [1] without its back-EMF.
+
+The current that R and L make of the measured voltage is compared with the measured one ([LJU] ch. 4, output error).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
+
+from fdhil.identification.identifiability import RELATIVE_STD_LIMIT
+from fdhil.identification.motion import noise_levels
+from fdhil.identification.normal import inverse_gram
+from fdhil.identification.windows import carried
+from fdhil.model.feed_drive import interval_shape
+from fdhil.records import PARAMETERS, Estimate, Float, Reason, Result, Window
+
+NAME = "locked_rotor"
+TURNING = 8.0  # of the noise of the speed
+ADVICE = "add a recording in which the rotor turns"
+START_L_H = 1e-3
+OPEN_SHARE = np.array([5e-4, 1e-3])  # of R and L: what the voltage's course within a sample leaves open
+TOO_SLOW = "the current changes too little, or too slowly, to determine {}"
+
+
+def is_locked(window: Window) -> bool:
+    """Return whether the speed of a laboratory recording is nothing but noise while a current flows."""
+    speed, current = np.abs(carried(window.speed_rad_s)).max(), np.abs(carried(window.current_a)).max()
+    noise = noise_levels(window)
+    return not window.is_rapid and bool(speed <= TURNING * noise.speed_rad_s and current > TURNING * noise.current_a)
+
+
+def estimate_locked(window: Window) -> Estimate:
+    """Return R and L of a window whose voltage was measured; the rest is NaN with its reason."""
+    assert window.voltage_v is not None
+    voltage = interval_shape(carried(window.voltage_v), window.voltage_sampling)[0]
+    current = carried(window.current_a)
+
+    def left(logarithms: Float) -> Float:
+        resistance, inductance = np.exp(logarithms)
+        keeps = math.exp(-resistance / inductance * window.dt_s)
+        made = lfilter([0.0, 1.0], [1.0, -keeps], voltage * (1.0 - keeps) / resistance)
+        return np.asarray(made + current[0] * keeps ** np.arange(current.size) - current, dtype=np.float64)
+
+    start_ohm = max(abs(float(voltage @ current)) / float(current @ current), 1e-3)
+    with np.errstate(over="ignore", under="ignore"):
+        found = least_squares(left, np.log([start_ohm, START_L_H]), bounds=(-14.0, 7.0))
+    spread = (
+        inverse_gram(np.asarray(found.jac, dtype=np.float64))[0]
+        * float(found.fun @ found.fun)
+        / max(1, current.size - 2)
+    )
+    shares = np.sqrt(np.diag(spread) * correlation_factor(found.fun) + OPEN_SHARE**2)
+    values, covariance = np.full(6, np.nan), np.full((6, 6), np.nan)
+    still = "the rotor does not turn, which leaves {} open"
+    missing = {name: Reason("LowExcitation", still.format(name), ADVICE) for name in PARAMETERS}
+    for k, name in enumerate(PARAMETERS[:2]):
+        if 0.0 < shares[k] <= RELATIVE_STD_LIMIT[name]:
+            values[k] = math.exp(found.x[k])
+            covariance[k, k] = (shares[k] * values[k]) ** 2
+            del missing[name]
+        else:
+            missing[name] = Reason("LowExcitation", TOO_SLOW.format(name), "record steps of the voltage")
+    return Estimate(NAME, PARAMETERS, values, covariance, {"electrical": found.fun}, Result.UNDER_EXCITED, missing)
+
+
+def correlation_factor(residuals: Float) -> float:
+    """Return by how much correlated residuals (m,) widen a variance, at least 1: 1 + 2 sum of their correlations."""
+    power, total = float(residuals @ residuals), 1.0
+    for lag in range(1, min(200, residuals.size // 4)):
+        share = float(residuals[lag:] @ residuals[:-lag]) / max(power, 1e-300)
+        if share < 0.05:
+            break
+        total += 2.0 * share
+    return total

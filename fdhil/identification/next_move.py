@@ -1,0 +1,63 @@
+"""Predicts which further move narrows the intervals of an estimate most: by the information of [1] and [2].
+
+Each row of a move adds the information of its regressors, divided by the variance that the sensors' noise gives to the
+equation ([LJU] ch. 13). Moves are simulated with the estimated model, within the voltage of the recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdhil.identification.motion import Noise, noise_levels
+from fdhil.identification.normal import inverse_of
+from fdhil.identification.windows import carried
+from fdhil.model.feed_drive import simulate_plant
+from fdhil.records import PARAMETERS, Float, Parameters, Window
+
+MOVES: Mapping[str, Callable[[Float], Float]] = {  # share (n,) of the voltage over the share (n,) of the time
+    "steps of voltage in both directions": lambda t: np.array([0.0, 0.5, 1.0, -1.0, -0.5, 0.0])[(t * 6).astype(int)],
+    "fast chirp about half the voltage": lambda t: 0.5 + 0.5 * np.sin(2 * np.pi * (2.0 + 60.0 * t) * t),
+    "slowly in both directions": lambda t: np.where(t < 0.5, 0.15, -0.15),
+    "long at full speed in both directions": lambda t: np.where(t < 0.5, 1.0, -1.0),
+}
+
+
+@dataclass(frozen=True)
+class NextMove:
+    """A further move: the share of its present interval that it leaves to each parameter."""
+
+    name: str
+    shares: Mapping[str, float]
+
+
+def predict_next_moves(window: Window, parameters: Parameters) -> list[NextMove]:
+    """Return for each move, as long as the window, what it leaves of the intervals, the same recording again first."""
+    if window.voltage_v is None:
+        return []
+    noise = noise_levels(window)
+    now = information(parameters, noise, window.dt_s, carried(window.current_a), carried(window.speed_rad_s))
+    before = np.sqrt(np.diag(inverse_of(now)[0]))
+    again = NextMove("the same recording again", dict.fromkeys(PARAMETERS, float(np.sqrt(0.5))))
+    top_v, share = float(np.nanmax(np.abs(window.voltage_v))), np.arange(window.n) / window.n
+    moves = [again]
+    for name, course in MOVES.items():
+        current, speed = simulate_plant(parameters, top_v * course(share), window.dt_s, "interval_mean")
+        after = inverse_of(now + information(parameters, noise, window.dt_s, current, speed))[0]
+        shares = np.sqrt(np.diag(after)) / before
+        moves.append(NextMove(name, dict(zip(PARAMETERS, shares.tolist(), strict=True))))
+    return moves
+
+
+def information(p: Parameters, noise: Noise, dt_s: float, current: Float, speed: Float) -> Float:
+    """Return the information (6, 6) on R, L, K, Jt, ft, Cd of a move's current (n,) and speed (n,)."""
+    di, dw, zero = np.gradient(current, dt_s), np.gradient(speed, dt_s), np.zeros(current.size)
+    slope_i, slope_w = np.sqrt(2.0) * noise.current_a / dt_s, np.sqrt(2.0) * noise.speed_rad_s / dt_s
+    parts = (noise.voltage_v, p.R * noise.current_a, p.L * slope_i, p.K * noise.speed_rad_s)
+    electrical = np.column_stack([current, di, speed, zero, zero, zero]) / np.linalg.norm(parts)
+    moving = np.abs(speed) > 0.02 * np.abs(speed).max()
+    torque = np.column_stack([zero, zero, -current, dw, speed, np.sign(speed)])[moving]
+    mechanical = torque / np.linalg.norm((p.K * noise.current_a, p.Jt * slope_w))
+    return np.asarray(electrical.T @ electrical + mechanical.T @ mechanical, dtype=np.float64)

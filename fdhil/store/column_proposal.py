@@ -1,0 +1,251 @@
+"""Proposes a column map for another program's file: by headings, units, sizes, and the physics that signals obey.
+
+Voltage, current and speed obey u = R i + L di/dt + K w with positive R, L and K, and torque moves an inertia: of the
+columns that headings and units leave open, those are proposed that obey both best.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import permutations
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from fdhil.csv_text import shown
+from fdhil.errors import RecordingError
+from fdhil.records import Float
+from fdhil.store.column_map import FACTORS, units_of_heading, whole_heading
+from fdhil.store.recording_table import PATH, RecordingTable
+from fdhil.store.recordings import read_raw
+
+HEADINGS: Mapping[str, str] = {  # in this order: a "position demand" is a demand, a "speed voltage" a speed
+    "time_s": r"^t$|time|zeit|temps|^x-axis$|second|sekunde|timestamp",
+    "demand_m": r"demand|set.?p|soll|target|command.*pos|pos.*(cmd|command|ref)|ref.*pos",
+    "torque_Nm": r"torque|moment|couple",
+    "current_A": r"curr|strom|courant|amp[eè]re|^i$|^i[_ ]|_i$",
+    "speed_rad_per_s": r"speed|velo|drehzahl|vitesse|omega|rpm|tacho|n_act|^w$|^w[_ ]",
+    "position_m": r"pos|lage|weg|encoder|angle|winkel|theta",
+    "voltage_V": r"volt|spannung|tension|^u$|^u[_ ]|_u$|^v$",
+}
+KEPT_ROWS = 4000  # that the physics is asked about
+LEVELS = 20  # that a signal has at least: with fewer it is a state
+EXPLAINED = 0.5  # of both equations, from which three columns are taken for u, i and w
+RPM_FROM = 700.0  # a speed beyond that without a unit is hardly in rad/s
+ANGLE_UNITS = ("rad", "deg", "rev")
+
+
+@dataclass(frozen=True)
+class Proposed:
+    """One signal's column: its heading, the unit of its numbers, and why."""
+
+    signal: str
+    heading: str
+    unit: str
+    why: str
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A column map to be checked: its columns, headers, the ``faults`` that keep it from being used.
+
+    ``aside`` are columns that need a pitch, which no file says.
+    """
+
+    columns: Sequence[Proposed]
+    headers: Mapping[str, str | float]
+    faults: Sequence[str]
+    aside: Sequence[Proposed] = ()
+
+    @property
+    def toml(self) -> str:
+        """The map as TOML."""
+        lines = ["# proposed by fdhil: check every line", "[headers]"]
+        lines += [f"{key} = {json.dumps(value)}" for key, value in self.headers.items()]
+        if self.aside:
+            lines.append("# pitch_m_per_rev = 0.01  # with it the columns below that are commented out can be used")
+        lines += ["", "[columns]"]
+        for mark, each in [*(("", c) for c in self.columns), *(("# ", c) for c in self.aside)]:
+            name, unit = json.dumps(each.heading), json.dumps(each.unit)
+            lines.append(f"{mark}{each.signal} = {{ name = {name}, unit = {unit} }}  # {each.why}")
+        return "\n".join(lines) + "\n"
+
+    def lines(self) -> Iterator[str]:
+        """Yield a line per column, for people."""
+        for each in (*self.columns, *self.aside):
+            yield f"  {each.signal:16} {each.heading!r} in {each.unit}: {each.why}"
+
+
+def propose_columns(path: Path) -> Proposal:
+    """Return the column map that a file suggests. RecordingError where it cannot be read."""
+    return propose(read_raw(path))
+
+
+def propose(
+    raw: RecordingTable, given: Mapping[str, str | Sequence[str]] = MappingProxyType({}), source: str = "recording"
+) -> Proposal:
+    """Return the column map that the columns of a file suggest.
+
+    Of ``given`` signals a heading, a part of one, or heading and unit are known; then no others are looked for.
+    """
+    if given:
+        return _from_given(raw, given, source)
+    columns = _distinct(raw)
+    by_name: dict[str, list[str]] = {}
+    for heading in columns:
+        if (signal := _named(heading, raw)) is not None:
+            by_name.setdefault(signal, []).append(heading)
+    found = {s: (headings[0], "by its heading") for s, headings in by_name.items() if len(headings) == 1}
+    headers: dict[str, str | float] = {"axis": "X"}
+    time = found.get("time_s") or _time(columns)
+    if time is not None:
+        found["time_s"] = time
+    _by_physics(columns, found, by_name)
+    if "voltage_V" in found:
+        headers["voltage_sampling"] = _sampling(columns, found)
+    faults = []
+    if "time_s" not in found:
+        faults.append("no column rises evenly as a time does: give sample_rate_hz under [headers]")
+    if not found.keys() & {"current_A", "torque_Nm"}:
+        faults.append("no current was recognised")
+    if not found.keys() & {"speed_rad_per_s", "angle_rad"}:
+        faults.append("no speed was recognised")
+    if "current_A" in found:
+        found.pop("torque_Nm", None)
+    proposed = [_with_unit(signal, *found[signal], columns, raw) for signal in FACTORS if signal in found]
+    aside = [each for each in proposed if each.signal in PATH]
+    return Proposal([each for each in proposed if each not in aside], headers, faults, aside)
+
+
+def _from_given(raw: RecordingTable, given: Mapping[str, str | Sequence[str]], source: str) -> Proposal:
+    proposed, found = [], {}
+    for signal, told in given.items():
+        if signal not in FACTORS:
+            raise RecordingError(f"{source}: {signal!r} is not a signal; signals are {', '.join(FACTORS)}")
+        part, *unit = (told,) if isinstance(told, str) else told
+        heading = whole_heading(raw, part, source)
+        if heading not in raw.columns:
+            listed = ", ".join(map(shown, _distinct(raw)))
+            raise RecordingError(f"{source} has no column {shown(part)}; it has {listed}: correct columns")
+        found[signal] = (heading, "given")
+        known = unit[0] if unit else _unit(heading, raw, signal) or next(iter(FACTORS[signal]))  # SI
+        proposed.append(Proposed(signal, heading, known, "given"))
+    headers: dict[str, str | float] = {"axis": "X"}
+    if "voltage_V" in found:
+        headers["voltage_sampling"] = _sampling(raw.columns, found)
+    return Proposal(proposed, headers, [])
+
+
+def _distinct(raw: RecordingTable) -> dict[str, Float]:
+    """Return the columns by heading, each once: one without a heading by its place."""
+    found: dict[int, str] = {}
+    for name, values in raw.columns.items():
+        known = found.get(id(values))
+        if known is None or (known.startswith("#") and not name.startswith("#")):
+            found[id(values)] = name
+    usable = {name: raw.columns[name] for name in found.values() if name not in raw.doubts}
+    sizes = Counter(values.size for values in usable.values()).most_common(1)
+    return {name: values for name, values in usable.items() if values.size == sizes[0][0]}
+
+
+def _named(heading: str, raw: RecordingTable) -> str | None:
+    """Return the signal that a heading or its unit names."""
+    text = heading.strip().lower()
+    if any("%" in unit for unit in units_of_heading(raw, heading)):
+        return None
+    for signal, pattern in HEADINGS.items():
+        if re.search(pattern, text):
+            return "angle_rad" if signal == "position_m" and _unit(heading, raw, "angle_rad") else signal
+    fitting = [signal for signal in HEADINGS if _unit(heading, raw, signal)]
+    return fitting[0] if len(fitting) == 1 else None
+
+
+def _unit(heading: str, raw: RecordingTable, signal: str) -> str | None:
+    return next((u for u in units_of_heading(raw, heading) if u in FACTORS[signal]), None)
+
+
+def _time(columns: Mapping[str, Float]) -> tuple[str, str] | None:
+    """Return the column that rises evenly, if there is one."""
+    for heading, values in columns.items():
+        steps = np.diff(values)
+        if steps.size and np.isfinite(steps).all() and (steps > 0).all() and np.ptp(steps) < 0.1 * np.median(steps):
+            return heading, "rises evenly"
+    return None
+
+
+def _by_physics(
+    columns: Mapping[str, Float], found: dict[str, tuple[str, str]], by_name: Mapping[str, Sequence[str]]
+) -> None:
+    """Enter the columns for voltage, current and speed that obey the equations best, where headings leave them open."""
+    wanted = ("voltage_V", "current_A", "speed_rad_per_s")
+    if all(signal in found for signal in wanted):
+        return
+    taken = {heading for signal, (heading, _) in found.items() if signal not in wanted}
+    free = [h for h, v in columns.items() if h not in taken and np.isfinite(v).all() and np.unique(v).size >= LEVELS]
+    choices = []
+    for triple in permutations(free, 3):
+        fits = all(s not in found or found[s][0] == h for s, h in zip(wanted, triple, strict=True))
+        fits = fits and all(s not in by_name or h in by_name[s] for s, h in zip(wanted, triple, strict=True))
+        fits = fits and not any(_is_of_another_unit(h, s) for s, h in zip(wanted, triple, strict=True))
+        if fits:
+            choices.append((obeys(*(columns[h][:KEPT_ROWS] for h in triple)), triple))
+    if choices and (best := max(choices))[0] > EXPLAINED:
+        for signal, heading in zip(wanted, best[1], strict=True):
+            found.setdefault(signal, (heading, f"by the equations, which explain {best[0]:.0%}"))
+
+
+def _is_of_another_unit(heading: str, signal: str) -> bool:
+    """Return whether a heading ends in a unit in brackets that is none of the signal's."""
+    found = re.search(r"[\[(]([^\[\]():,]*[^\[\]():,\d\s][^\[\]():,]*)[\])]$", heading.strip())
+    return found is not None and found[1] not in FACTORS[signal]
+
+
+def obeys(voltage: Float, current: Float, speed: Float) -> float:
+    """Return the share of [1] and [2] that voltage, current and speed (n,) explain; 0 for parameters below 0."""
+    middle = [(v[1:] + v[:-1]) / 2 for v in (current, speed)]
+    electrical = _share(voltage[:-1], [middle[0], np.diff(current), middle[1]])
+    mechanical = _share(middle[0], [np.diff(speed), middle[1], np.sign(middle[1])])
+    if electrical is None or mechanical is None or min(electrical[1][0], electrical[1][2], mechanical[1][0]) <= 0.0:
+        return 0.0
+    return electrical[0] * mechanical[0]
+
+
+def _sampling(columns: Mapping[str, Float], found: Mapping[str, tuple[str, str]]) -> str:
+    """Return whether the voltage explains the current better as the mean over each sample or as its value there."""
+    if not found.keys() >= {"current_A", "speed_rad_per_s"}:
+        return "instant"
+    u, i, w = (columns[found[s][0]][:KEPT_ROWS] for s in ("voltage_V", "current_A", "speed_rad_per_s"))
+    instant = np.append((u[1:] + u[:-1]) / 2, u[-1])
+    return "interval_mean" if obeys(u, i, w) > obeys(instant, i, w) else "instant"
+
+
+def _share(values: Float, regressors: Sequence[Float]) -> tuple[float, Float] | None:
+    """Return the explained share of the variance and the coefficients, of regressors of unit size."""
+    table = np.column_stack([*regressors, np.ones(values.size)])
+    size = np.abs(table).max(axis=0)
+    variance = float(np.var(values))
+    if not variance > 0.0 or not (size > 0.0).all():
+        return None
+    weights = np.linalg.lstsq(table / size, values, rcond=None)[0]
+    return 1.0 - float(np.var(values - table / size @ weights)) / variance, weights
+
+
+def _with_unit(signal: str, heading: str, why: str, columns: Mapping[str, Float], raw: RecordingTable) -> Proposed:
+    """Return the column with its unit: the heading's, else the likeliest by size."""
+    if (unit := _unit(heading, raw, signal)) is not None:
+        return Proposed(signal, heading, unit, why)
+    values = columns[heading]
+    unit = next(iter(FACTORS[signal]))
+    if signal == "time_s" and float(np.median(np.diff(values))) >= 0.05:
+        unit = "ms"
+    elif signal == "speed_rad_per_s" and float(np.nanmax(np.abs(values))) > RPM_FROM:
+        unit = "rpm"
+    elif signal in ("position_m", "demand_m") and float(np.ptp(values)) > math.tau:
+        unit = "mm"
+    return Proposed(signal, heading, unit, f"{why}; the unit is a guess by size")

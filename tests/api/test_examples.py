@@ -1,0 +1,21 @@
+"""The examples of the Python interface's docstrings, run as they stand."""
+
+from __future__ import annotations
+
+import doctest
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+MODULES = ("recordings", "result", "machine", "model")
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_examples_of_docstrings_give_what_they_show(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    options = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+    done = doctest.testmod(import_module(f"fdhil.api.{name}"), optionflags=options)
+    assert done.attempted > 1
+    assert done.failed == 0
