@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
-from typing import NamedTuple
 
 from fdhil.cia402 import (
     COB_EMCY,
@@ -87,33 +86,11 @@ class _PdoState:
 
 _Place = tuple[_PdoState, int]
 _ABSENT: _Place = _PdoState(Pdo(0, ())), 0  # of an object that no PDO carries
-
-
-class _Signals(NamedTuple):
-    """The places of one axis' signals, in the order of ``_SIGNALS``."""
-
-    position: _Place
-    read_back: _Place
-    following_error: _Place
-    statusword: _Place
-    mode: _Place
-    speed_offset: _Place
-    torque_offset: _Place
-    speed: _Place
-    demand: _Place
-
-
+# what a drive shows, in the order in which ``_axis_input`` takes it
 _SIGNALS = (
-    Object.POSITION_ACTUAL,
-    Object.POSITION_OFFSET,
-    Object.FOLLOWING_ERROR,
-    Object.STATUSWORD,
-    Object.MODE_DISPLAY,
-    Object.VELOCITY_OFFSET,
-    Object.TORQUE_OFFSET,
-    Object.VELOCITY_ACTUAL,
-    Object.POSITION_DEMAND,
-)
+    Object.POSITION_ACTUAL, Object.POSITION_OFFSET, Object.FOLLOWING_ERROR, Object.STATUSWORD, Object.MODE_DISPLAY,
+    Object.VELOCITY_OFFSET, Object.TORQUE_OFFSET, Object.VELOCITY_ACTUAL, Object.POSITION_DEMAND,
+)  # fmt: skip
 
 
 @dataclass(slots=True)
@@ -135,15 +112,14 @@ class Listener:
         self.lost_frames = self.emergencies = 0
         self._sent_ids = settings.sent_ids
         self._writers = {cob_id: axis.name for axis in settings.axes for cob_id in axis.writers}
-        self._targets = [_PdoState(axis.target) for axis in settings.axes]
+        targets = [_PdoState(axis.target) for axis in settings.axes]
         self._tpdos = [[_PdoState(pdo) for pdo in axis.tpdos] for axis in settings.axes]
-        self._signals = list(map(_signals, self._tpdos))
-        self._target_of = [_places([target]).get(Object.TARGET_POSITION, _ABSENT) for target in self._targets]
-        self._pdos_of = [(target, *tpdos) for target, tpdos in zip(self._targets, self._tpdos, strict=True)]
+        self._signals = [[places.get(i, _ABSENT) for i in _SIGNALS] for places in map(_places, self._tpdos)]
+        self._target_of = [_places([target]).get(Object.TARGET_POSITION, _ABSENT) for target in targets]
+        self._pdos_of = [(target, *tpdos) for target, tpdos in zip(targets, self._tpdos, strict=True)]
         self._pdos: dict[int, _PdoState] = {}
-        for axis, target, tpdos in zip(settings.axes, self._targets, self._tpdos, strict=True):
-            self._pdos[axis.target.cob_id] = target
-            self._pdos.update(zip([pdo.cob_id for pdo in axis.tpdos], tpdos, strict=True))
+        for axis, pdos in zip(settings.axes, self._pdos_of, strict=True):
+            self._pdos.update(zip([pdo.cob_id for pdo in (axis.target, *axis.tpdos)], pdos, strict=True))
         self._nodes = [_Node() for _ in settings.axes]
         nodes = [axis.node_id for axis in settings.axes]
         self._axes_of = {node: [k for k, of in enumerate(nodes) if of == node] for node in nodes}  # one or more
@@ -293,24 +269,25 @@ class Listener:
         return seen
 
     def _axis_input(self, k: int, axis: AxisSettings, now_s: float, target: int | None) -> AxisInput:
-        tpdos, of, node = self._tpdos[k], self._signals[k], self._nodes[k]
-        shown = of.read_back[0]
+        tpdos, node = self._tpdos[k], self._nodes[k]
+        position, read_back, error, statusword, mode, speed_offset, torque_offset, speed, demand = self._signals[k]
+        shown = read_back[0]
         return AxisInput(
             target,
-            _fresh(*of.position),
-            None if shown.early else _fresh(*of.read_back),
-            _fresh(*of.following_error),
-            _last(*of.statusword),
-            _last(*of.mode),
+            _fresh(*position),
+            None if shown.early else _fresh(*read_back),
+            _fresh(*error),
+            _last(*statusword),
+            _last(*mode),
             node.nmt,
             _age(tpdos),
             now_s - node.heartbeat_at_s,
             max([pdo.short for pdo in tpdos], default=0),
             max([pdo.long for pdo in tpdos], default=0),
-            (_fresh(*of.speed_offset), _fresh(*of.torque_offset)),
-            _fresh(*of.speed),
+            (_fresh(*speed_offset), _fresh(*torque_offset)),
+            _fresh(*speed),
             -(-shown.sure_age // shown.every_sync),
-            _fresh(*of.demand),
+            _fresh(*demand),
             node.touched,
             shown.early,
         )
@@ -320,11 +297,6 @@ def _places(pdos: Sequence[_PdoState]) -> dict[int, _Place]:
     """Return the place of each object, in the most frequent PDO that carries it."""
     rarest_first = sorted(pdos, key=lambda pdo: -pdo.every_sync)
     return {index: (pdo, place) for pdo in rarest_first for index, place in pdo.where.items()}
-
-
-def _signals(tpdos: Sequence[_PdoState]) -> _Signals:
-    places = _places(tpdos)
-    return _Signals(*[places.get(index, _ABSENT) for index in _SIGNALS])
 
 
 def _fresh(pdo: _PdoState, place: int) -> int | None:
