@@ -169,5 +169,6 @@ class GuardPoll:
         by_client = bool(ready)
         if self._can_asked and self._can.is_readable:
             ready.append((self._can.fileno(), select.POLLIN))
-        self._rest(0.0 if by_client else wait_ms * 1e-3)  # after a frame it would wait again at once
+        if self._clients_asked:  # else it only looks whether a frame waits
+            self._rest(0.0 if by_client else wait_ms * 1e-3)  # after a frame it would wait again at once
         return ready
