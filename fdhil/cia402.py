@@ -5,11 +5,9 @@ CiA 402-2 (state machine, objects), CiA 402-3 (mode bits). Used by the drivers a
 """
 
 import math
-import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum, IntEnum
-from functools import partial
 
 # COB-IDs of the predefined connection set (CiA 301, table 39)
 COB_NMT = 0x000
@@ -221,21 +219,6 @@ def unpack(entries: Sequence[PdoEntry], data: bytes) -> tuple[int, ...]:
             value -= 1 << entry.bits
         values.append(value)
     return tuple(values)
-
-
-_CODES = {(8, True): "b", (8, False): "B", (16, True): "h", (16, False): "H", (32, True): "i", (32, False): "I"}
-
-
-def decoder(entries: tuple[PdoEntry, ...]) -> Callable[[bytes], tuple[int, ...]]:
-    """Return ``unpack`` of one mapping for frames that are long enough, compiled where it has whole 8, 16 or 32 bits.
-
-    >>> decoder(lay_out([(0x6041, 0, 16, False), (0x6064, 0, 32, True)]))(bytes.fromhex("2712ffffffff"))
-    (4647, -1)
-    """
-    codes = [_CODES.get((entry.bits, entry.signed), "") for entry in entries]
-    if all(codes) and entries == lay_out([(e.index, e.sub, e.bits, e.signed) for e in entries]):
-        return struct.Struct("<" + "".join(codes)).unpack_from
-    return partial(unpack, entries)
 
 
 def pack(entries: Sequence[PdoEntry], values: Sequence[int]) -> bytes:

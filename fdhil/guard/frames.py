@@ -20,9 +20,9 @@ from fdhil.cia402 import (
     Nmt,
     NmtCommand,
     Object,
-    decoder,
     first_axis_index,
     pdo_length,
+    unpack,
 )
 from fdhil.guard.interlocks import Alarm
 from fdhil.guard.settings import AxisSettings, Pdo, Settings
@@ -50,7 +50,6 @@ class _PdoState:
     def __init__(self, pdo: Pdo) -> None:
         self.entries = pdo.entries
         self.length = pdo_length(self.entries)
-        self._decode = decoder(tuple(self.entries))
         self.every_sync = max(1, pdo.every_sync)
         self.where = {entry.index: k for k, entry in enumerate(self.entries) if entry.sub == 0}
         self.needed = bool(_NEEDED & self.where.keys())
@@ -74,7 +73,7 @@ class _PdoState:
             self.twice = self.twice or data != self.data
         self.fresh, self.age = True, 0
         if data != self.data:
-            self.data, self.values = data, self._decode(data)  # now: at the SYNC there is no time
+            self.data, self.values = data, unpack(self.entries, data)  # now: at the SYNC there is no time
 
     def at_sync(self) -> None:
         """Age by one cycle."""
