@@ -290,7 +290,7 @@ def life_of(seed: int, seconds: float, folder: Path) -> tuple[list[str], Counter
     machine = Machine(seed, drawn(rng), folder=folder)
     with machine:
         begun_s = machine.clock.now_s()
-        kind = f"{len(machine.config.axis)} axes, SYNC every {1e3 * machine.config.machine.sync_period_s:g} ms"
+        kind = f"{'+'.join(machine.config.axis)}, SYNC every {1e3 * machine.config.machine.sync_period_s:g} ms"
         life = Life(seed, seconds, machine, Judge(machine), rng)
         signal.setitimer(signal.ITIMER_PROF, MOST_CPU_S * seconds, MOST_CPU_S * seconds)
         try:
@@ -301,7 +301,7 @@ def life_of(seed: int, seconds: float, folder: Path) -> tuple[list[str], Counter
         machine.bus.flush()
         counted = life.judge.counted + Counter({f"event {name}": n for name, n in life.happened.items()})
         counted["frames"] += machine.bus.frames
-        counted[f"machine {kind}"] += 1
+        counted[f"axes {kind}"] += 1
         counted["milliseconds"] += round(1e3 * (machine.clock.now_s() - begun_s))
         return machine.wrong, counted, machine
 
@@ -419,7 +419,7 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
         "- neither daemon nor guard ends with an error.",
         "",
     ]
-    lines += _table(counted, "machine ", "machines")
+    lines += _table(counted, "axes ", "axes and SYNC")
     lines += _table(counted, "event ", "what happened")
     lines += pages.paragraph(f"Broken: {pages.of(len(failures), figures['machines'])} machines.")
     lines += [f"- `{each['replay']}`: {' '.join(each['wrong'][0].split())[:200]}" for each in failures[:SHOWN]]
