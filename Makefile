@@ -95,9 +95,8 @@ fuzz: setup      ## any bytes at every way in, N for each (make fuzz N=1000000);
 
 swarm: N = 200
 swarm: SECONDS = 60
-swarm: SEED = 1
 swarm: setup     ## N random machines, each from one seed and for SECONDS of virtual time; the page is out/swarm/swarm.md
-	@$(BIN)/python -m studies.swarm --machines $(N) --seconds $(SECONDS) --seed $(SEED) --out out/swarm
+	@$(BIN)/python -m studies.swarm --machines $(N) --seconds $(SECONDS) $(if $(SEED),--first-seed $(SEED)) --out out/swarm
 
 guard: setup     ## the guard's own tests, in its processes too; a branch of it that none of them takes is an error
 	@$(BIN)/python -m coverage erase

@@ -2,6 +2,8 @@
 
 Daemon, guard, store, drives and NC are the product's own, in one process (``tests/machine``). What must hold whatever
 happens is judged at every SYNC; what is broken is reported with the command that repeats it.
+
+A run goes on where the last one of the same code ended: figures and page add up what was run, after every life.
 """
 
 from __future__ import annotations
@@ -9,13 +11,16 @@ from __future__ import annotations
 import argparse
 import contextlib
 import gc
+import hashlib
+import json
 import math
 import random
+import signal
 import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,6 +35,14 @@ ROOM_MM = 120.0
 FIRST_S = 3.0  # of rest after the last fault, until the drives must be at zero
 FAULTS_END_S = 3.0
 SHOWN = 40  # failures on the page
+MOST_CPU_S = 5.0  # of a machine-second: what takes longer does not end
+CODE = ("fdhil/**/*.py", "tests/machine/[!t]*.py", "tests/guard/wire.py", "tests/bench.py", "studies/swarm.py")
+SYNC_PERIODS_S = (0.001, 0.002, 0.004)
+AXES = ("X", "XY", "XY", "XY", "XYZ")
+
+
+class TooLong(Exception):
+    """A life does not end."""
 
 
 @dataclass
@@ -72,6 +85,8 @@ class Life:
             method = rng.choice((None, None, None, "mirror"))
             answer = machine.arm(machine.write(text, name), **({} if method is None else {"method": method}))
             self.happened["armed" if answer["ok"] else f"refused: {answer['code']}"] += 1
+            if not answer["ok"] and answer["code"] == "PoorSkill" and rng.random() < 0.5:
+                machine.play(shuttle(machine.config.axis), "shuttle.ngc")
             if rng.random() < 0.05:
                 machine.ask("disarm")
                 self.happened["disarmed"] += 1
@@ -91,15 +106,21 @@ class Life:
         self.machine.start(name)
 
     def program(self) -> str:
-        """Draw a program of a few moves from and to zero."""
+        """Draw a program of a few moves from and to zero: lines, rectangles and circles, with rests between."""
         rng, axes = self.rng, list(self.machine.plant.units)
         lines = ["G21 G90 G94", f"G4 P{rng.choice((0.1, 0.3))}"]
-        for _ in range(rng.randint(1, 5)):
-            words = " ".join(f"{axis}{rng.uniform(-ROOM_MM, ROOM_MM):.3f}" for axis in axes if rng.random() < 0.7)
-            if words and rng.random() < 0.8:
-                lines.append(f"G1 {words} F{rng.uniform(4000, 9000):.0f}")
+        for _ in range(rng.randint(1, 4)):
+            feed = f"F{rng.uniform(4000, 9000):.0f}"
+            shape = rng.choice(("line", "rectangle", "rectangle", "circle", "rapid"))
+            there = {axis: rng.uniform(-ROOM_MM, ROOM_MM) for axis in axes if rng.random() < 0.7}
+            words = " ".join(f"{axis}{place_mm:.3f}" for axis, place_mm in there.items())
+            if shape == "circle" and {"X", "Y"} <= set(axes):
+                lines.append(f"G2 I{rng.uniform(5, 40):.3f} J0 {feed}")
+            elif shape == "rectangle":
+                corners = [f"{axis}{place_mm:.3f}" for axis, place_mm in there.items()] + [f"{axis}0" for axis in there]
+                lines += [f"G1 {corner} {feed}" for corner in corners]
             elif words:
-                lines.append(f"G0 {words}")
+                lines.append(f"G0 {words}" if shape == "rapid" else f"G1 {words} {feed}")
             if rng.random() < 0.3:
                 lines.append(f"G4 P{rng.uniform(0.01, 0.4):.2f}")
         return "\n".join([*lines, "G1 " + " ".join(f"{axis}0" for axis in axes) + " F8000", "G4 P0.2", "M2", ""])
@@ -119,7 +140,7 @@ class Life:
                 machine.nc(on=True)
         machine.plant.nc.stop()
         machine.run(0.8)
-        if machine.guard_state == "FROZEN":
+        if machine.guard_state == "FROZEN" or any(machine.held_um().values()):
             answer = machine.adopt()
             self.happened["adopted" if answer["ok"] else "adoption refused"] += 1
             machine.run(1.0)
@@ -254,10 +275,11 @@ EVENTS: Mapping[str, Callable[[Life], None]] = {
 
 def drawn(rng: random.Random) -> dict[str, Any]:
     """Draw a machine."""
-    made = document(rng.choice(("XY", "XY", "XYZ")))
+    made = document(rng.choice(AXES))
+    made["machine"]["sync_period_s"] = rng.choice(SYNC_PERIODS_S)
     for axis in made["axis"].values():
         axis["nominal"]["Jt"] *= rng.uniform(0.9, 1.1)
-        axis["correction"]["max_offset_um"] = rng.choice((100.0, 150.0, 250.0))
+        axis["correction"]["max_offset_um"] = rng.choice((150.0, 250.0, 250.0))
         axis["drive"] = {"sign": rng.choice((1, -1))}
     return made
 
@@ -268,14 +290,18 @@ def life_of(seed: int, seconds: float, folder: Path) -> tuple[list[str], Counter
     machine = Machine(seed, drawn(rng), folder=folder)
     with machine:
         begun_s = machine.clock.now_s()
+        kind = f"{'+'.join(machine.config.axis)}, SYNC every {1e3 * machine.config.machine.sync_period_s:g} ms"
         life = Life(seed, seconds, machine, Judge(machine), rng)
+        signal.setitimer(signal.ITIMER_PROF, MOST_CPU_S * seconds, MOST_CPU_S * seconds)
         try:
             life.live()
         except Exception as error:  # noqa: BLE001 - whatever ends a life is a finding
             machine.wrong.append(f"{machine.clock.now_s():.3f} s: {type(error).__name__}: {error}"[:3000])
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
         machine.bus.flush()
         counted = life.judge.counted + Counter({f"event {name}": n for name, n in life.happened.items()})
         counted["frames"] += machine.bus.frames
+        counted[f"axes {kind}"] += 1
         counted["milliseconds"] += round(1e3 * (machine.clock.now_s() - begun_s))
         return machine.wrong, counted, machine
 
@@ -285,13 +311,19 @@ def judged(seed: int, seconds: float) -> tuple[int, list[str], dict[str, int], f
     begun_s = time.process_time()
     with tempfile.TemporaryDirectory(prefix="swarm-") as folder:
         wrong, counted, _ = life_of(seed, seconds, Path(folder))
+    gc.collect()
     return seed, wrong, dict(counted), time.process_time() - begun_s
 
 
-def _quiet() -> None:
-    """Do without the garbage collector, as the guard's process does: a worker ends after a few lives."""
+def _begin_worker() -> None:
+    """Collect garbage between two lives alone, as the guard's process never does; end a life that does not end."""
     gc.freeze()
     gc.disable()
+    signal.signal(signal.SIGPROF, _too_long)
+
+
+def _too_long(*_: object) -> None:
+    raise TooLong(f"more than {MOST_CPU_S:g} s of processor time for each machine-second")
 
 
 def replay(seed: int, seconds: float) -> str:
@@ -299,24 +331,65 @@ def replay(seed: int, seconds: float) -> str:
     return f"make swarm N=1 SEED={seed} SECONDS={seconds:g}"
 
 
-def measure(options: argparse.Namespace) -> dict[str, Any]:
-    """Let all machines live."""
-    seeds = range(options.seed, options.seed + options.machines)
-    counted, failures, used_s = Counter[str](), [], 0.0
-    with ProcessPoolExecutor(options.processes, initializer=_quiet, max_tasks_per_child=10) as pool:
-        for seed, wrong, found, seconds in pool.map(judged, seeds, [options.seconds] * len(seeds)):
-            counted.update(found)
-            used_s += seconds
-            if wrong:
-                failures.append({"seed": seed, "wrong": wrong[:5], "replay": replay(seed, options.seconds)})
-                print(f"{replay(seed, options.seconds)}\n  " + "\n  ".join(wrong[:5]), flush=True)
-    return {
-        "machines": len(seeds),
-        "seconds": options.seconds,
-        "counted": dict(sorted(counted.items())),
-        "processor_s": used_s,
-        "failures": failures,
+def code_digest() -> str:
+    """Return the digest of the code that lives and judges."""
+    files = sorted(path for pattern in CODE for path in pages.ROOT.glob(pattern))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:16]
+
+
+def nothing_run(code: str) -> dict[str, Any]:
+    """Return the figures of a version of the code before its first life."""
+    return {"code": code, "runs": [], "machines": 0, "counted": {}, "processor_s": 0.0, "failures": [], "earlier": []}
+
+
+def resumed(path: Path, code: str) -> dict[str, Any]:
+    """Return the figures in a file, to be added to; those of another version of the code become one line of a new."""
+    figures = nothing_run(code)
+    if not path.exists():
+        return figures
+    document = json.loads(path.read_text("utf-8"))
+    before: dict[str, Any] = document["figures"]
+    if before.get("code") == code:
+        return before
+    line = {
+        "commit": document["run"]["commit"],
+        "machines": before["machines"],
+        "machine_s": before["counted"].get("milliseconds", 0) / 1e3,
+        "failures": len(before["failures"]),
     }
+    return figures | {"earlier": [*before.get("earlier", []), line]}
+
+
+def next_seed(figures: Mapping[str, Any]) -> int:
+    """Return the first seed that was not run."""
+    return max((last for _, last, _ in figures["runs"]), default=0) + 1
+
+
+def is_counted(figures: Mapping[str, Any], seed: int, seconds: float) -> bool:
+    """Return whether this life is in the figures: it may be repeated, and is not counted again."""
+    return any(first <= seed <= last and of == seconds for first, last, of in figures["runs"])
+
+
+def lives(options: argparse.Namespace, seeds: range) -> Iterator[tuple[int, list[str], dict[str, int], float]]:
+    """Let all machines live; yield of each its seed, what was wrong, what was counted and the processor time."""
+    with ProcessPoolExecutor(options.processes, initializer=_begin_worker, max_tasks_per_child=25) as pool:
+        yield from pool.map(judged, seeds, [options.seconds] * len(seeds))
+
+
+def add_life(
+    figures: dict[str, Any], seed: int, seconds: float, wrong: list[str], counted: Mapping[str, int], used_s: float
+) -> None:
+    """Add a life to the figures."""
+    runs = figures["runs"]
+    if runs and runs[-1][1:] == [seed - 1, seconds]:
+        runs[-1][1] = seed
+    else:
+        runs.append([seed, seed, seconds])
+    figures["machines"] += 1
+    figures["counted"] = dict(sorted((Counter(figures["counted"]) + Counter(counted)).items()))
+    figures["processor_s"] += used_s
+    if wrong:
+        figures["failures"].append({"seed": seed, "wrong": wrong[:5], "replay": replay(seed, seconds)})
 
 
 def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
@@ -327,13 +400,13 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
     lines += pages.paragraph(
         f"""Each machine comes from one seed: its axes, programs, faults and their times. Daemon, guard, store,
         simulated drives and NC run in one process on one virtual clock (`tests/machine`), so that a seed gives the same
-        frames, history and log each time. {figures["machines"]} machines lived {lived_s:.0f} machine-seconds in
-        {figures["processor_s"]:.0f} s of processor time ({lived_s / figures["processor_s"]:.1f} times real time,
-        judging included)."""
+        frames, history and log each time. With this version of the code {figures["machines"]} machines lived
+        {lived_s:.0f} machine-seconds in {figures["processor_s"]:.0f} s of processor time
+        ({lived_s / figures["processor_s"]:.1f} times real time, judging included); the next run adds to it."""
     )
     lines += pages.paragraph(
         f"""Judged: {counted["SYNC"]} SYNC with {counted["frames"]} frames, {counted.get("offset frames", 0)} offset
-        frames of the guard, {counted["statuses"]} statuses, {counted["records"]} rows of the history and
+        frames of the guard, {counted.get("statuses", 0)} statuses, {counted.get("records", 0)} rows of the history and
         {counted.get("audit lines", 0)} lines of the audit."""
     )
     lines += [
@@ -346,31 +419,61 @@ def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
         "- neither daemon nor guard ends with an error.",
         "",
     ]
-    names = {name.removeprefix("event "): n for name, n in counted.items() if name.startswith("event ")}
-    lines += pages.grid(("what happened", "times"), [(name, str(n)) for name, n in sorted(names.items())])
-    broken = f"Broken: {pages.of(len(failures), figures['machines'])} machines."
-    lines += ["", *pages.paragraph(broken)]
-    for failure in failures[:SHOWN]:
-        lines += [f"- `{failure['replay']}`: {_short(failure['wrong'])}"]
+    lines += _table(counted, "axes ", "axes and SYNC")
+    lines += _table(counted, "event ", "what happened")
+    lines += pages.paragraph(f"Broken: {pages.of(len(failures), figures['machines'])} machines.")
+    lines += [f"- `{each['replay']}`: {' '.join(each['wrong'][0].split())[:200]}" for each in failures[:SHOWN]]
+    if figures["earlier"]:
+        lines += ["", "Earlier versions of the code:", ""]
+        lines += pages.grid(
+            ("commit", "machines", "machine-seconds", "broken"),
+            [
+                (each["commit"], str(each["machines"]), f"{each['machine_s']:.0f}", str(each["failures"]))
+                for each in figures["earlier"]
+            ],
+        )
     return "\n".join(lines)
 
 
-def _short(wrong: Sequence[str]) -> str:
-    return " ".join(wrong[0].split())[:200]
+def _table(counted: Mapping[str, int], prefix: str, title: str) -> list[str]:
+    rows = [(name.removeprefix(prefix), str(n)) for name, n in sorted(counted.items()) if name.startswith(prefix)]
+    return [*pages.grid((title, "times"), rows), ""]
 
 
 def main() -> None:
-    """Run the study."""
+    """Run machines, and add them to the figures and the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--machines", type=int, default=200)
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--seed", type=int, default=1)
-    figures = pages.conduct("swarm", parser, _seeds, measure)
-    sys.exit(bool(figures["failures"]))
+    parser.add_argument("--first-seed", type=int, help="default: the first that this version of the code has not run")
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=pages.FOLDER)
+    options = parser.parse_args()
+    path = options.out / "swarm.json"
+    figures = resumed(path, code_digest())
+    first = next_seed(figures) if options.first_seed is None else options.first_seed
+    run = pages.provenance(f"python -m studies.swarm --machines {options.machines} --seconds {options.seconds:g}")
+    options.out.mkdir(parents=True, exist_ok=True)
+    broken = False
+    for seed, wrong, counted, used_s in lives(options, range(first, first + options.machines)):
+        if wrong:
+            broken = True
+            print(f"{replay(seed, options.seconds)}\n  " + "\n  ".join(wrong[:5]), flush=True)
+        if not is_counted(figures, seed, options.seconds):
+            add_life(figures, seed, options.seconds, wrong, counted, used_s)
+        write(path, run, figures)
+    print(pages.rendered(json.loads(path.read_text("utf-8"))))
+    sys.exit(broken)
 
 
-def _seeds(options: argparse.Namespace) -> str:
-    return f"{options.seed} to {options.seed + options.machines - 1}"
+def write(path: Path, run: pages.Run, figures: Mapping[str, Any]) -> None:
+    """Write figures and page, so that what was run is kept however the run ends."""
+    seeds = ", ".join(f"{first} to {last} ({seconds:g} s each)" for first, last, seconds in figures["runs"])
+    document = {"study": "swarm", "run": {**run, "seeds": seeds}, "figures": pages.plain(figures)}
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(document, separators=(",", ":")) + "\n", "utf-8")
+    part.replace(path)
+    pages.write_page(path)
 
 
 if __name__ == "__main__":

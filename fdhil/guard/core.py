@@ -57,6 +57,8 @@ def step(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outpu
     state, output = go_on(state, inputs, alarms, settings, output)
     moved = None if state.mode is before else (before, state.mode, state.cause)
     fed = None if state.feed.mode is fed_before else (fed_before, state.feed.mode)
+    if refused is None and moved is None and fed is None:
+        return state, output
     return state, output._replace(refused=refused, transition=moved, feed_transition=fed)
 
 

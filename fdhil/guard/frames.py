@@ -7,7 +7,7 @@ latches is the last one that came before it.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
 
@@ -82,10 +82,14 @@ class _PdoState:
         self.age += 1
         self.sure_age = 1 if self.fresh and not self.early else self.sure_age + 1
 
-    def get(self, index: int) -> int | None:
-        """The last value of an object, None when it was never heard or is not mapped here."""
-        place = self.where.get(index)
-        return None if place is None or not self.values else self.values[place]
+
+_Place = tuple[_PdoState, int]
+_ABSENT: _Place = _PdoState(Pdo(0, ())), 0  # of an object that no PDO carries
+# what a drive shows, in the order in which ``_axis_input`` takes it
+_SIGNALS = (
+    Object.POSITION_ACTUAL, Object.POSITION_OFFSET, Object.FOLLOWING_ERROR, Object.STATUSWORD, Object.MODE_DISPLAY,
+    Object.VELOCITY_OFFSET, Object.TORQUE_OFFSET, Object.VELOCITY_ACTUAL, Object.POSITION_DEMAND,
+)  # fmt: skip
 
 
 @dataclass(slots=True)
@@ -107,13 +111,14 @@ class Listener:
         self.lost_frames = self.emergencies = 0
         self._sent_ids = settings.sent_ids
         self._writers = {cob_id: axis.name for axis in settings.axes for cob_id in axis.writers}
-        self._targets = [_PdoState(axis.target) for axis in settings.axes]
+        targets = [_PdoState(axis.target) for axis in settings.axes]
         self._tpdos = [[_PdoState(pdo) for pdo in axis.tpdos] for axis in settings.axes]
-        self._carriers = list(map(_carriers, self._tpdos))
+        self._signals = [[places.get(i, _ABSENT) for i in _SIGNALS] for places in map(_places, self._tpdos)]
+        self._target_of = [_places([target]).get(Object.TARGET_POSITION, _ABSENT) for target in targets]
+        self._pdos_of = [(target, *tpdos) for target, tpdos in zip(targets, self._tpdos, strict=True)]
         self._pdos: dict[int, _PdoState] = {}
-        for axis, target, tpdos in zip(settings.axes, self._targets, self._tpdos, strict=True):
-            self._pdos[axis.target.cob_id] = target
-            self._pdos.update(zip([pdo.cob_id for pdo in axis.tpdos], tpdos, strict=True))
+        for axis, pdos in zip(settings.axes, self._pdos_of, strict=True):
+            self._pdos.update(zip([pdo.cob_id for pdo in (axis.target, *axis.tpdos)], pdos, strict=True))
         self._nodes = [_Node() for _ in settings.axes]
         nodes = [axis.node_id for axis in settings.axes]
         self._axes_of = {node: [k for k, of in enumerate(nodes) if of == node] for node in nodes}  # one or more
@@ -252,55 +257,53 @@ class Listener:
         return not (interval > 3 * period or not abs(typical - period) <= 0.02 * period)
 
     def _axis_at_sync(self, k: int, axis: AxisSettings, now_s: float) -> AxisInput:
-        target_pdo = self._targets[k]
-        for pdo in (target_pdo, *self._tpdos[k]):
+        target = _fresh(*self._target_of[k])
+        for pdo in self._pdos_of[k]:
             pdo.at_sync()
             if pdo.twice_run >= FOREIGN_CYCLES:
                 self._alarm(Alarm("ForeignProducer", axis.name))
-        target = target_pdo.get(Object.TARGET_POSITION) if target_pdo.fresh else None
         seen = self._axis_input(k, axis, now_s, target)
-        for pdo in (target_pdo, *self._tpdos[k]):
+        for pdo in self._pdos_of[k]:
             pdo.fresh = pdo.early = pdo.twice = False
         return seen
 
     def _axis_input(self, k: int, axis: AxisSettings, now_s: float, target: int | None) -> AxisInput:
-        tpdos, of, node = self._tpdos[k], self._carriers[k], self._nodes[k]
-        shown = of.get(Object.POSITION_OFFSET)
+        tpdos, node = self._tpdos[k], self._nodes[k]
+        position, read_back, error, statusword, mode, speed_offset, torque_offset, speed, demand = self._signals[k]
+        shown = read_back[0]
         return AxisInput(
             target,
-            _fresh(of, Object.POSITION_ACTUAL),
-            _fresh(of, Object.POSITION_OFFSET) if shown is not None and not shown.early else None,
-            _fresh(of, Object.FOLLOWING_ERROR),
-            _last(of, Object.STATUSWORD),
-            _last(of, Object.MODE_DISPLAY),
+            _fresh(*position),
+            None if shown.early else _fresh(*read_back),
+            _fresh(*error),
+            _last(*statusword),
+            _last(*mode),
             node.nmt,
             _age(tpdos),
             now_s - node.heartbeat_at_s,
             max([pdo.short for pdo in tpdos], default=0),
             max([pdo.long for pdo in tpdos], default=0),
-            (_fresh(of, Object.VELOCITY_OFFSET), _fresh(of, Object.TORQUE_OFFSET)),
-            _fresh(of, Object.VELOCITY_ACTUAL),
-            NEVER if shown is None else -(-shown.sure_age // shown.every_sync),
-            _fresh(of, Object.POSITION_DEMAND),
+            (_fresh(*speed_offset), _fresh(*torque_offset)),
+            _fresh(*speed),
+            -(-shown.sure_age // shown.every_sync),
+            _fresh(*demand),
             node.touched,
-            shown is not None and shown.early,
+            shown.early,
         )
 
 
-def _carriers(pdos: Sequence[_PdoState]) -> dict[int, _PdoState]:
-    """Return of each object the TPDO that carries it, the most frequent one."""
+def _places(pdos: Sequence[_PdoState]) -> dict[int, _Place]:
+    """Return the place of each object, in the most frequent PDO that carries it."""
     rarest_first = sorted(pdos, key=lambda pdo: -pdo.every_sync)
-    return {index: pdo for pdo in rarest_first for index in pdo.where}
+    return {index: (pdo, place) for pdo in rarest_first for index, place in pdo.where.items()}
 
 
-def _fresh(of: Mapping[int, _PdoState], index: int) -> int | None:
-    pdo = of.get(index)
-    return pdo.get(index) if pdo is not None and pdo.fresh else None
+def _fresh(pdo: _PdoState, place: int) -> int | None:
+    return pdo.values[place] if pdo.fresh else None
 
 
-def _last(of: Mapping[int, _PdoState], index: int) -> int | None:
-    pdo = of.get(index)
-    return None if pdo is None else pdo.get(index)
+def _last(pdo: _PdoState, place: int) -> int | None:
+    return pdo.values[place] if pdo.values else None
 
 
 def _age(pdos: Sequence[_PdoState]) -> float:

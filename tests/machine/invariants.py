@@ -15,6 +15,7 @@ from fdhil.store.audit import entries
 from tests.guard.wire import Wire
 from tests.machine.whole_machine import Machine
 
+OFFSET = 0x60B000
 LAG_SYNC = 150  # ten read-backs and more: by then the guard has seen what a drive holds
 STATUS_LAG_S = 1.5  # the daemon asks the guard twice a second
 WINDOW_LINE = re.compile(r" ([A-Z]): G0 [+-] at ")
@@ -27,7 +28,7 @@ class Judge:
     def __init__(self, machine: Machine) -> None:
         self._machine = machine
         self.counted = Counter[str]()
-        self._units = list(machine.plant.units.values())
+        self._numbers = [unit.drive.dictionary.numbers for unit in machine.plant.units.values()]
         self._wires: dict[int, tuple[Any, Wire]] = {}
         self._sent: set[int] = set()
         self._guard: object = None
@@ -54,7 +55,11 @@ class Judge:
     @staticmethod
     def _held(unit: Any) -> int:
         """The offset that the drive has in force, increments."""
-        return int(unit.drive.dictionary.number(0x60B0, 0))
+        return int(unit.drive.dictionary.numbers[OFFSET])
+
+    @property
+    def _any_held(self) -> bool:
+        return any(numbers[OFFSET] for numbers in self._numbers)
 
     def _guard_frame(self, cob_id: int, data: bytes) -> None:
         self._follow()
@@ -80,7 +85,7 @@ class Judge:
         self._sent.clear()
         self._true_guard()
         now_s = self._machine.clock.time_s
-        if any(map(self._held, self._units)):
+        if self._any_held:
             self._held_since_s = now_s if self._held_since_s is None else self._held_since_s
         else:
             self._held_since_s = None
@@ -111,7 +116,7 @@ class Judge:
     def end(self) -> None:
         """Judge what is left: the drives at zero, no record lost or doubled, no line of a crash."""
         machine = self._machine
-        if any(map(self._held, self._units)):
+        if self._any_held:
             self.wrong(f"in the end the drives hold {machine.held_um()} um")
         log = machine.log.getvalue()
         for word in ("Traceback", "InternalError"):

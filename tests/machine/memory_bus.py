@@ -166,7 +166,9 @@ class GuardPoll:
         if wait_ms > 0 and not self._clients_asked and not self._can.is_readable:
             self._wait(wait_ms * 1e-3)
         ready = self._clients.poll(0) if self._clients_asked else []
+        by_client = bool(ready)
         if self._can_asked and self._can.is_readable:
             ready.append((self._can.fileno(), select.POLLIN))
-        self._rest(0.0 if ready else wait_ms * 1e-3)
+        if self._clients_asked:  # else it only looks whether a frame waits
+            self._rest(0.0 if by_client else wait_ms * 1e-3)  # after a frame it would wait again at once
         return ready

@@ -186,3 +186,20 @@ def test_a_fault_in_the_cut_ends_at_zero(begin: Begin, kind: str, fields: dict[s
     machine.run(1.0)
     assert judge.status()["armed"] is None
     assert machine.wrong == []
+
+
+def test_the_guard_sleeps_while_no_sync_comes(begin: Begin, monkeypatch: pytest.MonkeyPatch) -> None:
+    machine = begin()
+    machine.nc(on=False)
+    machine.run(0.5)
+    assert machine.guard is not None
+    turns: list[float] = []
+    turn = machine.guard.turn
+
+    def counted() -> int | None:
+        turns.append(machine.clock.now_s())
+        return turn()
+
+    monkeypatch.setattr(machine.guard, "turn", counted)
+    machine.run(5.0)
+    assert 50 < len(turns) < 500  # it looks 20 times a second, and when it is asked

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import random
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from tests.machine.test_lives import into_the_cut
 from tests.machine.whole_machine import Machine
 
 Begin = Callable[[], Machine]
+RUN = {"command": "python -m studies.swarm", "commit": "0123abcd", "date": "2026-11-28", "versions": "Python 3.11"}
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -31,7 +34,46 @@ def test_a_seed_repeats_a_whole_life(tmp_path: Path) -> None:
 
 
 def test_a_failure_names_the_command_that_repeats_it() -> None:
-    assert swarm.replay(17, 60.0) == "make swarm N=1 SEED=17 SECONDS=60"
+    figures = swarm.nothing_run("code")
+    swarm.add_life(figures, 17, 60.0, ["1.000 s: a step"], {"SYNC": 3, "frames": 9, "milliseconds": 70}, 2.0)
+    page = swarm.page({**RUN, "seeds": "17 to 17"}, figures)
+    assert "`make swarm N=1 SEED=17 SECONDS=60`: 1.000 s: a step" in page
+    assert "Broken: in all 1 machines." in page
+
+
+def test_a_run_adds_to_what_the_same_code_has_run(tmp_path: Path) -> None:
+    path = tmp_path / "swarm.json"
+    for seed in (1, 2):
+        figures = swarm.resumed(path, "code")
+        assert swarm.next_seed(figures) == seed
+        swarm.add_life(figures, seed, 60.0, [], {"SYNC": 3, "frames": 9, "milliseconds": 70_000}, 2.0)
+        swarm.write(path, RUN, figures)
+    figures = json.loads(path.read_text("utf-8"))["figures"]
+    assert (figures["runs"], figures["machines"], figures["counted"]["SYNC"]) == ([[1, 2, 60.0]], 2, 6)
+    assert swarm.is_counted(figures, 2, 60.0)
+    assert not swarm.is_counted(figures, 2, 20.0)
+    text = " ".join(path.with_suffix(".md").read_text("utf-8").split())
+    assert "140 machine-seconds in 4 s of processor time" in text
+
+
+def test_a_run_of_other_code_begins_again_and_lists_the_earlier_one(tmp_path: Path) -> None:
+    path = tmp_path / "swarm.json"
+    figures = swarm.nothing_run("before")
+    swarm.add_life(figures, 1, 60.0, ["2.0 s: wrong"], {"milliseconds": 70_000}, 2.0)
+    path.write_text(json.dumps({"run": RUN, "figures": figures}), "utf-8")
+    again = swarm.resumed(path, "after")
+    assert (again["machines"], again["runs"], again["failures"]) == (0, [], [])
+    assert again["earlier"] == [{"commit": "0123abcd", "machines": 1, "machine_s": 70.0, "failures": 1}]
+
+
+def test_a_life_that_does_not_end_is_a_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(swarm, "MOST_CPU_S", 0.02)
+    handler = signal.signal(signal.SIGPROF, swarm._too_long)
+    try:
+        _, wrong, _, _ = swarm.judged(1, 1.0)
+    finally:
+        signal.signal(signal.SIGPROF, handler)
+    assert any("more than 0.02 s of processor time" in each for each in wrong), wrong
 
 
 def test_every_event_can_happen_to_a_machine_that_cuts(begin: Begin) -> None:

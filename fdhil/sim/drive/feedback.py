@@ -50,6 +50,7 @@ class Feedback:
         self._motion = motion
         self._sensors = sensors
         self._gauges = gauges
+        self._switches = motion.homing.switches if motion.homing.switches.mounted else None
         self.trace = TraceBuffer()
         self._inc_per_rad = ratings.increments_per_rev / (2 * math.pi)
         self._counts_per_a = 1e3 / ratings.rated_current_a
@@ -66,10 +67,9 @@ class Feedback:
     @property
     def inputs(self) -> int:
         """0x60FD now."""
-        switches = self._motion.homing.switches
-        if not switches.mounted:
+        if self._switches is None:
             return self.digital_inputs
-        return self.digital_inputs | switches.inputs(self.true_position + self._motion.shift)
+        return self.digital_inputs | self._switches.inputs(self.true_position + self._motion.shift)
 
     @property
     def actual(self) -> Actual:
@@ -126,7 +126,7 @@ class Feedback:
 
     def show_state(self) -> None:
         """Bring statusword and mode display up to date."""
-        word = self._power.state.value | _VOLTAGE_ENABLED | _REMOTE
+        word = self._power.state | _VOLTAGE_ENABLED | _REMOTE
         if self._power.powered:
             word |= self._motion.status_bits
             if self._physics.current_limited or self._physics.voltage_limited or self._motion.limited:

@@ -224,10 +224,10 @@ class CanopenNode(ABC):
         self.nmt = state
 
     def _rpdo(self, can_id: int, data: bytes) -> list[Frame]:
+        if not self.pdo.receives(can_id):
+            return []
         try:
             at_once = self.pdo.receive(can_id, data, self._now_s)
-        except LookupError:
-            return []
         except ValueError:
             self._emergencies.report(PDO_TOO_SHORT)
             return self._take_outgoing()

@@ -165,6 +165,10 @@ class PdoEngine:
 
     # -- reception
 
+    def receives(self, can_id: int) -> bool:
+        """Return whether an RPDO has this identifier."""
+        return can_id in self._rpdos
+
     def receive(self, can_id: int, data: bytes, now_s: float) -> Pdo | None:
         """Take an RPDO; the PDO is returned when it is to be applied at once, else it waits for the SYNC.
 

@@ -1,10 +1,10 @@
 """Steps the power states of CiA 402-2: controlword in, state out, with the option codes for every kind of stop."""
 
 from collections.abc import Callable
-from enum import Enum, auto
+from enum import Enum, IntEnum, auto
 
 
-class State(Enum):
+class State(IntEnum):
     """The states; the value is the statusword's pattern in bits 0-3, 5 and 6."""
 
     NOT_READY = 0x00

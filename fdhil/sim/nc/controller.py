@@ -362,7 +362,7 @@ class NcController:
         for link in self._links:
             if link.silent > link.wiring.patience:
                 why = "sends no statusword any more"
-            elif link.status is None or link.status & 0x6F != State.OPERATION_ENABLED.value:
+            elif link.status is None or link.status & 0x6F != State.OPERATION_ENABLED:
                 why = f"left Operation enabled for {link.state.name}"
             else:
                 continue

@@ -39,7 +39,8 @@ def power_state(statusword: int) -> State:
 class Wiring:
     """The PDOs by which the NC leads a drive, and its ``mode`` of cyclic set-points with the object it is written to.
 
-    ``missing`` are the objects that the NC needs and no valid PDO carries.
+    ``missing`` are the objects that the NC needs and no valid PDO carries. A drive is silent that sends no statusword
+    for ``patience`` SYNCs; one that sends it by event never is.
     """
 
     setpoints: tuple[Pdo, ...] = ()
@@ -47,6 +48,7 @@ class Wiring:
     missing: tuple[str, ...] = ()
     mode: int = CYCLIC_POSITION
     mode_index: int = 0x6060
+    patience: float = float("inf")
 
     @classmethod
     def of(cls, rpdos: Iterable[Pdo], tpdos: Iterable[Pdo], mode: int, mode_index: int) -> Wiring:
@@ -58,19 +60,16 @@ class Wiring:
         for key, pdos in ((TARGET, received), (CONTROLWORD, received), (STATUSWORD, sent), (POSITION, sent)):
             chosen[key] = next((pdo for pdo in pdos if key in pdo.keys), None)
         used = {pdo.cob_id: pdo for pdo in chosen.values() if pdo is not None}
+        status = chosen[STATUSWORD]
+        kind = 255 if status is None else status.kind
         return cls(
             tuple(pdo for pdo in used.values() if pdo in received),
             tuple(pdo for pdo in used.values() if pdo in sent),
             tuple(f"{key >> 8:04X}" for key, pdo in chosen.items() if pdo is None),
             mode,
             mode_index,
+            _SILENCE_CYCLES * max(kind, 1) if kind <= 240 else float("inf"),
         )
-
-    @property
-    def patience(self) -> float:
-        """SYNCs after which a drive is silent that sends no statusword; one that sends it by event never is."""
-        kind = next((pdo.kind for pdo in self.answers if STATUSWORD in pdo.keys), 255)
-        return _SILENCE_CYCLES * max(kind, 1) if kind <= 240 else float("inf")
 
 
 @dataclass(slots=True)
