@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from fdhil.config import Axis
 from fdhil.records import Estimate, Float, Window, frozen
@@ -46,6 +45,8 @@ def with_presliding(estimate: Estimate, windows: Sequence[Window], axis: Axis, s
     if not trials or not min(trials) < sharp:
         return estimate
     near = math.log(TRIALS_UM[int(np.argmin(trials))])
+    from scipy.optimize import minimize_scalar  # late: it is slow to import
+
     found = minimize_scalar(
         lambda log_um: left(math.exp(log_um)),
         bounds=(near - 1.0, near + 1.0),
