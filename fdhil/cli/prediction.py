@@ -176,11 +176,13 @@ def correct(asked: Asked, method: str | None) -> int:
     from fdhil import correction
     from fdhil.correction.document import correction_document
     from fdhil.prediction.models import load_model_file
-    from fdhil.store.known_gain import known_gain
+    from fdhil.store.known_gain import known_gain, known_largest_um
 
     forewarn("predict", "correct")
-    planned = correction.plan(reference, models, config, method)
-    held_out_um = {} if asked.model_path is None else load_model_file(asked.model_path).held_out_um
+    given = None if asked.model_path is None else load_model_file(asked.model_path)
+    held_out_um, held_out_max_um = ({}, {}) if given is None else (given.held_out_um, given.held_out_max_um)
+    largest_um = known_largest_um(reference.moving_axes, config, asked.from_history, held_out_max_um)
+    planned = correction.plan(reference, models, config, method, largest_um)
     predicted = known_gain(planned, models, config, asked.from_history, held_out_um)
     if asked.out is not None:
         _write(asked.out, _correction_columns(planned))
@@ -229,7 +231,7 @@ def inputs(
     given, source = model_files.nominal_models(config), str(config_path)
     if model_path is not None:
         source = str(model_path)
-        given, loops, _ = model_files.load_model_file(model_path)
+        given, loops, *_ = model_files.load_model_file(model_path)
         _refuse_refuted_loops(config, given.keys() - loops.keys(), source)
         config = model_files.with_loops(config, loops, source)
     elif from_history:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import combinations, pairwise
 
 import numpy as np
+
 from fdhil.records import Bool, Float, Int, Trajectory, Zone
 
 # an error stands out above this share of the largest one, and never below a micrometre

@@ -1,9 +1,9 @@
 """What a correction is predicted to gain, with the uncertainty that the history knows."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from fdhil.config import MachineConfig
-from fdhil.prediction.gain import Gain, gain, worst_skill_um
+from fdhil.prediction.gain import Gain, gain, joint_held_out_um, largest_skill_um, worst_skill_um
 from fdhil.records import Correction, Parameters
 from fdhil.store.history import History
 
@@ -28,3 +28,17 @@ def known_gain(
         skills = {axis: history.skills(axis, limit=RECENT_MOVES) for axis in config.axis}
     covariances = {axis: found[0].set.covariance for axis, found in newest.items() if found}
     return gain(planned, models, config, covariances, worst_skill_um(skills))
+
+
+def known_largest_um(
+    axes: Sequence[str], config: MachineConfig, from_history: bool, held_out_max_um: Mapping[str, float]
+) -> float | None:
+    """Return the largest error (um) of the moving ``axes`` together in moves that the models were not identified on.
+
+    That of the history's last moves, or what is given of models that come from elsewhere; None where an axis has none.
+    """
+    if not from_history:
+        return joint_held_out_um(held_out_max_um, axes)
+    with History.read(config.store.directory) as history:
+        skills = {axis: history.skills(axis, limit=RECENT_MOVES) for axis in axes}
+    return joint_held_out_um(largest_skill_um(skills), axes)
