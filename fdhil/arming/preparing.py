@@ -22,7 +22,7 @@ from fdhil.correction import gate, online
 from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.identification.loops import regulators_of
 from fdhil.model.terms import with_resonance
-from fdhil.prediction.gain import Gain, joint_held_out_um, with_held_out_um, worst_skill_um
+from fdhil.prediction.gain import Gain, joint_held_out_um, largest_skill_um, with_held_out_um, worst_skill_um
 from fdhil.prediction.models import validated_models
 from fdhil.program import program_digest
 from fdhil.records import Parameters, Reason, Skill
@@ -54,8 +54,8 @@ class Armament:
     """A correction ready for the guard: its first rows, the stream of all that passed and will pass, and the facts.
 
     ``begun_um`` is what the rows promised that were checked when it was armed, ``half_um`` half the 95 % interval of
-    the error that is left, and ``left_um`` the RMS that held-out moves show, None: not known. ``first`` finds the first
-    rows anew where the axes stand otherwise.
+    the error that is left, ``left_um`` the RMS that held-out moves show and ``largest_um`` their largest error, None:
+    not known. ``first`` finds the first rows anew where the axes stand otherwise.
     """
 
     program: str
@@ -65,6 +65,7 @@ class Armament:
     begun_um: float
     half_um: float | None = None
     left_um: float | None = None
+    largest_um: float | None = None
     first: FirstBlock | None = None
 
     @property
@@ -101,7 +102,7 @@ class Armament:
             "after": {**checked.errors["after"], "rms_um": predicted.after_um, "uncertainty_um": self.half_um},
             "promise": f"contour error {predicted.before_um:.1f} um RMS is predicted to become {predicted}",
             **self.progress(),
-            "warnings": [str(reason) for reason in checked.warnings],
+            "warnings": [str(reason) for reason in (*checked.warnings, *gate.held_out(self.largest_um))],
             "facts": dict(self.facts),
         }
 
@@ -191,7 +192,8 @@ def prepare_armament(
     stream, gain_um = RowStream(checked, request.program_digest, config.machine.sync_period_s), checked.gain_um
     facts = standing_facts(stream.axes, config, known, gain_um)
     facts |= _commissioned(stream.axes, checked.largest_um, config)
-    left_um = joint_held_out_um(worst_skill_um({axis: found.skills for axis, found in known.items()}), stream.axes)
+    skills = {axis: found.skills for axis, found in known.items()}
+    left_um, largest_um = (joint_held_out_um(of(skills), stream.axes) for of in (worst_skill_um, largest_skill_um))
     half_um = left_um if checked.half_um is None else checked.half_um
     begin, first = stream.take(FIRST_S), None
     if checked.method == "inverse":
@@ -199,7 +201,7 @@ def prepare_armament(
         if (rows := first.expect(rest or {})) is not None:
             first.take(rows)
         begin = first.begin
-    return Armament(str(request.program), stream, begin, facts, gain_um, half_um, left_um, first)
+    return Armament(str(request.program), stream, begin, facts, gain_um, half_um, left_um, largest_um, first)
 
 
 @dataclass(frozen=True, slots=True)

@@ -158,15 +158,16 @@ def _analyse(
     accelerometer: Path | None,
     columns: Path | None,
 ) -> list[FileResult]:
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-
     from fdhil.cli.batch import analyse_files
-    from fdhil.cli.console import PrintableConsole
     from fdhil.store.column_map import read_column_map
 
     told = None if columns is None else read_column_map(columns)
     if not sys.stderr.isatty():
         return list(analyse_files(paths, settings, machine, accelerometer=accelerometer, columns=told))
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    from fdhil.cli.console import PrintableConsole
+
     shown = (TextColumn("identifying"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with Progress(*shown, console=PrintableConsole(stderr=True), transient=True) as progress:
         task = progress.add_task("identifying", total=len(paths))

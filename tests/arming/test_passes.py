@@ -74,7 +74,8 @@ def test_a_pass_is_measured_as_a_prediction_is_whatever_its_pieces(
         assert told["measured"]["max_um"] == pytest.approx(float(error.max()), rel=1e-6)
         if rows is not None:
             assert told["rows"] == rows
-            assert told["measured"]["rms_um"] == pytest.approx(armament.predicted.after_um, rel=1e-6)
+            assert told["measured"]["rms_um"] == pytest.approx(after.rms_um, rel=1e-6)
+            assert armament.predicted.after_um > after.rms_um  # held-out moves are predicted worse
             lag = (after.predicted_mm["X"] - reference.position_mm["X"]) * 1e3
             assert told["following_rms_um"]["X"] == pytest.approx(float(np.sqrt(np.mean(lag**2))), rel=1e-6)
         else:
@@ -127,10 +128,11 @@ async def test_each_pass_is_told_beside_what_was_predicted(
         refused = await shop.arm(program)
     assert (refused["ok"], refused["code"]) == (False, "PromiseBroken"), refused
     first, third, second = shop.desk.passes
-    assert first["measured"]["rms_um"] == pytest.approx(first["predicted"]["rms_um"], rel=1e-3)
+    assert first["measured"]["rms_um"] == pytest.approx(planned.after.rms_um, rel=1e-3)
+    assert first["predicted"]["rms_um"] > first["measured"]["rms_um"]  # held-out moves are predicted worse
     assert second["measured"]["rms_um"] == pytest.approx(second["predicted_without"]["rms_um"], rel=1e-3)
     assert "pass 1 of gentle.ngc: contour error measured" in first["text"]
-    assert first["gain"]["measured"] == pytest.approx(first["gain"]["predicted"], rel=1e-3)
+    assert first["gain"]["measured"] > first["gain"]["predicted"] > 1.0
     assert "ended by StaleData" in third["text"]
     assert any("more than predicted; identify again" in notice.text for notice in shop.told)
     assert any("worse than without; leave it off" in notice.text for notice in shop.told)
