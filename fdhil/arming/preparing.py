@@ -4,7 +4,7 @@ Pure but for reading the program and the commissioning records; what says no is 
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -54,8 +54,8 @@ class Armament:
     """A correction ready for the guard: its first rows, the stream of all that passed and will pass, and the facts.
 
     ``begun_um`` is what the rows promised that were checked when it was armed, ``half_um`` half the 95 % interval of
-    the error that is left, ``left_um`` the RMS that held-out moves show and ``largest_um`` their largest error, None:
-    not known. ``first`` finds the first rows anew where the axes stand otherwise.
+    the error that is left, and ``left_um`` the RMS that held-out moves show, None: not known. ``first`` finds the first
+    rows anew where the axes stand otherwise.
     """
 
     program: str
@@ -65,7 +65,6 @@ class Armament:
     begun_um: float
     half_um: float | None = None
     left_um: float | None = None
-    largest_um: float | None = None
     first: FirstBlock | None = None
 
     @property
@@ -102,7 +101,7 @@ class Armament:
             "after": {**checked.errors["after"], "rms_um": predicted.after_um, "uncertainty_um": self.half_um},
             "promise": f"contour error {predicted.before_um:.1f} um RMS is predicted to become {predicted}",
             **self.progress(),
-            "warnings": [str(reason) for reason in (*checked.warnings, *gate.held_out(self.largest_um))],
+            "warnings": [str(reason) for reason in checked.warnings],
             "facts": dict(self.facts),
         }
 
@@ -127,9 +126,14 @@ def prepare(
     models = {axis: with_resonance(model, config.axis[axis]) for axis, model in found[0].items()}
     digest = program_digest(program)
     ahead = method in (None, "inverse") and _longer_than_ring(program, config, digest)
-    if ahead and (off := gate.writing_off(list(config.axis), config)):
+    if ahead and (off := gate.writing_off(list(config.axis), config) or gate.held_out(largest_um(known, models))):
         return Refused(off)
     return ArmRequest(program, digest, models, found[1], method, ahead)
+
+
+def largest_um(known: Mapping[str, AxisKnowledge], axes: Iterable[str]) -> float | None:
+    """Return the largest error (um) of some axes together in the last moves; None where an axis has none."""
+    return joint_held_out_um(largest_skill_um({axis: known[axis].skills for axis in axes}), tuple(axes))
 
 
 def models_with_loops(
@@ -192,8 +196,7 @@ def prepare_armament(
     stream, gain_um = RowStream(checked, request.program_digest, config.machine.sync_period_s), checked.gain_um
     facts = standing_facts(stream.axes, config, known, gain_um)
     facts |= _commissioned(stream.axes, checked.largest_um, config)
-    skills = {axis: found.skills for axis, found in known.items()}
-    left_um, largest_um = (joint_held_out_um(of(skills), stream.axes) for of in (worst_skill_um, largest_skill_um))
+    left_um = joint_held_out_um(worst_skill_um({axis: found.skills for axis, found in known.items()}), stream.axes)
     half_um = left_um if checked.half_um is None else checked.half_um
     begin, first = stream.take(FIRST_S), None
     if checked.method == "inverse":
@@ -201,7 +204,7 @@ def prepare_armament(
         if (rows := first.expect(rest or {})) is not None:
             first.take(rows)
         begin = first.begin
-    return Armament(str(request.program), stream, begin, facts, gain_um, half_um, left_um, largest_um, first)
+    return Armament(str(request.program), stream, begin, facts, gain_um, half_um, left_um, first)
 
 
 @dataclass(frozen=True, slots=True)

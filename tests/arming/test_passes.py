@@ -13,7 +13,7 @@ import pytest
 
 from fdhil.arming import passes
 from fdhil.arming.passes import Pass
-from fdhil.arming.preparing import Armament
+from fdhil.arming.preparing import Armament, Refused
 from fdhil.config import MachineConfig
 from fdhil.prediction import contour_error_um
 from fdhil.prediction.gain import Gain, joint_held_out_um, plus_minus, worst_skill_um
@@ -149,13 +149,21 @@ def test_a_gain_is_bounded_by_the_parameters_spread_and_by_the_skill(config: Mac
     assert good.half_um > math.hypot(0.5, 0.5)  # the skill of both axes, and the parameters' spread
     assert good.at_least is not None
     assert good.at_least < good.before_um / good.after_um
-    poor = predicted(skills=(Skill("X", 1, 500.0, 900.0, 0.0, 900.0),))
+    poor = predicted(skills=(Skill("X", 1, 500.0, 1.0, 0.0, 900.0),))
     assert poor.half_um is not None
     assert poor.half_um > 500.0
     assert poor.at_least is None
     for unknown in ((), (Skill("X", 1, math.nan, 1.0, 0.0, 900.0),)):
         assert predicted(skills=unknown).half_um is None
     assert "how well it fits this machine is not known" in str(predicted(skills=()))
+
+
+def test_program_is_not_armed_when_the_last_moves_show_errors_that_make_a_position_worse(
+    config: MachineConfig, program: Path
+) -> None:
+    found = whole(program, config, skills=(Skill("X", 1, 0.5, 4.0, 0.0, 24.0),))
+    assert isinstance(found, Refused)
+    assert [reason.code for reason in found.reasons] == ["HarmPredicted"]
 
 
 def test_gain_includes_what_held_out_moves_show_and_is_unknown_where_an_axis_has_none() -> None:
