@@ -13,7 +13,7 @@ from fdhil.arming.preparing import ArmRequest, Refused, largest_um
 from fdhil.arming.program_check import encoded
 from fdhil.config import MachineConfig
 from fdhil.errors import StoreError
-from fdhil.prediction.gain import gain, worst_skill_um
+from fdhil.prediction.gain import gain, moving_axes, worst_skill_um
 from fdhil.program import load_trajectory
 from fdhil.records import Correction, Float, Reason, rms
 
@@ -27,7 +27,7 @@ def plan_whole(request: ArmRequest, known: Mapping[str, AxisKnowledge]) -> Check
     """
     config = request.config
     reference = load_trajectory(request.program, config, request.program_digest)
-    held_out_um = largest_um(known, reference.moving_axes)
+    held_out_um = largest_um(known, moving_axes(reference))
     planned = correction.plan(reference, request.models, config, request.method, held_out_um)
     if planned.refused:
         return Refused(planned.refused)

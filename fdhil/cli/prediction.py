@@ -175,14 +175,15 @@ def correct(asked: Asked, method: str | None) -> int:
     reference, models, config = inputs(asked.program, asked.config_path, asked.model_path, asked.from_history)
     from fdhil import correction
     from fdhil.correction.document import correction_document
+    from fdhil.prediction.gain import joint_held_out_um, largest_skill_um, moving_axes
     from fdhil.prediction.models import load_model_file
-    from fdhil.store.known_gain import known_gain, known_largest_um
+    from fdhil.store.known_gain import known_gain, recent_skills
 
     forewarn("predict", "correct")
     given = None if asked.model_path is None else load_model_file(asked.model_path)
-    held_out_um, held_out_max_um = ({}, {}) if given is None else (given.held_out_um, given.held_out_max_um)
-    largest_um = known_largest_um(reference.moving_axes, config, asked.from_history, held_out_max_um)
-    planned = correction.plan(reference, models, config, method, largest_um)
+    held_out_um, max_um = ({}, {}) if given is None else (given.held_out_um, given.held_out_max_um)
+    max_um = largest_skill_um(recent_skills(config)) if asked.from_history else max_um
+    planned = correction.plan(reference, models, config, method, joint_held_out_um(max_um, moving_axes(reference)))
     predicted = known_gain(planned, models, config, asked.from_history, held_out_um)
     if asked.out is not None:
         _write(asked.out, _correction_columns(planned))

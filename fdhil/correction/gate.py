@@ -16,11 +16,7 @@ NEAR_SHARE = 0.95  # of a current or voltage limit: worth a warning
 LEAST_GAIN = 1.05  # before / after RMS
 NOTHING_UM = 0.05  # an RMS below this is nothing to correct
 WORSE_UM = 1.0  # by how much a zone's largest error may grow
-HELD_OUT_SHARE = 0.43
-"""Of the largest error that held-out moves show, by which a correction makes some position worse.
-
-``python -m studies.zoo``: 0.39 to 0.48 of it, and more where the motor's encoder does not see the table's play.
-"""
+HELD_OUT_SHARE = 0.43  # of the largest error in held-out moves: how much worse a position gets (studies.zoo: 0.39-0.48)
 ZONE_S = 0.1  # errors this near to each other are one zone
 MASK_S, FADE_S = 0.04, 0.06  # what is left alone around a row that gets worse, and how far the fade reaches
 
@@ -103,17 +99,11 @@ def fade(worse: Bool, dt_s: float) -> Float:
 
 
 def held_out(largest_um: float | None) -> tuple[Reason, ...]:
-    """Refuse a correction by a model that errs too much around starts, stops and reversals that it was not fitted to.
-
-    ``largest_um`` is the largest error of the axes together in held-out moves; None: not known, which refuses nothing.
-    A friction that reverses some ms later than predicted makes a position worse that was good.
-    """
+    """Refuse a model whose largest error in held-out moves, at a late reversal mostly, would show in good positions."""
     if largest_um is None or largest_um * HELD_OUT_SHARE <= WORSE_UM:
         return ()
-    text = (
-        f"held-out moves were predicted to {largest_um:.1f} um only: a position that is good now may get worse by "
-        f"{largest_um * HELD_OUT_SHARE:.1f} um, limit {WORSE_UM:g} um"
-    )
+    text = f"held-out moves were predicted to {largest_um:.1f} um only: a position that is good now may get worse by "
+    text += f"{largest_um * HELD_OUT_SHARE:.1f} um, limit {WORSE_UM:g} um"
     advice = "look for play, reversal friction or a resonance that the model lacks, then identify again"
     return (Reason("HarmPredicted", text, advice),)
 

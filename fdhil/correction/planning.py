@@ -12,15 +12,7 @@ from fdhil.correction import gate
 from fdhil.correction.limits import fit_all
 from fdhil.correction.method import Method, Plan
 from fdhil.prediction.predict import predict, predict_corrected
-from fdhil.records import (
-    Correction,
-    Float,
-    Parameters,
-    Prediction,
-    Reason,
-    Trajectory,
-    frozen,
-)
+from fdhil.records import Correction, Float, Parameters, Prediction, Reason, Trajectory, frozen
 
 MASK_PASSES = 3
 
@@ -71,11 +63,7 @@ def _frozen(offsets: Mapping[str, Float]) -> dict[str, Float]:
 
 
 def _mask_harm(
-    reference: Trajectory,
-    models: Mapping[str, Parameters],
-    config: MachineConfig,
-    before: Prediction,
-    wanted: Plan,
+    reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, before: Prediction, wanted: Plan
 ) -> tuple[Mapping[str, Float], Prediction, tuple[Reason, ...]]:
     """Leave alone the zones that would get worse; return the offsets, what they leave, and a warning.
 

@@ -28,7 +28,6 @@ __all__ = [
     "course_answers",
     "gains_of",
     "innovations",
-    "likelihoods",
     "whiten",
 ]
 NOTHING: Float = np.zeros((0, 0))
@@ -75,20 +74,7 @@ def whiten(motion: Motion, thetas: Float, variances: Float) -> tuple[Float, Floa
     return np.column_stack([one.whitened for one in made]), np.array([one.logdet for one in made])
 
 
-def likelihoods(motion: Motion, theta: Float, variances: Float) -> Float:
-    """Return minus twice the log likelihood (q,), but for its constant, for the rows of ``variances`` (q, 3)."""
-    if motion.slow is None:
-        inputs = voltage_v(motion, theta), load_nm(motion, theta)
-        return kalman.likelihoods(theta, variances, Readings.of(motion), *inputs)
-    e, logdet = whiten(motion, np.tile(theta, (len(variances), 1)), variances)
-    found: Float = logdet + np.einsum("mq,mq->q", e, e)
-    return found
-
-
 def _whitened(motion: Motion, thetas: Float, variances: Float, gains: Float) -> tuple[Float, Float]:
-    if len(thetas) == 1:
-        voltages, loads = voltage_v(motion, thetas[0])[None], loads_nm(motion, thetas)
-        return kalman.whiten(thetas, variances, Readings.of(motion), voltages, loads, gains)
     told = thetas[:, DELAY:] if any_voltage(motion) else thetas[:, DELAY, None]
     together = bool((told == told[0]).all())
     voltages = np.array([voltage_v(motion, theta) for theta in (thetas[:1] if together else thetas)])

@@ -221,28 +221,6 @@ def whiten(
 
 
 @compiled
-def likelihoods(theta: Float, variances: Float, readings: Readings, mean_v: Float, load: Float) -> Float:
-    """Return minus twice the log likelihood (q,), but for its constant, for the rows of ``variances`` (q, 3)."""
-    white, none = np.empty((readings.mode.size, 2)), np.zeros((0, 0))
-    found = np.empty(variances.shape[0])
-    for c in range(found.size):
-        total = _whiten_one(theta, variances[c], readings, mean_v, load, white, none)
-        for k in range(white.shape[0]):
-            total += white[k, 0] ** 2 + white[k, 1] ** 2
-        found[c] = total
-    return found
-
-
-@compiled
-def _by_row(values: Float) -> Float:
-    """Return ``values`` (q, n) row after row of the window (n, q)."""
-    turned = np.empty(values.shape[::-1])
-    for c in range(values.shape[0]):
-        turned[:, c] = values[c]
-    return turned
-
-
-@compiled
 def respond(
     theta: Float, readings: Readings, signals: Float, kind: int, courses: Float, rises: Float, gains: Float
 ) -> Float:
@@ -253,8 +231,8 @@ def respond(
     """
     steps, q = interval_steps(theta, readings.dt_s, readings.emf_share), len(courses)
     mode, observed = readings.mode, readings.observed
-    white, course, rise = np.empty((mode.size, 2, q)), _by_row(courses), np.zeros(q)
-    risen = _by_row(rises)
+    white, course, rise = np.empty((mode.size, 2, q)), np.ascontiguousarray(courses.T), np.zeros(q)
+    risen = np.ascontiguousarray(rises.T)
     share = np.zeros(4)
     share[kind], signals[kind] = 1.0, 0.0
     i, w = signals[CURRENT, 0] + share[CURRENT] * course[0], signals[SPEED, 0] + share[SPEED] * course[0]

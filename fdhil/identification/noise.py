@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fdhil.identification.innovations import likelihoods
+from fdhil.identification.innovations import whiten
 from fdhil.identification.motion import Motion, Noise
 from fdhil.records import Float
 
@@ -25,7 +25,9 @@ def fit_noise(motion: Motion, theta: Float, start: Noise) -> Noise:
     x = np.log(start.vector())
 
     def costs(logs: Float) -> Float:
-        values = likelihoods(motion, theta, np.exp(2 * logs))
+        # minus twice the log likelihood (q,), without its constant, for each row of logarithms (q, 3)
+        e, logdet = whiten(motion, np.tile(theta, (len(logs), 1)), np.exp(2 * logs))
+        values = logdet + np.einsum("mq,mq->q", e, e)
         return np.where(np.isfinite(values), values, np.inf)
 
     here = float(costs(x[None])[0])

@@ -14,7 +14,7 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.prediction.uncertainty import contour_std_um
-from fdhil.records import INTERVAL_95, Correction, Float, Parameters, Skill, rms
+from fdhil.records import INTERVAL_95, Correction, Float, Parameters, Skill, Trajectory, rms
 
 MARGIN = 1.5
 """A path turns and starts more often than the rapids that show what a model leaves, and tables deflect behind encoders.
@@ -71,13 +71,18 @@ def gain(
     """
     reference = planned.before.reference
     before_um, after_um = planned.before.rms_um, planned.after.rms_um
-    left_um = joint_held_out_um(held_out_um, reference.moving_axes)
+    left_um = joint_held_out_um(held_out_um, moving_axes(reference))
     if left_um is None:
         return Gain(before_um, after_um, None)
     known = {axis: covariances.get(axis, np.zeros((6, 6))) for axis in reference.axes}
     std_um = rms(contour_std_um(reference, models, known, config, planned.offset_um)) if covariances else 0.0
     predicted_um = after_um if planned.refused else with_held_out_um(after_um, left_um)
     return Gain(before_um, predicted_um, math.hypot(INTERVAL_95 * std_um, left_um))
+
+
+def moving_axes(reference: Trajectory) -> tuple[str, ...]:
+    """Return the axes that change their position."""
+    return tuple(axis for axis, path in reference.position_mm.items() if np.ptp(path) > 0.0)
 
 
 def with_held_out_um(after_um: float, left_um: float | None) -> float:

@@ -38,11 +38,6 @@ class Trajectory:
         return table_axes(self.axes)
 
     @property
-    def moving_axes(self) -> tuple[str, ...]:
-        """The axes that change their position."""
-        return tuple(axis for axis, path in self.position_mm.items() if np.ptp(path) > 0.0)
-
-    @property
     def path_mm(self) -> Float:
         """The path (n, d), a column for each of ``table_axes``."""
         return self.table_mm(self.position_mm)

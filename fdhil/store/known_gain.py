@@ -1,10 +1,10 @@
 """What a correction is predicted to gain, with the uncertainty that the history knows."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from fdhil.config import MachineConfig
-from fdhil.prediction.gain import Gain, gain, joint_held_out_um, largest_skill_um, worst_skill_um
-from fdhil.records import Correction, Parameters
+from fdhil.prediction.gain import Gain, gain, worst_skill_um
+from fdhil.records import Correction, Parameters, Skill
 from fdhil.store.history import History
 
 RECENT_MOVES = 3  # whose skill bounds what a correction can reach
@@ -25,20 +25,11 @@ def known_gain(
         return gain(planned, models, config, {}, held_out_um or {})
     with History.read(config.store.directory) as history:
         newest = {axis: history.revisions(axis, limit=1) for axis in config.axis}
-        skills = {axis: history.skills(axis, limit=RECENT_MOVES) for axis in config.axis}
     covariances = {axis: found[0].set.covariance for axis, found in newest.items() if found}
-    return gain(planned, models, config, covariances, worst_skill_um(skills))
+    return gain(planned, models, config, covariances, worst_skill_um(recent_skills(config)))
 
 
-def known_largest_um(
-    axes: Sequence[str], config: MachineConfig, from_history: bool, held_out_max_um: Mapping[str, float]
-) -> float | None:
-    """Return the largest error (um) of the moving ``axes`` together in moves that the models were not identified on.
-
-    That of the history's last moves, or what is given of models that come from elsewhere; None where an axis has none.
-    """
-    if not from_history:
-        return joint_held_out_um(held_out_max_um, axes)
+def recent_skills(config: MachineConfig) -> dict[str, list[Skill]]:
+    """Return the skills of each axis' last moves. StoreError."""
     with History.read(config.store.directory) as history:
-        skills = {axis: history.skills(axis, limit=RECENT_MOVES) for axis in axes}
-    return joint_held_out_um(largest_skill_um(skills), axes)
+        return {axis: history.skills(axis, limit=RECENT_MOVES) for axis in config.axis}

@@ -47,12 +47,8 @@ def with_presliding(estimate: Estimate, windows: Sequence[Window], axis: Axis, s
     near = math.log(TRIALS_UM[int(np.argmin(trials))])
     from scipy.optimize import minimize_scalar  # late: it is slow to import
 
-    found = minimize_scalar(
-        lambda log_um: left(math.exp(log_um)),
-        bounds=(near - 1.0, near + 1.0),
-        method="bounded",
-        options={"xatol": 0.05},
-    )
+    reach = (near - 1.0, near + 1.0)
+    found = minimize_scalar(lambda log: left(math.exp(log)), bounds=reach, method="bounded", options={"xatol": 0.05})
     best = float(found.fun)
     if sharp - best < max(LEAST_SHARE * sharp, LEAST_UM**2):
         return estimate

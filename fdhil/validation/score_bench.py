@@ -6,7 +6,6 @@ deviations, and the alternative's amplitude in its own unit.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -63,34 +62,6 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
-    """What is tried of a window: the signal of ``kind`` changed by each of ``courses`` (q, n).
-
-    Of the voltage these are its samples (q, m), with ``rises`` (q, m) within them; of the load they act
-    against the positive direction.
-    """
-
-    kind: int
-    courses: Float
-    rises: Float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Tried:
-    """What a trial shows: how the innovations answer (m, q), and of each course statistic and amplitude (q,)."""
-
-    answers: Float
-    statistic: Float
-    amplitude: Float
-
-    @property
-    def best(self) -> tuple[int, float, float, Float]:
-        """Index, statistic, amplitude and (m,) of the course with the largest statistic."""
-        k = int(np.argmax(np.abs(self.statistic)))
-        return k, float(self.statistic[k]), float(self.amplitude[k]), self.answers[:, k]
-
-
-@dataclass(frozen=True, slots=True)
 class Bench:
     """One fitted window on which alternatives are tried: how innovations answer, and what imitates them.
 
@@ -126,14 +97,18 @@ class Bench:
         """Largest K |i| of the window, N.m."""
         return float(abs(self.fit.theta[2]) * np.abs(self.motion.current).max())
 
-    def gains(self, courses: Float) -> dict[str, Trial]:
-        """Return the trials of a gain that grows by each of ``courses`` (q, n), by signal."""
-        motion = self._foretold()
-        at = np.array([motion.at_voltage(c) for c in courses])
-        voltage = Trial(VOLTAGE, motion.voltage_mean * at, motion.voltage_rise * at)
-        return {"voltage": voltage} | {n: Trial(kind, getattr(motion, n) * courses) for n, kind in _KINDS.items()}
+    def load_answers(self, loads: Float) -> Float:
+        """Return minus the change (m, q) of the innovations under each of ``loads`` (q, n), N.m."""
+        return self._answers(LOAD, loads, None)
 
-    def _foretold(self) -> Motion:
+    def gain_answers(self, motion: Motion, name: str, courses: Float) -> Float:
+        """Return minus the change (m, q) of the innovations when the gain of ``name`` grows by ``courses`` (q, n)."""
+        if name == "voltage":
+            at = np.array([motion.at_voltage(c) for c in courses])
+            return self._answers(VOLTAGE, motion.voltage_mean * at, motion.voltage_rise * at)
+        return self._answers(_KINDS[name], getattr(motion, name) * courses, None)
+
+    def foretold(self) -> Motion:
         """Return the motion with each reading as those before it foretell it: a gain acts on what is measured.
 
         A reading holds its own innovation. Of a gain that the parameters imitate, that alone would be left.
@@ -154,37 +129,15 @@ class Bench:
             voltage_mean=motion.voltage_mean - made[2 * motion.n :],
         )
 
-    def offsets(self, name: str, courses: Float) -> Trial:
-        """Return the trial of ``courses`` (q, n) added to signal ``name``."""
+    def offset_answers(self, name: str, courses: Float) -> Float:
+        """Return minus the change (m, q) of the innovations when ``courses`` (q, n) are added to signal ``name``."""
+        motion = self.motion
         if name != "voltage":
-            return Trial(_KINDS[name], courses)
-        at_samples = np.array([self.motion.at_voltage(c) for c in courses])
-        return Trial(VOLTAGE, at_samples, np.zeros_like(at_samples))
-
-    def ask(self, trials: Sequence[Trial]) -> list[Tried]:
-        """Return what each trial shows: all of a kind go through the filter together."""
-        answers: dict[int, Float] = {}
-        for kind in {trial.kind for trial in trials}:
-            its = [trial for trial in trials if trial.kind == kind]
-            rises = np.concatenate([t.rises for t in its if t.rises is not None]) if kind == VOLTAGE else None
-            answers[kind] = self._answers(kind, np.concatenate([t.courses for t in its]), rises)
-        whole, begin = dict.fromkeys(answers, 0), []
-        for trial in trials:
-            begin.append(whole[trial.kind])
-            whole[trial.kind] += len(trial.courses)
-        tested = {kind: self._tested_alone(matrix) for kind, matrix in answers.items()}
-        parts = [(t.kind, slice(b, b + len(t.courses))) for t, b in zip(trials, begin, strict=True)]
-        return [Tried(answers[k][:, at], tested[k][0][at], tested[k][1][at]) for k, at in parts]
-
-    def _tested_alone(self, matrix: Float) -> tuple[Float, Float]:
-        """Return statistic and amplitude (q,) of each column of ``matrix`` (m, q) by itself."""
-        shared = self.imitating.T @ matrix
-        whole = np.einsum("mq,mq->q", matrix, matrix)
-        weight = whole - np.einsum("kq,kq->q", shared, self.inverse @ shared)
-        return self.tested(self.fit.residuals @ matrix - self.held @ shared, weight, whole)
+            return self._answers(_KINDS[name], courses, None)
+        at_samples = np.array([motion.at_voltage(c) for c in courses])
+        return self._answers(VOLTAGE, at_samples, np.zeros_like(at_samples))
 
     def _answers(self, kind: int, courses: Float, rises: Float | None) -> Float:
-        """Return minus the change (m, q) of the innovations when a signal changes by each of ``courses`` (q, n)."""
         motion, theta, gains = self.motion, self.fit.theta, self.fit.problem.filters[0]
         if motion.slow is not None:
             return np.column_stack([self._slow_answer(kind, course) for course in courses])
@@ -207,15 +160,23 @@ class Bench:
         change: Float = self.fit.residuals - innovations(motion, theta, gains, load)
         return change
 
-    def scores(self, directions: Float) -> tuple[Float, Float, Float]:
-        """Return score (q,) and information (q, q) of ``directions`` (m, q) beyond what imitates them, and their Gram.
+    def scores(self, directions: Float) -> tuple[Float, Float]:
+        """Return score (q,) and information (q, q) of ``directions`` (m, q) beyond what imitates them.
 
         What the voltage's course within its samples may give is taken out as far as it is expected, so that what it
         does not give is seen as sharply as ever (generalised least squares).
         """
         shared = self.imitating.T @ directions
-        score, gram = directions.T @ self.fit.residuals - shared.T @ self.held, directions.T @ directions
-        return score, gram - shared.T @ self.inverse @ shared, gram
+        score = directions.T @ self.fit.residuals - shared.T @ self.held
+        return score, directions.T @ directions - shared.T @ self.inverse @ shared
+
+    def best(self, matrix: Float) -> tuple[int, float, float, Float]:
+        """Return index, statistic, amplitude and (m,) of the column of ``matrix`` (m, q) with the largest statistic."""
+        shared, whole = self.imitating.T @ matrix, np.einsum("mq,mq->q", matrix, matrix)
+        weight = whole - np.einsum("kq,kq->q", shared, self.inverse @ shared)
+        statistic, amplitude = self.tested(self.fit.residuals @ matrix - self.held @ shared, weight, whole)
+        k = int(np.argmax(np.abs(statistic)))
+        return k, float(statistic[k]), float(amplitude[k]), matrix[:, k]
 
     def tested(self, score: Float, weight: Float, whole: Float) -> tuple[Float, Float]:
         """Return statistics and amplitudes; 0 where the parameters imitate all but rounding of ``whole``.

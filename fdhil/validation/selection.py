@@ -46,8 +46,8 @@ def lacking(fit: Fit, findings: Sequence[Finding]) -> list[Lacking]:
         return []
     bench = Bench.of(fit)
     directions = np.column_stack([finding.direction for finding in findings])
-    score, information, gram = bench.scores(directions)
-    whole = np.diag(gram)
+    score, information = bench.scores(directions)
+    whole = np.einsum("mq,mq->q", directions, directions)
     taken: list[int] = []
     alike: list[npt.NDArray[np.intp]] = []
     while len(taken) < len(findings):

@@ -7,17 +7,14 @@ Whiteness over lags catches what has no name.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 import numpy.typing as npt
 
 from fdhil.identification.estimators.maximum_likelihood import Fit
-from fdhil.identification.innovations import LOAD
 from fdhil.identification.motion import Motion
 from fdhil.identification.windows import carried
 from fdhil.records import Float
-from fdhil.validation.score_bench import Bench, Finding, Trial, Tried
+from fdhil.validation.score_bench import Bench, Finding
 
 EDGES = 20  # instants at which a load may begin or end, or a gain may step
 LEAST_TORQUE = 0.01  # of the peak torque
@@ -38,27 +35,12 @@ def findings(fit: Fit) -> list[Finding]:
         return []
     edges = np.unique(np.linspace(rows[0], rows[-1] + 1, EDGES + 1).astype(int))
     drift = np.clip((np.arange(bench.motion.n) - edges[0]) / max(1, edges[-1] - edges[0]), 0.0, 1.0)
-    names, units = ("voltage", "current", "speed"), ("V", "A", "rad/s")
-    loads, friction = _steps_and_drift(edges[:-1], drift), _low_speed_loads(bench.motion)
-    offsets = np.vstack([np.ones(bench.motion.n), drift])
-    gains = bench.gains(_steps_and_drift(edges[2:-2:2], drift))
-    lost = _lost_voltages(bench, drift)
-    tried = iter(
-        bench.ask(
-            [
-                *(Trial(LOAD, courses) for courses in (loads, friction)),
-                *(bench.offsets("voltage", loss.course[None]) for loss in lost),
-                *(gains[name] for name in names),
-                *(bench.offsets(name, offsets) for name in names),
-            ]
-        )
-    )
-    found = [_load(bench, edges, drift, next(tried)), _low_speed_friction(bench, friction, next(tried))]
-    found += [loss.found(next(tried)) for loss in lost]
-    found += [_gain(bench, name, edges[2:-2:2], next(tried)) for name in names]
-    found += [_offset(bench, name, unit, next(tried)) for name, unit in zip(names, units, strict=True)]
-    kept = [f for f in found if f.name != WARMING or _warms(f, bench, drift)]
-    return sorted(kept, key=lambda f: -abs(f.statistic))
+    found = [_load(bench, edges, drift), _low_speed_friction(bench), *_of_the_voltage(bench, drift)]
+    gains, foretold = _steps_and_drift(edges[2:-2:2], drift), bench.foretold()
+    for name, unit in (("voltage", "V"), ("current", "A"), ("speed", "rad/s")):
+        tried = bench.best(bench.gain_answers(foretold, name, gains))
+        found += [_gain(bench.motion.dt_s, name, edges[2:-2:2], tried), _offset(bench, name, unit, drift)]
+    return sorted(found, key=lambda f: -abs(f.statistic))
 
 
 def _steps_and_drift(edges: npt.NDArray[np.int_], drift: Float) -> Float:
@@ -66,11 +48,13 @@ def _steps_and_drift(edges: npt.NDArray[np.int_], drift: Float) -> Float:
     return np.vstack([np.arange(drift.size) >= edges[:, None], drift])
 
 
-def _load(bench: Bench, edges: npt.NDArray[np.int_], drift: Float, tried: Tried) -> Finding:
-    """Return the likeliest constant torque between two edges, or one that rises over the move."""
-    motion, matrix = bench.motion, tried.answers
-    score, information, gram = bench.scores(matrix)
-    rising = tried.statistic[-1], tried.amplitude[-1]
+def _load(bench: Bench, edges: npt.NDArray[np.int_], drift: Float) -> Finding:
+    """Try a constant torque between every two edges, and one that rises over the move."""
+    motion = bench.motion
+    matrix = bench.load_answers(_steps_and_drift(edges[:-1], drift))
+    score, information = bench.scores(matrix)
+    gram = matrix.T @ matrix
+    rising = bench.tested(score[-1:], information[-1:, -1], gram[-1:, -1])
     # a load from edge a to edge b is the step at a less the step at b; none begins at the last
     for part in (score, gram, information):
         part[-1] = 0.0
@@ -82,8 +66,8 @@ def _load(bench: Bench, edges: npt.NDArray[np.int_], drift: Float, tried: Tried)
     found = (float(statistic[a, b]), float(amplitude[a, b]))
     rows, direction = np.arange(motion.n), matrix[:, a] - (matrix[:, b] if b < edges.size - 1 else 0.0)
     torque = ((rows >= edges[a]) & (rows < edges[b])).astype(np.float64)
-    if abs(rising[0]) > abs(found[0]):
-        span, found = "rises over the move", (float(rising[0]), float(rising[1]))
+    if abs(rising[0][0]) > abs(found[0]):
+        span, found = "rises over the move", (float(rising[0][0]), float(rising[1][0]))
         torque, direction = drift, matrix[:, -1]
     return Finding(
         "LoadDetected",
@@ -103,11 +87,11 @@ def _apart(gram: Float) -> Float:
     return distances
 
 
-def _gain(bench: Bench, name: str, edges: npt.NDArray[np.int_], tried: Tried) -> Finding:
-    """Return a gain that steps at one of ``edges`` and stays, or one that drifts."""
-    k, statistic, amplitude, direction = tried.best
+def _gain(dt_s: float, name: str, edges: npt.NDArray[np.int_], tried: tuple[int, float, float, Float]) -> Finding:
+    """Return the best of those ``tried``: a gain that steps at one of ``edges`` and stays, or one that drifts."""
+    k, statistic, amplitude, direction = tried
     drifts = k == edges.size
-    at = "over the move" if drifts else f"at {edges[k] * bench.motion.dt_s:.3f} s of the window"
+    at = "over the move" if drifts else f"at {edges[k] * dt_s:.3f} s of the window"
     text = f"the gain of {name} {'drifts' if drifts else 'changes'} by {{:+.2%}} {at}"
     # what is tried is the correction of the signal, so the sensor's own change has the other sign
     return Finding(
@@ -121,34 +105,22 @@ def _gain(bench: Bench, name: str, edges: npt.NDArray[np.int_], tried: Tried) ->
     )
 
 
-def _offset(bench: Bench, name: str, unit: str, tried: Tried) -> Finding:
-    """Return an offset that is there throughout, or one that drifts from nothing on over the move."""
+def _offset(bench: Bench, name: str, unit: str, drift: Float) -> Finding:
+    """Try an offset that is there throughout, and one that drifts from nothing on over the move."""
     motion = bench.motion
     peak = float(np.abs(motion.voltage_mean if name == "voltage" else getattr(motion, name)).max())
-    k, statistic, amplitude, direction = tried.best
+    k, statistic, amplitude, direction = bench.best(bench.offset_answers(name, np.vstack([np.ones(motion.n), drift])))
     text = f"{name} has an offset of {{:+.3g}} {unit}" if k == 0 else f"the zero of {name} drifts by {{:+.3g}} {unit}"
     advice = f"set the zero of the {name} sensor at standstill"
     kind = OFFSET_CURRENT if name == "current" and k == 0 else ""
     return Finding("CalibrationSuspect", text, advice, LEAST_OFFSET * peak, statistic, -amplitude, direction, name=kind)
 
 
-class _LostVoltage(NamedTuple):
-    """A voltage (n,) of which only a part reaches the motor, or is needed there: it is tried as what is missing."""
+def _of_the_voltage(bench: Bench, drift: Float) -> list[Finding]:
+    """Try what else is between the recorded voltage and the winding: dead time, a bus that sags, a winding that warms.
 
-    name: str
-    course: Float
-    words: tuple[str, str]
-    advice: str
-    least: float
-
-    def found(self, tried: Tried) -> Finding:
-        """Return what the trial of the course shows."""
-        _, statistic, amplitude, direction = tried.best
-        return Finding(*self.words, self.advice, self.least, statistic, -amplitude, direction, name=self.name)
-
-
-def _lost_voltages(bench: Bench, drift: Float) -> list[_LostVoltage]:
-    """Return what else is between recorded voltage and winding: dead time, a bus that sags, a winding that warms."""
+    Of these voltages only a part reaches the motor, or is needed there: each is tried as what is missing.
+    """
     motion = bench.motion
     current, volts = carried(motion.current), np.interp(*_places(motion), carried(motion.voltage_mean))
     peak, most = float(np.abs(current).max()), float(np.abs(volts).max())
@@ -177,7 +149,13 @@ def _lost_voltages(bench: Bench, drift: Float) -> list[_LostVoltage]:
         ),
     )
     joined = {course.name for course in motion.courses}
-    return [_LostVoltage(*each) for each in tried if each[0] not in joined]
+    found = []
+    for name, course, (code, text), advice, least in tried:
+        if name not in joined:
+            _, statistic, amplitude, direction = bench.best(bench.offset_answers("voltage", course[None]))
+            finding = Finding(code, text, advice, least, statistic, -amplitude, direction, name=name)
+            found += [finding] if name != WARMING or _warms(finding, bench, drift) else []
+    return found
 
 
 def _warms(finding: Finding, bench: Bench, drift: Float) -> bool:
@@ -194,18 +172,13 @@ def _places(motion: Motion) -> tuple[Float, Float]:
     return rows, motion.at_voltage(rows) if motion.slow is not None else rows
 
 
-def _low_speed_loads(motion: Motion) -> Float:
-    """Return friction (q, n) that rises towards standstill, over several ranges of speed."""
+def _low_speed_friction(bench: Bench) -> Finding:
+    """Try friction that rises towards standstill, over several ranges of speed."""
+    motion = bench.motion
+    top = float(np.abs(motion.speed).max())
     moving = np.where(np.abs(motion.mode) == 1, motion.mode, 0)
-    speeds = float(np.abs(motion.speed).max()) * np.array(STRIBECK_SPEEDS)[:, None]
-    loads: Float = np.exp(-np.square(motion.speed / speeds)) * moving
-    return loads
-
-
-def _low_speed_friction(bench: Bench, loads: Float, tried: Tried) -> Finding:
-    """Return friction that rises towards standstill, over the likeliest of these ranges."""
-    k, statistic, amplitude, direction = tried.best
-    top = float(np.abs(bench.motion.speed).max())
+    loads = np.exp(-np.square(motion.speed / (top * np.array(STRIBECK_SPEEDS)[:, None]))) * moving
+    k, statistic, amplitude, direction = bench.best(bench.load_answers(loads))
     return Finding(
         "ValidationFailed",
         f"friction is {{:+.3g}} N.m higher below {STRIBECK_SPEEDS[k] * top:.3g} rad/s than above (Stribeck)",
