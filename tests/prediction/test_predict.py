@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -121,7 +122,7 @@ def test_contour_error_wants_shapes_that_fit(first: int | None) -> None:
         contour_error_um(np.zeros((4, 2)), np.zeros((3, 2)), 0.001, first)
 
 
-def rapid(**signals: Float) -> Window:
+def rapid(**signals: Any) -> Window:
     """A rapid of the model itself."""
     return replace(nominal_rapid("Y", CONFIG.axis["Y"], 0.001, 1, seed=0), **signals)
 
