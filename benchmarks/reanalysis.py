@@ -19,7 +19,7 @@ from pathlib import Path
 from studies import bench
 
 WINDOWS = 1000
-WANTED_S = 30
+WANTED_S = 8
 NOISE = 0.005
 DISTANCE_M = 0.453
 

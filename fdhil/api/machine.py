@@ -13,8 +13,10 @@ from fdhil.api.compiling import forewarn
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault, StoreError
 from fdhil.prediction import models as model_files
+from fdhil.prediction.gain import joint_held_out_um, largest_skill_um, moving_axes
 from fdhil.program import load_trajectory
 from fdhil.records import Correction, Parameters, Prediction, Trajectory
+from fdhil.store.known_gain import recent_skills
 from fdhil.store.newest_sets import read_newest_sets
 
 HISTORY = "history"
@@ -89,7 +91,18 @@ def correct(
     :func:`plan`.
     """
     forewarn("predict", "correct")
-    return correction.plan(*read_inputs(program, machine, models), method)
+    reference, given, settings = read_inputs(program, machine, models)
+    return correction.plan(reference, given, settings, method, held_out_max_um(reference, settings, models))
+
+
+def held_out_max_um(reference: Trajectory, settings: MachineConfig, models: Models) -> float | None:
+    """Return the largest error (um) that the models left of moves they were not identified on; None: not known."""
+    found: Mapping[str, float] = {}
+    if models == HISTORY:
+        found = largest_skill_um(recent_skills(settings))
+    elif isinstance(models, str | Path):
+        found = model_files.load_model_file(Path(models)).held_out_max_um
+    return joint_held_out_um(found, moving_axes(reference))
 
 
 def read_inputs(

@@ -4,7 +4,7 @@ Pure but for reading the program and the commissioning records; what says no is 
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from fdhil.correction import gate, online
 from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.identification.loops import regulators_of
 from fdhil.model.terms import with_resonance
-from fdhil.prediction.gain import Gain, joint_held_out_um, worst_skill_um
+from fdhil.prediction.gain import Gain, joint_held_out_um, largest_skill_um, with_held_out_um, worst_skill_um
 from fdhil.prediction.models import validated_models
 from fdhil.program import program_digest
 from fdhil.records import Parameters, Reason, Skill
@@ -54,7 +54,8 @@ class Armament:
     """A correction ready for the guard: its first rows, the stream of all that passed and will pass, and the facts.
 
     ``begun_um`` is what the rows promised that were checked when it was armed, ``half_um`` half the 95 % interval of
-    the error that is left, None: not known. ``first`` finds the first rows anew where the axes stand otherwise.
+    the error that is left, and ``left_um`` the RMS that held-out moves show, None: not known. ``first`` finds the first
+    rows anew where the axes stand otherwise.
     """
 
     program: str
@@ -63,6 +64,7 @@ class Armament:
     facts: dict[str, bool]
     begun_um: float
     half_um: float | None = None
+    left_um: float | None = None
     first: FirstBlock | None = None
 
     @property
@@ -72,9 +74,10 @@ class Armament:
 
     @property
     def predicted(self) -> Gain:
-        """What the rows promise that were checked by now."""
+        """The predicted gain of the rows that were checked by now, held-out moves included."""
         errors = self.stream.checked.errors
-        return Gain(errors["before"]["rms_um"], errors["after"]["rms_um"], self.half_um)
+        after_um = with_held_out_um(errors["after"]["rms_um"], self.left_um)
+        return Gain(errors["before"]["rms_um"], after_um, self.half_um)
 
     def standing_facts(self, config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> dict[str, bool]:
         """Return the facts that may be withdrawn while it runs; the gain is the whole's, once that is known."""
@@ -95,7 +98,7 @@ class Armament:
             "rows": checked.rows,
             "streamed": not self.begin.final,
             "before": dict(checked.errors["before"]),
-            "after": {**checked.errors["after"], "uncertainty_um": self.half_um},
+            "after": {**checked.errors["after"], "rms_um": predicted.after_um, "uncertainty_um": self.half_um},
             "promise": f"contour error {predicted.before_um:.1f} um RMS is predicted to become {predicted}",
             **self.progress(),
             "warnings": [str(reason) for reason in checked.warnings],
@@ -123,9 +126,14 @@ def prepare(
     models = {axis: with_resonance(model, config.axis[axis]) for axis, model in found[0].items()}
     digest = program_digest(program)
     ahead = method in (None, "inverse") and _longer_than_ring(program, config, digest)
-    if ahead and (off := gate.writing_off(list(config.axis), config)):
+    if ahead and (off := gate.writing_off(list(config.axis), config) or gate.held_out(largest_um(known, models))):
         return Refused(off)
     return ArmRequest(program, digest, models, found[1], method, ahead)
+
+
+def largest_um(known: Mapping[str, AxisKnowledge], axes: Iterable[str]) -> float | None:
+    """Return the largest error (um) of some axes together in the last moves; None where an axis has none."""
+    return joint_held_out_um(largest_skill_um({axis: known[axis].skills for axis in axes}), tuple(axes))
 
 
 def models_with_loops(
@@ -188,17 +196,15 @@ def prepare_armament(
     stream, gain_um = RowStream(checked, request.program_digest, config.machine.sync_period_s), checked.gain_um
     facts = standing_facts(stream.axes, config, known, gain_um)
     facts |= _commissioned(stream.axes, checked.largest_um, config)
-    half_um = checked.half_um
-    if half_um is None:
-        skills = worst_skill_um({axis: found.skills for axis, found in known.items()})
-        half_um = joint_held_out_um(skills, stream.axes)
+    left_um = joint_held_out_um(worst_skill_um({axis: found.skills for axis, found in known.items()}), stream.axes)
+    half_um = left_um if checked.half_um is None else checked.half_um
     begin, first = stream.take(FIRST_S), None
     if checked.method == "inverse":
         first = FirstBlock(begin, request.program, request.models, request.config, request.program_digest)
         if (rows := first.expect(rest or {})) is not None:
             first.take(rows)
         begin = first.begin
-    return Armament(str(request.program), stream, begin, facts, gain_um, half_um, first)
+    return Armament(str(request.program), stream, begin, facts, gain_um, half_um, left_um, first)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,11 +9,11 @@ import numpy as np
 from fdhil import correction
 from fdhil.arming.checked_program import Block, CheckedProgram
 from fdhil.arming.knowledge import AxisKnowledge
-from fdhil.arming.preparing import ArmRequest, Refused
+from fdhil.arming.preparing import ArmRequest, Refused, largest_um
 from fdhil.arming.program_check import encoded
 from fdhil.config import MachineConfig
 from fdhil.errors import StoreError
-from fdhil.prediction.gain import gain, worst_skill_um
+from fdhil.prediction.gain import gain, moving_axes, worst_skill_um
 from fdhil.program import load_trajectory
 from fdhil.records import Correction, Float, Reason, rms
 
@@ -27,7 +27,8 @@ def plan_whole(request: ArmRequest, known: Mapping[str, AxisKnowledge]) -> Check
     """
     config = request.config
     reference = load_trajectory(request.program, config, request.program_digest)
-    planned = correction.plan(reference, request.models, config, request.method)
+    held_out_um = largest_um(known, moving_axes(reference))
+    planned = correction.plan(reference, request.models, config, request.method, held_out_um)
     if planned.refused:
         return Refused(planned.refused)
     if not any(np.any(offset) for offset in planned.offset_um.values()):

@@ -173,13 +173,15 @@ def correct(asked: Asked, method: str | None) -> int:
     """
     reference, models, config = inputs(asked.program, asked.config_path, asked.model_path, asked.from_history)
     from fdhil import correction
+    from fdhil.api.machine import held_out_max_um
     from fdhil.correction.document import correction_document
     from fdhil.prediction.models import load_model_file
     from fdhil.store.known_gain import known_gain
 
     forewarn("predict", "correct")
-    planned = correction.plan(reference, models, config, method)
     held_out_um = {} if asked.model_path is None else load_model_file(asked.model_path).held_out_um
+    largest_um = held_out_max_um(reference, config, "history" if asked.from_history else asked.model_path)
+    planned = correction.plan(reference, models, config, method, largest_um)
     predicted = known_gain(planned, models, config, asked.from_history, held_out_um)
     if asked.out is not None:
         _write(asked.out, _correction_columns(planned))

@@ -16,6 +16,7 @@ NEAR_SHARE = 0.95  # of a current or voltage limit: worth a warning
 LEAST_GAIN = 1.05  # before / after RMS
 NOTHING_UM = 0.05  # an RMS below this is nothing to correct
 WORSE_UM = 1.0  # by how much a zone's largest error may grow
+HELD_OUT_SHARE = 0.43  # of the largest error in held-out moves: how much worse a position gets (studies.zoo: 0.39-0.48)
 ZONE_S = 0.1  # errors this near to each other are one zone
 MASK_S, FADE_S = 0.04, 0.06  # what is left alone around a row that gets worse, and how far the fade reaches
 
@@ -95,6 +96,16 @@ def fade(worse: Bool, dt_s: float) -> Float:
         return np.ones(worse.size)
     ratio = np.clip((distance_transform_edt(~worse) * dt_s - MASK_S) / FADE_S, 0.0, 1.0)
     return np.asarray(ratio**3 * (10 - 15 * ratio + 6 * ratio**2))
+
+
+def held_out(largest_um: float | None) -> tuple[Reason, ...]:
+    """Refuse a model whose largest error in held-out moves, at a late reversal mostly, would show in good positions."""
+    if largest_um is None or largest_um * HELD_OUT_SHARE <= WORSE_UM:
+        return ()
+    text = f"held-out moves were predicted to {largest_um:.1f} um only: a position that is good now may get worse by "
+    text += f"{largest_um * HELD_OUT_SHARE:.1f} um, limit {WORSE_UM:g} um"
+    advice = "look for play, reversal friction or a resonance that the model lacks, then identify again"
+    return (Reason("HarmPredicted", text, advice),)
 
 
 def gains(then_um: float, now_um: float) -> tuple[Reason, ...]:

@@ -21,6 +21,7 @@ from fdhil.correction.method import Plan
 from fdhil.correction.mirror import allowed_um, too_large
 from fdhil.correction.resting import Resting
 from fdhil.model import closed_loop
+from fdhil.prediction.gain import moving_axes
 from fdhil.records import Float, Parameters, Prediction, Reason, Trajectory
 
 BLOCK_S = 2.0
@@ -56,7 +57,7 @@ def delayed(path: Float, delay_rows: float) -> Float:
 
 def plan(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, _before: Prediction) -> Plan:
     """Return the offsets of the whole reference, block by block."""
-    moving = [axis for axis, path in reference.position_mm.items() if np.ptp(path) > 0.0]
+    moving = moving_axes(reference)
     speeds = {axis: float(np.abs(np.diff(reference.position_mm[axis])).max()) / reference.dt_s for axis in moving}
     tau, refused = common_delay_s(speeds, models, config)
     zero = np.zeros(reference.time_s.size)

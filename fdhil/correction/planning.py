@@ -12,31 +12,28 @@ from fdhil.correction import gate
 from fdhil.correction.limits import fit_all
 from fdhil.correction.method import Method, Plan
 from fdhil.prediction.predict import predict, predict_corrected
-from fdhil.records import (
-    Correction,
-    Float,
-    Parameters,
-    Prediction,
-    Reason,
-    Trajectory,
-    frozen,
-)
+from fdhil.records import Correction, Float, Parameters, Prediction, Reason, Trajectory, frozen
 
 MASK_PASSES = 3
 
 
 def plan(
-    reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, method: str | None = None
+    reference: Trajectory,
+    models: Mapping[str, Parameters],
+    config: MachineConfig,
+    method: str | None = None,
+    held_out_um: float | None = None,
 ) -> Correction:
     """Plan the correction of ``reference``; refusals are values, with all offsets 0 and ``after`` = ``before``.
 
+    ``held_out_um`` is the largest error that the models leave of moves that they were not identified on, if known.
     ConfigError when an axis has no model; KeyError for an unknown method.
     """
     name = method or tables.DEFAULT_CORRECTION
     factory: Method = tables.load(tables.CORRECTIONS, name)
     before = predict(reference, models, config)
     warnings: tuple[Reason, ...] = ()
-    refused = gate.writing_off(reference.axes, config)
+    refused = gate.writing_off(reference.axes, config) or gate.held_out(held_out_um)
     if not refused:
         refused, warnings = gate.demand(reference, models, config, before)
     if not refused:
@@ -66,11 +63,7 @@ def _frozen(offsets: Mapping[str, Float]) -> dict[str, Float]:
 
 
 def _mask_harm(
-    reference: Trajectory,
-    models: Mapping[str, Parameters],
-    config: MachineConfig,
-    before: Prediction,
-    wanted: Plan,
+    reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, before: Prediction, wanted: Plan
 ) -> tuple[Mapping[str, Float], Prediction, tuple[Reason, ...]]:
     """Leave alone the zones that would get worse; return the offsets, what they leave, and a warning.
 

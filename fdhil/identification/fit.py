@@ -55,7 +55,8 @@ class Problem:
     def columns(self, thetas: Float) -> Float:
         """Return the whitened innovations (m, q) for each row of ``thetas`` (q, k)."""
         pairs = zip(self.motions, self.noises, strict=True)
-        return np.concatenate([whiten(m, thetas, np.tile(s.vector() ** 2, (len(thetas), 1)))[0] for m, s in pairs])
+        parts = [whiten(m, thetas, np.tile(s.vector() ** 2, (len(thetas), 1)))[0] for m, s in pairs]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def shape_effect(self, theta: Float) -> Float:
         """Return how the innovations (m,) change with what is not known of the voltage's course within its samples."""

@@ -118,7 +118,7 @@ def answers(
     within = NOTHING if rises is None or not readings.rise_v.size else np.asarray(rises)
     signals = np.zeros((4, motion.n))
     white = kalman.respond(theta, readings, signals, kind, np.asarray(courses), within, gains.gains)
-    return white.reshape(len(courses), -1).T
+    return white.reshape(-1, len(courses))
 
 
 def course_answers(motion: Motion, theta: Float, gains: Gains) -> Float:
@@ -127,4 +127,4 @@ def course_answers(motion: Motion, theta: Float, gains: Gains) -> Float:
     rises, currents = motion.within.rise_v, motion.within.current_a
     readings, signals = Readings.of(motion), np.zeros((4, motion.n))
     white = kalman.respond(theta, readings, signals, VOLTAGE, np.zeros_like(rises), rises, gains.gains)
-    return white.reshape(len(rises), -1).T + answers(motion, theta, gains, CURRENT, currents)
+    return white.reshape(-1, len(rises)) + answers(motion, theta, gains, CURRENT, currents)

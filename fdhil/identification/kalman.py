@@ -221,44 +221,44 @@ def whiten(
 
 
 @compiled
-def _respond_one(steps: Float, readings: Readings, signals: Float, rise_v: Float, gains: Float, white: Float) -> None:
-    """Fill ``white`` (n, 2) with the whitened innovations of ``signals`` (4, n) by the filter of ``gains`` (n, 7)."""
-    mode, observed = readings.mode, readings.observed
-    i, w = signals[CURRENT, 0], signals[SPEED, 0]
-    begin = 0
-    while begin < mode.size and not signals[:, begin].any() and (rise_v.size == 0 or rise_v[begin] == 0.0):
-        begin += 1
-    white[:begin] = 0.0
-    for k in range(begin, mode.size):
-        if not observed[k]:
-            white[k] = 0.0
-        else:
-            e1, e2 = signals[CURRENT, k] - i, signals[SPEED, k] - w
-            white[k, 0] = gains[k, WHITE_I] * e1
-            white[k, 1] = gains[k, WHITE_IW] * e1 + gains[k, WHITE_W] * e2
-            i += gains[k, G_II] * e1 + gains[k, G_IW] * e2
-            w += gains[k, G_WI] * e1 + gains[k, G_WW] * e2
-        if mode[k] != BROKEN:
-            known = 0 if mode[k] == UNKNOWN else 1
-            rise = rise_v[k] if rise_v.size else 0.0
-            i, w = _moved(steps, known, i, w, signals[VOLTAGE, k], signals[LOAD, k], rise)
-
-
-@compiled
 def respond(
     theta: Float, readings: Readings, signals: Float, kind: int, courses: Float, rises: Float, gains: Float
 ) -> Float:
-    """Return the whitened innovations (q, n, 2) by the filter of ``gains`` (n, 7), which are linear in all signals.
+    """Return the whitened innovations (n, 2, q) by the filter of ``gains`` (n, 7), which are linear in all signals.
 
     Of ``signals`` (4, n) that of ``kind`` is each of ``courses`` (q, n), with ``rises`` (q, n) of the voltage within
     the intervals, or none. The load is friction, and what comes on top, against the positive direction.
     """
-    steps = interval_steps(theta, readings.dt_s, readings.emf_share)
-    white = np.empty((courses.shape[0], readings.mode.size, 2))
-    none = np.zeros(0)
-    for c in range(courses.shape[0]):
-        signals[kind] = courses[c]
-        _respond_one(steps, readings, signals, rises[c] if rises.size else none, gains, white[c])
+    steps, q = interval_steps(theta, readings.dt_s, readings.emf_share), len(courses)
+    mode, observed = readings.mode, readings.observed
+    white, course, rise = np.empty((mode.size, 2, q)), np.ascontiguousarray(courses.T), np.zeros(q)
+    risen = np.ascontiguousarray(rises.T)
+    share = np.zeros(4)
+    share[kind], signals[kind] = 1.0, 0.0
+    i, w = signals[CURRENT, 0] + share[CURRENT] * course[0], signals[SPEED, 0] + share[SPEED] * course[0]
+    for k in range(mode.size):
+        gain = gains[k]
+        if not observed[k]:
+            white[k] = 0.0
+        else:
+            for c in range(q):
+                e1 = signals[CURRENT, k] + share[CURRENT] * course[k, c] - i[c]
+                e2 = signals[SPEED, k] + share[SPEED] * course[k, c] - w[c]
+                white[k, 0, c] = gain[WHITE_I] * e1
+                white[k, 1, c] = gain[WHITE_IW] * e1 + gain[WHITE_W] * e2
+                i[c] += gain[G_II] * e1 + gain[G_IW] * e2
+                w[c] += gain[G_WI] * e1 + gain[G_WW] * e2
+        if mode[k] == BROKEN:
+            continue
+        step = steps[0 if mode[k] == UNKNOWN else 1]
+        if risen.size:
+            rise = risen[k]
+        for c in range(q):
+            u = signals[VOLTAGE, k] + share[VOLTAGE] * course[k, c]
+            torque = signals[LOAD, k] + share[LOAD] * course[k, c]
+            was_i, was_w = i[c], w[c]
+            i[c] = step[I_I] * was_i + step[I_W] * was_w + (step[I_U] * u + step[I_T] * torque + step[I_RISE] * rise[c])
+            w[c] = step[W_I] * was_i + step[W_W] * was_w + (step[W_U] * u + step[W_T] * torque + step[W_RISE] * rise[c])
     return white
 
 

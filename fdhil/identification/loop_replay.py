@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import solveh_banded
 
 from fdhil.config import Axis, Regulators
 from fdhil.identification.filtering import all_about, moving_mean
@@ -170,6 +169,8 @@ def smoothed(demand_mm: Float) -> Float:
 
 def _whittaker(values: Float, weight: float) -> Float:
     """Return the course (n,) with the least squared way from ``values`` + ``weight`` x squared third differences."""
+    from scipy.linalg import solveh_banded  # late: loops are rarely sought, and it is slow to import
+
     n, third = values.size, np.array([-1.0, 3.0, -3.0, 1.0])
     bands = np.zeros((PENALISED + 1, n))
     for a in range(PENALISED + 1):

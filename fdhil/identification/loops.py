@@ -100,11 +100,12 @@ def _of_either(problem: Problem, modelled: tuple[Rapid, ...], tolerance_um: floa
     begun = [loop_fit.fit(replace(problem, rapids=tuple(rapids[j] for j in few))) for rapids in kinds]
     if begun[1].deviance < begun[0].deviance:
         kinds, begun = kinds[::-1], begun[::-1]
-    found = _best(begun[0].problem, tolerance_um, configured)
+    found = _best(begun[0], tolerance_um, configured)
     ends = [loop_fit.fit(replace(found.problem, rapids=rapids), found.coordinates) for rapids in kinds]
     if ends[0].deviance <= ends[1].deviance:
         return ends[0]
-    again = _best(replace(begun[1].problem, axis=ends[1].axis(), names=ends[1].problem.names), tolerance_um, configured)
+    other = loop_fit.fit(replace(begun[1].problem, axis=ends[1].axis(), names=ends[1].problem.names))
+    again = _best(other, tolerance_um, configured)
     return loop_fit.fit(replace(again.problem, rapids=kinds[1]), again.coordinates)
 
 
@@ -135,11 +136,11 @@ def _names(regulators: Regulators) -> tuple[str, ...]:
     return (*base, *(n for n in SINGLE if n not in base and getattr(regulators, n) > 0))
 
 
-def _best(problem: Problem, tolerance_um: float, configured: bool) -> Fit:
+def _best(begun: Fit, tolerance_um: float, configured: bool) -> Fit:
     """Return the best fit of all structures; another structure than that of the start must be worth it."""
-    best = _grown(loop_fit.fit(problem), tolerance_um)
+    best = _grown(begun, tolerance_um)
     if configured and best.unexplained_um > tolerance_um:  # the configuration may have led astray
-        best = min(best, _grown(loop_fit.fit(begun_anew(problem)), tolerance_um), key=lambda f: f.unexplained_um)
+        best = min(best, _grown(loop_fit.fit(begun_anew(begun.problem)), tolerance_um), key=lambda f: f.unexplained_um)
     if best.problem.names == CASCADE and beyond_rounding_um(best) < enough_um(tolerance_um):
         return best
     other = _other_structure(best)

@@ -77,7 +77,7 @@ def mended(window: Window, source: SpeedSource = "auto") -> Window:
     return _mended(window, source)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=12)
 def _mended(window: Window, source: SpeedSource) -> Window:
     with np.errstate(over="ignore", invalid="ignore"):  # a signal that no drive has tells no lag
         found = lag_of(window, source)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from fdhil.config import Axis, Identification
 from fdhil.identification.compliance import beside_the_config, compliance, joined
 from fdhil.identification.demand_lead import with_demand_on_time
 from fdhil.identification.estimators import chosen, maximum_likelihood
+from fdhil.identification.fit import Fit
 from fdhil.identification.identifiability import empty_estimate
 from fdhil.identification.signals import mended
 from fdhil.identification.spring import sprung
@@ -29,6 +31,7 @@ SAME_PITCH = 0.01  # to which a recording and the section of its axis agree
 OVERRIDE = 2.0  # by which their rapid speeds may differ: an override slows what is recorded
 NOTICED = 0.2  # of what a model may leave: with less left no resonance is sought
 UNFIT = "NotFinite"
+KEPT_FITS = 12  # of the newest windows: a recording's rapids, or those that tell of a drive's loops
 LAG_ROWS = 0.75  # a speed that is a difference of positions is half a row late
 
 
@@ -124,12 +127,18 @@ def estimated(signals: Evidence) -> Evidence:
         known = {} if axis is None else {"R": axis.nominal.R, "L": axis.nominal.L, "K": axis.nominal.K}
         return replace(signals, estimate=told(window, signals.torque, known))
     name, estimator = chosen(settings)
-    fit = maximum_likelihood.fit_windows([window], settings)
+    fit = _fitted(window, settings)
     if fit is not None and axis is not None:
         fit = maximum_likelihood.with_loops(fit, window, settings, axis, signals.sync_period_s)
     if name == maximum_likelihood.NAME and fit is not None:
         return _with_spring(replace(signals, estimate=maximum_likelihood.finish(fit), fit=fit))
     return replace(signals, estimate=estimator([window], settings), fit=fit)
+
+
+@lru_cache(maxsize=KEPT_FITS)
+def _fitted(window: Window, settings: Identification) -> Fit | None:
+    """Return the fit of a window, which holds for each section of the axis that it is analysed with."""
+    return maximum_likelihood.fit_windows([window], settings)
 
 
 def _with_spring(stiff: Evidence) -> Evidence:

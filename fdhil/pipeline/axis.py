@@ -294,13 +294,7 @@ class AxisPipeline:
         if published is None or not self._with_skill:
             return None
         axis = self._loops.axis or self._config.axis[self.axis]
-        signals = (window.demand_mm, window.position_mm)
-        try:
-            return skill(
-                self.axis, window.start_tick, *signals, published.parameters, axis, self._period_s, window.offset_mm
-            )
-        except ValueError:  # too few whole rows to compare
-            return None
+        return skill(window, published.parameters, axis, self._period_s)
 
 
 def _since_jump(known: Known) -> Sequence[Member]:

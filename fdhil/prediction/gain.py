@@ -14,7 +14,7 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.prediction.uncertainty import contour_std_um
-from fdhil.records import INTERVAL_95, Correction, Float, Parameters, Skill, rms
+from fdhil.records import INTERVAL_95, Correction, Float, Parameters, Skill, Trajectory, rms
 
 MARGIN = 1.5
 """A path turns and starts more often than the rapids that show what a model leaves, and tables deflect behind encoders.
@@ -70,15 +70,24 @@ def gain(
     are per axis; where an axis that moves has no held-out moves the uncertainty is not known.
     """
     reference = planned.before.reference
-    moving = [axis for axis in reference.axes if np.ptp(reference.position_mm[axis]) > 0.0]
     before_um, after_um = planned.before.rms_um, planned.after.rms_um
-    left_um = joint_held_out_um(held_out_um, moving)
+    left_um = joint_held_out_um(held_out_um, moving_axes(reference))
     if left_um is None:
         return Gain(before_um, after_um, None)
     known = {axis: covariances.get(axis, np.zeros((6, 6))) for axis in reference.axes}
     std_um = rms(contour_std_um(reference, models, known, config, planned.offset_um)) if covariances else 0.0
-    promised_um = after_um if planned.refused else math.hypot(after_um, MARGIN * left_um)
-    return Gain(before_um, promised_um, math.hypot(INTERVAL_95 * std_um, left_um))
+    predicted_um = after_um if planned.refused else with_held_out_um(after_um, left_um)
+    return Gain(before_um, predicted_um, math.hypot(INTERVAL_95 * std_um, left_um))
+
+
+def moving_axes(reference: Trajectory) -> tuple[str, ...]:
+    """Return the axes that change their position."""
+    return tuple(axis for axis, path in reference.position_mm.items() if np.ptp(path) > 0.0)
+
+
+def with_held_out_um(after_um: float, left_um: float | None) -> float:
+    """Return the RMS (um) that a correction leaves with what held-out moves show; None: there are none."""
+    return after_um if left_um is None else math.hypot(after_um, MARGIN * left_um)
 
 
 def worst_skill_um(skills: Mapping[str, Sequence[Skill]]) -> dict[str, float]:
@@ -86,8 +95,13 @@ def worst_skill_um(skills: Mapping[str, Sequence[Skill]]) -> dict[str, float]:
     return {axis: float(np.max([skill.rms_um for skill in found])) for axis, found in skills.items() if found}
 
 
+def largest_skill_um(skills: Mapping[str, Sequence[Skill]]) -> dict[str, float]:
+    """Return the largest error (um) that the model left of the last recorded moves, of each axis that has any."""
+    return {axis: float(np.max([skill.max_um for skill in found])) for axis, found in skills.items() if found}
+
+
 def joint_held_out_um(held_out_um: Mapping[str, float], axes: Sequence[str]) -> float | None:
-    """Return the RMS (um) over the axes of what held-out moves show of each; None where an axis has none."""
+    """Return the error (um) in the plane or space of what held-out moves show of each axis; None where one has none."""
     if not axes or not all(axis in held_out_um for axis in axes):
         return None
     um = math.hypot(*(held_out_um[axis] for axis in axes))

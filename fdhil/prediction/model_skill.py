@@ -5,35 +5,27 @@ from __future__ import annotations
 import numpy as np
 
 from fdhil.config import Axis
-from fdhil.records import Float, Int, Parameters, Skill, rms
-from fdhil.validation.replay import replay
+from fdhil.records import Float, Int, Parameters, Skill, Window, rms
+from fdhil.validation.replay import replay_setpoints
 
 LONGEST_DELAY = 8.0  # in SYNC cycles
 
 
-def skill(
-    axis_name: str,
-    tick: int,
-    demand_mm: Float,
-    position_mm: Float,
-    parameters: Parameters,
-    axis: Axis,
-    sync_period_s: float,
-    offset_mm: Float | None = None,
-) -> Skill:
-    """Compare the predicted with the measured following error of a move from rest, rows (n,) on the SYNC grid.
+def skill(window: Window, parameters: Parameters, axis: Axis, sync_period_s: float) -> Skill | None:
+    """Compare the predicted with the measured following error of a recorded move, as held-out moves are in a file.
 
-    ``demand_mm`` is r[k], what the drive follows at row k; lost rows are NaN and not compared. ``delay_ms`` is the
-    shift of the prediction (positive: the drive is later) that explains the difference best. ValueError when fewer
-    than 20 rows can be compared.
+    Lost rows are not compared. ``delay_ms`` is the shift of the prediction (positive: the drive is later) that explains
+    the difference best. None where the rows are not the drive's set-points, or too few can be compared.
     """
-    told = replay(demand_mm, position_mm, parameters, axis, sync_period_s, offset_mm)
+    told = replay_setpoints(window, parameters, axis, sync_period_s)
+    if told is None:
+        return None
     return Skill(
-        axis=axis_name,
-        tick=tick,
+        axis=window.axis,
+        tick=window.start_tick,
         rms_um=rms(told.difference_um),
         max_um=float(np.abs(told.difference_um).max()),
-        delay_ms=_delay(position_mm, told.predicted_mm, told.rows) * sync_period_s * 1e3,
+        delay_ms=_delay(window.position_mm, told.predicted_mm, told.rows) * sync_period_s * 1e3,
         measured_rms_um=told.measured_um,
     )
 

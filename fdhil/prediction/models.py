@@ -44,12 +44,14 @@ Loops = Mapping[str, Mapping[str, float | str]]
 class ModelFile(NamedTuple):
     """The contents of a model file by axis; an axis without a table of loops has none in ``loops``.
 
-    ``held_out_um`` is the RMS in um that the model leaves of moves that it was not identified on, where it is given.
+    ``held_out_um`` is the RMS in um that the model leaves of moves that it was not identified on, and
+    ``held_out_max_um`` the largest error of any of them, where they are given.
     """
 
     parameters: dict[str, Parameters]
     loops: Loops
     held_out_um: Mapping[str, float]
+    held_out_max_um: Mapping[str, float]
 
 
 def nominal_models(config: MachineConfig) -> dict[str, Parameters]:
@@ -83,13 +85,14 @@ def load_model_file(path: Path) -> ModelFile:
     faults: list[ConfigFault] = []
     models = {axis: _parameters(axis[:SHOWN_CHARS], values, faults) for axis, values in document.items()}
     loops = {axis: _table(axis[:SHOWN_CHARS], "loops", values, faults) for axis, values in document.items()}
-    held_out_um = {
-        axis: um for axis, values in document.items() if (um := _held_out_um(axis, values, faults)) is not None
-    }
+    held_out = [
+        {axis: um for axis, values in document.items() if (um := _held_out_um(axis, key, values, faults)) is not None}
+        for key in ("rms_um", "max_um")
+    ]
     if faults:
         raise ConfigError(str(path), faults[:MOST_FAULTS])
     known = {axis: model for axis, model in models.items() if model is not None}
-    return ModelFile(known, {axis: values for axis, values in loops.items() if "loops" in document[axis]}, held_out_um)
+    return ModelFile(known, {axis: values for axis, values in loops.items() if "loops" in document[axis]}, *held_out)
 
 
 def with_loops(config: MachineConfig, loops: Loops, source: str) -> MachineConfig:
@@ -189,14 +192,14 @@ def _table(axis: str, name: str, values: Any, faults: list[ConfigFault]) -> dict
     return table
 
 
-def _held_out_um(axis: str, values: Any, faults: list[ConfigFault]) -> float | None:
-    """Return what a model leaves of moves that it was not identified on, RMS um; None where that is not given."""
-    table = _table(axis[:SHOWN_CHARS], "held_out", values, faults)
-    if not table:
+def _held_out_um(axis: str, key: str, values: Any, faults: list[ConfigFault]) -> float | None:
+    """Return what a model leaves of moves that it was not identified on, um; None where that is not given."""
+    table = _table(axis[:SHOWN_CHARS], "held_out", values, faults if key == "rms_um" else [])
+    if not table or (key != "rms_um" and key not in table):
         return None
-    um = table.get("rms_um")
+    um = table.get(key)
     if isinstance(um, bool) or not isinstance(um, int | float) or not 0.0 <= um <= LARGEST:
-        place = f"{axis[:SHOWN_CHARS]}.held_out.rms_um"
+        place = f"{axis[:SHOWN_CHARS]}.held_out.{key}"
         faults.append(ConfigFault(place, f"must be a finite number of at least 0, not {_shown(um)}", "in um"))
         return None
     return float(um)

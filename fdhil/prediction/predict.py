@@ -66,10 +66,7 @@ def predict_corrected(
 
 
 def _responses(
-    reference: Trajectory,
-    models: Mapping[str, Parameters],
-    config: MachineConfig,
-    *offsets: Mapping[str, Float] | None,
+    reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, *offsets: Mapping[str, Float] | None
 ) -> Mapping[str, Response]:
     check_axes(reference, models, config)
     responses = simulate_axes(models, config.axis, reference.dt_s, reference.position_mm, *offsets)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from itertools import combinations, pairwise
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 from fdhil.records import Bool, Float, Int, Trajectory, Zone
 
@@ -100,6 +99,8 @@ def _corners(velocity: Float, turn_rate: Float, speed: Float, loop_s: float, dt:
     What happens within the loops' time they answer as one, so that the chords of a circle are a circle; and a change
     counts by the acceleration across the path that it makes there, against the largest one around.
     """
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d  # late: identifying needs none
+
     half, around = max(1, round(TOGETHER * loop_s / dt)), round(AFTER * loop_s / dt)
     pace = np.maximum(uniform_filter1d(speed, half), 1e-9)
     rate = uniform_filter1d(turn_rate, half)

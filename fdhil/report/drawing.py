@@ -9,9 +9,9 @@ import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from xml.sax.saxutils import escape, quoteattr
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,8 +60,10 @@ def _inline(text: str, alt: str, data: Mapping[str, Any] | None) -> str:
     mark = f"f{zlib.crc32(body.encode()):08x}"
     body = re.sub(r'id="', f'id="{mark}-', body)
     body = re.sub(r'(xlink:href="#|url\(#)', rf"\g<1>{mark}-", body)
-    told = "" if data is None else f"<metadata>{escape(json.dumps(data, separators=(',', ':')))}</metadata>"
-    words = f' role="img" aria-label={quoteattr(alt)}' if alt else ""
+    told = (
+        "" if data is None else f"<metadata>{escape(json.dumps(data, separators=(',', ':')), quote=False)}</metadata>"
+    )
+    words = f' role="img" aria-label="{escape(alt)}"' if alt else ""
     start, _, rest = body.partition(">")
     return f"{start}{words}>{told}{rest}"
 

@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from html import escape
 from importlib.metadata import version
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
-from xml.sax.saxutils import quoteattr
 
 from fdhil.errors import FdhilError
 from fdhil.report.typography import typeset, typeset_markup
@@ -91,5 +91,5 @@ def _carried(name: str) -> str:
 def _picture(svg: str, caption: str) -> str:
     """Return a picture with its text typeset; one that does not say what it shows says its caption."""
     if "aria-label=" not in svg[:1000]:
-        svg = svg.replace("<svg", f'<svg role="img" aria-label={quoteattr(caption)}', 1)
+        svg = svg.replace("<svg", f'<svg role="img" aria-label="{escape(caption)}"', 1)
     return typeset_markup(svg)

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from fdhil.config import MachineConfig
 from fdhil.prediction.gain import Gain, gain, worst_skill_um
-from fdhil.records import Correction, Parameters
+from fdhil.records import Correction, Parameters, Skill
 from fdhil.store.history import History
 
 RECENT_MOVES = 3  # whose skill bounds what a correction can reach
@@ -25,6 +25,11 @@ def known_gain(
         return gain(planned, models, config, {}, held_out_um or {})
     with History.read(config.store.directory) as history:
         newest = {axis: history.revisions(axis, limit=1) for axis in config.axis}
-        skills = {axis: history.skills(axis, limit=RECENT_MOVES) for axis in config.axis}
     covariances = {axis: found[0].set.covariance for axis, found in newest.items() if found}
-    return gain(planned, models, config, covariances, worst_skill_um(skills))
+    return gain(planned, models, config, covariances, worst_skill_um(recent_skills(config)))
+
+
+def recent_skills(config: MachineConfig) -> dict[str, list[Skill]]:
+    """Return the skills of each axis' last moves. StoreError."""
+    with History.read(config.store.directory) as history:
+        return {axis: history.skills(axis, limit=RECENT_MOVES) for axis in config.axis}

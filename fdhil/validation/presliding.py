@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from fdhil.config import Axis
 from fdhil.records import Estimate, Float, Window, frozen
@@ -46,12 +45,10 @@ def with_presliding(estimate: Estimate, windows: Sequence[Window], axis: Axis, s
     if not trials or not min(trials) < sharp:
         return estimate
     near = math.log(TRIALS_UM[int(np.argmin(trials))])
-    found = minimize_scalar(
-        lambda log_um: left(math.exp(log_um)),
-        bounds=(near - 1.0, near + 1.0),
-        method="bounded",
-        options={"xatol": 0.05},
-    )
+    from scipy.optimize import minimize_scalar  # late: it is slow to import
+
+    reach = (near - 1.0, near + 1.0)
+    found = minimize_scalar(lambda log: left(math.exp(log)), bounds=reach, method="bounded", options={"xatol": 0.05})
     best = float(found.fun)
     if sharp - best < max(LEAST_SHARE * sharp, LEAST_UM**2):
         return estimate

@@ -7,6 +7,7 @@ deviations, and the alternative's amplitude in its own unit.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -100,15 +101,14 @@ class Bench:
         """Return minus the change (m, q) of the innovations under each of ``loads`` (q, n), N.m."""
         return self._answers(LOAD, loads, None)
 
-    def gain_answers(self, name: str, courses: Float) -> Float:
-        """Return minus the change (m, q) of innovations when the gain of ``name`` grows by ``courses`` (q, n)."""
-        motion = self._foretold()
+    def gain_answers(self, motion: Motion, name: str, courses: Float) -> Float:
+        """Return minus the change (m, q) of the innovations when the gain of ``name`` grows by ``courses`` (q, n)."""
         if name == "voltage":
             at = np.array([motion.at_voltage(c) for c in courses])
             return self._answers(VOLTAGE, motion.voltage_mean * at, motion.voltage_rise * at)
         return self._answers(_KINDS[name], getattr(motion, name) * courses, None)
 
-    def _foretold(self) -> Motion:
+    def foretold(self) -> Motion:
         """Return the motion with each reading as those before it foretell it: a gain acts on what is measured.
 
         A reading holds its own innovation. Of a gain that the parameters imitate, that alone would be left.
@@ -172,8 +172,9 @@ class Bench:
 
     def best(self, matrix: Float) -> tuple[int, float, float, Float]:
         """Return index, statistic, amplitude and (m,) of the column of ``matrix`` (m, q) with the largest statistic."""
-        score, information = self.scores(matrix)
-        statistic, amplitude = self.tested(score, np.diag(information), np.einsum("mq,mq->q", matrix, matrix))
+        shared, whole = self.imitating.T @ matrix, np.einsum("mq,mq->q", matrix, matrix)
+        weight = whole - np.einsum("kq,kq->q", shared, self.inverse @ shared)
+        statistic, amplitude = self.tested(self.fit.residuals @ matrix - self.held @ shared, weight, whole)
         k = int(np.argmax(np.abs(statistic)))
         return k, float(statistic[k]), float(amplitude[k]), matrix[:, k]
 
@@ -187,6 +188,7 @@ class Bench:
         return np.where(seen, score / np.sqrt(self.coloured * safe), 0.0), np.where(seen, score / safe, 0.0)
 
 
+@lru_cache(maxsize=2)
 def courses(fit: Fit) -> Float:
     """Return how the innovations (m, c) answer one standard deviation of what is not known between voltage samples.
 
@@ -208,6 +210,7 @@ def courses(fit: Fit) -> Float:
     return np.column_stack([shape, answer])
 
 
+@lru_cache(maxsize=2)
 def expected_correlation(fit: Fit) -> Float:
     """Return the autocorrelation (LAGS,) of the current's innovations that instants of a noisy voltage give.
 

@@ -36,8 +36,10 @@ def findings(fit: Fit) -> list[Finding]:
     edges = np.unique(np.linspace(rows[0], rows[-1] + 1, EDGES + 1).astype(int))
     drift = np.clip((np.arange(bench.motion.n) - edges[0]) / max(1, edges[-1] - edges[0]), 0.0, 1.0)
     found = [_load(bench, edges, drift), _low_speed_friction(bench), *_of_the_voltage(bench, drift)]
+    gains, foretold = _steps_and_drift(edges[2:-2:2], drift), bench.foretold()
     for name, unit in (("voltage", "V"), ("current", "A"), ("speed", "rad/s")):
-        found += [_gain(bench, name, edges[2:-2:2], drift), _offset(bench, name, unit, drift)]
+        tried = bench.best(bench.gain_answers(foretold, name, gains))
+        found += [_gain(bench.motion.dt_s, name, edges[2:-2:2], tried), _offset(bench, name, unit, drift)]
     return sorted(found, key=lambda f: -abs(f.statistic))
 
 
@@ -85,11 +87,11 @@ def _apart(gram: Float) -> Float:
     return distances
 
 
-def _gain(bench: Bench, name: str, edges: npt.NDArray[np.int_], drift: Float) -> Finding:
-    """Try a gain that steps at one of ``edges`` and stays, and one that drifts."""
-    k, statistic, amplitude, direction = bench.best(bench.gain_answers(name, _steps_and_drift(edges, drift)))
+def _gain(dt_s: float, name: str, edges: npt.NDArray[np.int_], tried: tuple[int, float, float, Float]) -> Finding:
+    """Return the best of those ``tried``: a gain that steps at one of ``edges`` and stays, or one that drifts."""
+    k, statistic, amplitude, direction = tried
     drifts = k == edges.size
-    at = "over the move" if drifts else f"at {edges[k] * bench.motion.dt_s:.3f} s of the window"
+    at = "over the move" if drifts else f"at {edges[k] * dt_s:.3f} s of the window"
     text = f"the gain of {name} {'drifts' if drifts else 'changes'} by {{:+.2%}} {at}"
     # what is tried is the correction of the signal, so the sensor's own change has the other sign
     return Finding(

@@ -96,3 +96,13 @@ def test_nothing_to_correct_is_no_gain() -> None:
     """A path at rest needs no offsets."""
     correction = plan(trajectory(np.zeros((200, 2))), MODELS, CONFIG, "mirror")
     assert [reason.code for reason in correction.refused] == ["NoGain"]
+
+
+def test_correction_is_refused_when_held_out_moves_show_errors_that_make_a_position_worse() -> None:
+    """What the model errs by around a reversal it adds where the path was good; small errors refuse nothing."""
+    reference = bench_trajectory(10)
+    refused, accepted = (plan(reference, MODELS, CONFIG, held_out_um=um) for um in (4.0, 1.0))
+    assert [reason.code for reason in refused.refused] == ["HarmPredicted"]
+    assert not any(offset.any() for offset in refused.offset_um.values())
+    assert accepted.refused == ()
+    assert accepted.after.rms_um < accepted.before.rms_um / 5

@@ -37,7 +37,8 @@ def test_reads_what_it_should(tmp_path: Path) -> None:
 
 def test_reads_what_held_out_moves_show(tmp_path: Path) -> None:
     document = {"X": GOOD | {"held_out": {"moves": 4, "rms_um": 0.7, "max_um": 2.0, "following_um": 40.0}}, "Y": GOOD}
-    assert load_model_file(write(tmp_path, json.dumps(document))).held_out_um == {"X": 0.7}
+    found = load_model_file(write(tmp_path, json.dumps(document)))
+    assert (found.held_out_um, found.held_out_max_um) == ({"X": 0.7}, {"X": 2.0})
 
 
 @pytest.mark.parametrize(
@@ -53,6 +54,7 @@ def test_reads_what_held_out_moves_show(tmp_path: Path) -> None:
         ({"J": 0.07}, "did you mean 'Jt'"),
         ({"held_out": {"moves": 4}}, "X.held_out.rms_um: must be a finite number of at least 0, not None"),
         ({"held_out": {"rms_um": -1}}, "X.held_out.rms_um: must be a finite number of at least 0, not -1"),
+        ({"held_out": {"rms_um": 0.7, "max_um": "2"}}, "X.held_out.max_um: must be a finite number of at least 0"),
         ({"held_out": 3}, "X.held_out: must be a table"),
         ({"terms": {"presliding_um": -2}}, "X.terms.presliding_um: must be at least 0"),
         ({"terms": {"loadd": 1.0}}, "X.terms.loadd: is no parameter (did you mean 'load'?)"),

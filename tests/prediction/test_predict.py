@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fdhil.daemon.kernel_warmup import nominal_rapid
 from fdhil.errors import ConfigError
 from fdhil.prediction import contour_error_um, predict, skill
 from fdhil.prediction.models import nominal_models
-from fdhil.records import Float
+from fdhil.records import Float, Skill, Window
 from tests.bench import bench_config
 from tests.paths import bench_trajectory, rms, trajectory
 
@@ -118,30 +122,38 @@ def test_contour_error_wants_shapes_that_fit(first: int | None) -> None:
         contour_error_um(np.zeros((4, 2)), np.zeros((3, 2)), 0.001, first)
 
 
+def rapid(**signals: Any) -> Window:
+    """A rapid of the model itself."""
+    return replace(nominal_rapid("Y", CONFIG.axis["Y"], 0.001, 1, seed=0), **signals)
+
+
+def skill_of(window: Window) -> Skill | None:
+    return skill(window, MODELS["Y"], CONFIG.axis["Y"], 0.001)
+
+
 def test_skill_of_a_perfect_model_is_perfect_and_finds_a_delay() -> None:
-    """The model's own response has no error; the same response two cycles late shows 2 ms."""
-    reference = bench_trajectory(10)
-    response = predict(reference, MODELS, CONFIG)
-    demand, position = reference.position_mm["Y"][:900], response.predicted_mm["Y"][:900]
-    same = skill("Y", 7, demand, position, MODELS["Y"], CONFIG.axis["Y"], 0.001)
-    assert same.rms_um < 1e-6
-    assert same.tick == 7
+    """The model's own response has no error but noise; the same response two cycles late shows 2 ms."""
+    window = rapid()
+    same = skill_of(window)
+    assert same is not None
+    assert same.rms_um < 0.5
+    assert same.tick == window.start_tick
     assert same.measured_rms_um > 20
-    late = np.concatenate([np.repeat(position[:1], 2), position[:-2]])
-    delayed = skill("Y", 7, demand, late, MODELS["Y"], CONFIG.axis["Y"], 0.001)
+    late = np.concatenate([np.repeat(window.position_mm[:1], 2), window.position_mm[:-2]])
+    delayed = skill_of(rapid(position_mm=late))
+    assert delayed is not None
     assert delayed.delay_ms == pytest.approx(2.0, abs=0.1)
     assert delayed.rms_um > 100
 
 
-def test_skill_leaves_out_lost_rows() -> None:
-    """A lost row is not compared and does no harm."""
-    reference = bench_trajectory(10)
-    response = predict(reference, MODELS, CONFIG)
-    demand, position = reference.position_mm["Y"][:900].copy(), response.predicted_mm["Y"][:900].copy()
+def test_skill_leaves_out_lost_rows_and_is_not_known_without_a_position() -> None:
+    window = rapid()
+    demand, position = window.demand_mm.copy(), window.position_mm.copy()
     demand[300:303] = position[300:303] = np.nan
-    assert skill("Y", 0, demand, position, MODELS["Y"], CONFIG.axis["Y"], 0.001).rms_um < 0.5
-    with pytest.raises(ValueError, match="no position"):
-        skill("Y", 0, demand, np.full(900, np.nan), MODELS["Y"], CONFIG.axis["Y"], 0.001)
+    found = skill_of(rapid(demand_mm=demand, position_mm=position))
+    assert found is not None
+    assert found.rms_um < 0.5
+    assert skill_of(rapid(position_mm=np.full(window.n, np.nan))) is None
 
 
 def test_one_axis_alone() -> None:
