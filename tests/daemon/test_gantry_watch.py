@@ -30,6 +30,9 @@ def watch() -> GantryWatch:
 def test_equal_lag_of_both_drives_is_no_skew_and_zeros_may_differ(watch: GantryWatch) -> None:
     watch.feed(samples("Y", 0, 900.0))
     watch.feed(samples("Y2", 0, 880.0, zero_mm=250.0))
+    skewed, notices = watch.look()
+    assert not skewed
+    assert [(notice.code, notice.severity, notice.axis) for notice in notices] == [("GantrySkew", "info", "Y")]
     assert watch.look() == (False, [])
 
 
