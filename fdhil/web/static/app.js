@@ -47,7 +47,7 @@ async function show() {
   markNavigation(path.name);
   say("");
   document.body.classList.toggle("bare", HIDDEN.includes(path.name));
-  document.title = `${[...PAGES].includes(path.name) ? t(`nav.${path.name}`) : path.name} – fdhil`;
+  nameMachine();
   main.setAttribute("aria-busy", "true");
   main.replaceChildren(el("p", {class: "soft"}, t("page.loading")));
   const end = await shown(path, () => mine === turn).catch(failed);
@@ -90,6 +90,13 @@ function markNavigation(name) {
   }
 }
 
+// product and machine, on every page
+function nameMachine() {
+  document.getElementById("machine-name").textContent = named ? ` · ${named}` : "";
+  const name = pathOf(new URL(location.href)).name;
+  document.title = [[...PAGES].includes(name) ? t(`nav.${name}`) : name, named, "fdhil"].filter(Boolean).join(" – ");
+}
+
 // the state of the correction, and the buttons that are always there
 const state = el("span", {class: "state"});
 const disarm = el("button", {type: "button", class: "stop", onclick: disarmNow}, t("disarm"));
@@ -114,8 +121,9 @@ function drawStanding() {
   document.getElementById("standing").replaceChildren(OF_A_MACHINE ? state : "", disarm, login);
 }
 
-let silent = false;
-function drawState({status, fault}) {
+let silent = false, named = "";
+function drawState({told, status, fault}) {
+  if (told && named !== told.machine) { named = told.machine; nameMachine(); }
   if (fault && !silent) say(fault.status === 0 ? fault.text : t("daemon.silent"));
   if (!fault && silent) say(t("daemon.back"));
   silent = Boolean(fault);
@@ -137,6 +145,8 @@ addEventListener("popstate", show);
 let unwatch = null;
 let readable;
 onSession(() => {
+  if (session().role === null) named = "";
+  nameMachine();
   drawStanding();
   unwatch?.();
   unwatch = session().role === null || !OF_A_MACHINE ? null : watch(drawState);

@@ -66,21 +66,22 @@ export async function show(main, path, context) {
   function card({newest, state, until, count: times, numbers, first_time: first, earlier}) {
     const about = t(numbers.length > 1 ? "events.acknowledge.ask.kind" : "events.acknowledge.ask.one", {...newest, count: numbers.length});
     const act = () => askToAcknowledge(about, {notices: numbers}, context).then((done) => done && again());
-    const said = [["events.effect", newest.effect], ["events.next", newest.action]];
-    const from = minute(newest.time);
-    const span = state === "active" ? t("events.since", {from})
-      : until === newest.time ? from : t("events.from.until", {from, until: minute(until)});
+    const active = state === "active", since = minute(newest.time), ended = until ? minute(until) : null;
+    const span = active ? t("events.since", {from: since}) : ended === since ? since : t("events.from.until", {from: since, until: ended});
     const often = times > 1 ? t("events.times", {count: times, first: minute(first)}) : "";
+    const said = el("dl", {class: "said"}, [["events.effect", newest.effect], ["events.next", newest.action]].filter(([, text]) => text)
+      .map(([key, text]) => [el("dt", {}, t(key)), el("dd", {}, sentence(text))]));
+    const list = earlier.length ? el("ul", {}, earlier.map((told) => el("li", {}, `${minute(told.time)} (${told.number}): ${told.text}`))) : null;
+    const more = el("details", {}, el("summary", {}, list ? t("events.earlier", {count: times - 1}) : t("events.more")), active ? null : said, list);
     return el("article", {class: state, "aria-labelledby": `notice-${newest.number}`},
-      el("h3", {id: `notice-${newest.number}`}, noticeText(newest)),
-      el("p", {}, lamp(state === "active" ? {MAJOR: "bad", minor: "warn"}[newest.severity] : "none", t(`events.state.${state}`)), ` ${span}. ${often}`),
-      el("dl", {class: "said"}, said.filter(([, text]) => text).map(([key, text]) => [el("dt", {}, t(key)), el("dd", {}, sentence(text))])),
-      earlier.length ? el("details", {}, el("summary", {}, t("events.earlier", {count: times - 1})),
-        el("ul", {}, earlier.map((told) => el("li", {}, `${minute(told.time)} (${told.number}): ${told.text}`)))) : null,
-      el("p", {class: "soft"}, gravity(newest), ` ${where(newest)}, ${t("events.number")} ${newest.number}. `, classOf(newest), " ", numbers.length ? "" : answered(newest)),
-      numbers.length && session().acting ? el("p", {class: "actions"}, el("button", {
+      el("div", {},
+        el("h3", {id: `notice-${newest.number}`}, noticeText(newest)),
+        el("p", {}, lamp(active ? {MAJOR: "bad", minor: "warn"}[newest.severity] : "none", t(`events.state.${state}`)), ` ${span}. ${often} `,
+          el("span", {class: "soft"}, gravity(newest), ` ${where(newest)}, ${t("events.number")} ${newest.number}. `, classOf(newest), " ", numbers.length ? "" : answered(newest))),
+        active ? said : null, active && !list ? null : more),
+      numbers.length && session().acting ? el("button", {
         type: "button", onclick: act, "aria-label": t("events.acknowledge.one", {...newest, code: classWords(newest.code)}),
-      }, t("events.acknowledge"))) : null);
+      }, t("events.acknowledge")) : null);
   }
 }
 

@@ -28,6 +28,7 @@ export default {
   "events.from.until": "{from} to {until}",
   "events.times": "Raised {count} times since {first}.",
   "events.earlier": "The {count} before it",
+  "events.more": "Effect and next action",
   "events.acknowledge": "Acknowledge",
   "events.acknowledge.one": "Acknowledge notice {number}: {code}",
   "events.acknowledge.all": "Acknowledge all {count}",
