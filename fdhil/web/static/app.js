@@ -3,7 +3,7 @@
 import {el, faultBox, lamp} from "/static/dom.js";
 import {ask, download, get, onLoginNeeded, post, socket} from "/static/ask.js";
 import {logIn, logOut, lookWho, onSession, session} from "/static/session.js";
-import {lookNow, watch} from "/static/status.js";
+import {lookNow, until, watch} from "/static/status.js";
 import {typeset} from "/static/typeset.js";
 import {ago, decimal, number, t, when} from "/static/text.js";
 
@@ -16,7 +16,7 @@ let endPage = null;
 let turn = 0;
 
 // what a page is given beside its place and the parts of its path
-export const context = {ask, get, post, socket, download, watch, lookNow, session, logIn, disarm: disarmNow, go, say, t, ago, decimal, number, when};
+export const context = {ask, get, post, socket, download, watch, lookNow, until, session, logIn, disarm: disarmNow, go, say, t, ago, decimal, number, when};
 
 // tell something: for who listens at once, for who sees for a while
 const SHOWN_MS = 12000;
@@ -105,7 +105,9 @@ const login = el("button", {type: "button", class: "quiet"});
 async function disarmNow() {
   say(t("disarm.asked"));
   try {
-    say(t("disarm.done", await post("/api/machine/disarm")));
+    const answer = await post("/api/machine/disarm");
+    await until((status) => !status.armed);  // what the head shows, and what is said, agree
+    say(t("disarm.done", answer));
   } catch (fault) {
     say(`${fault.code}: ${fault.text}. ${fault.advice}`);
   }
