@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from fdhil.report import typography
+from fdhil.report.drawing import COLOURS, SHADES
 from fdhil.web.app import SHELL, STATIC
 
 SCRIPTS = sorted(STATIC.rglob("*.js"))
@@ -57,3 +58,10 @@ def test_units_are_set_by_the_rule_of_the_reports() -> None:
     table = re.search(r"const PRINTED = \{(.*?)\};", text, re.DOTALL)
     assert table is not None
     assert json.loads("{" + table[1].strip().rstrip(",") + "}") == typography._PRINTED
+
+
+def test_colours_are_those_of_the_reports() -> None:
+    styles = "".join((STATIC / name).read_text("utf-8") for name in ("app.css", "pages/program.css"))
+    for name, colours in (("series", COLOURS), ("shade", SHADES)):
+        light = dict(reversed(re.findall(rf"--{name}-(\d): (#\w+);", styles)))
+        assert tuple(light[key] for key in sorted(light)) == colours

@@ -17,9 +17,9 @@ export async function show(main, path, context) {
   const shown = el("div", {});
   const drop = dropPlace(kept, named, context);
   const running = digest ? el("div", {}) : null;
-  main.append(el("h1", {}, t("program.title")), ...(digest ? [shown, running, drop] : [drop]), await jobs(context), await learning(context));
+  main.append(el("h1", {}, t("program.title")), ...(digest ? [shown, drop] : [drop]), await jobs(context), await learning(context));
   if (!digest) return null;
-  const ends = [follow(shown, digest, path.query, context, (told) => ends.push(onTheMachine(running, told, context)))];
+  const ends = [follow(shown, digest, path.query, context, running, (told) => ends.push(onTheMachine(running, told, context)))];
   return () => ends.forEach((end) => end());
 }
 
@@ -79,7 +79,7 @@ function dropPlace(kept, named, context) {
 }
 
 // asks until the forecast is over, then shows it; returns what ends it
-function follow(shown, digest, query, context, onDone) {
+function follow(shown, digest, query, context, next, onDone) {
   const {t} = context;
   const words = el("span", {});
   const cancel = el("button", {type: "button", onclick: () => context.post(`/api/program/${digest}/cancel`).catch(() => null)}, t("program.cancel"));
@@ -107,7 +107,7 @@ function follow(shown, digest, query, context, onDone) {
   async function conclude(told) {
     if (waiting.isConnected) context.say(t(`program.${told.state}`, told));
     if (told.state === "done") {
-      end = await showForecast(shown, told, query, context);
+      end = await showForecast(shown, told, query, context, next);
       if (!ended) onDone(told);
     }
     else if (told.state === "failed") shown.replaceChildren(el("section", {}, el("h2", {}, told.name), faultBox(told.fault)));

@@ -38,7 +38,7 @@ export default {
   "program.largest": "largest (µm)",
   "program.before": "without correction",
   "program.after": "with the {method} correction",
-  "program.uncertain": "{rms} ± {half}",
+  "program.uncertain": "at most {most} (95 %), {rms} by the model",
   "program.gain": "Predicted smaller by a factor of at least {factor}.",
   "program.gain.model": "By the model alone: how well it fits this machine is not known here.",
   "program.gain.unsure": "That it gets smaller is not sure.",
