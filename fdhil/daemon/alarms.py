@@ -16,13 +16,14 @@ from fdhil.records import Notice
 from fdhil.store.notice_document import acknowledgement_document, date_of
 from fdhil.store.rows import Acknowledgement, Stamp, StoredNotice
 
-CONDITIONS = frozenset(
-    "BusDown BusErrors BusOff BusSilent DiskFull DriveEmergency ErrorPassive FeedHold GantrySkew GuardLost HeartbeatLost "
-    "MaintenanceDue ModbusCrc ModbusException ModbusPortGone ModbusShape ModbusStale ModbusTimeout ModbusUnit "
-    "MovesNotUsed NcSilent NoSamples NodeNeverHeard NotAcknowledged OverrideChanged PdoMissing PitchSuspect "
-    "ReadOnlyStore ResourceHigh ScaleSuspect SerialPortGone SerialShape SerialTimeout SourceLost StoreFault SyncLost "
-    "SyncPeriodSuspect TableSilent".split()
-)
+_LASTING = """
+    BusDown BusErrors BusOff BusSilent DiskFull DriveEmergency ErrorPassive FeedHold GantrySkew GuardLost
+    HeartbeatLost MaintenanceDue ModbusCrc ModbusException ModbusPortGone ModbusShape ModbusStale ModbusTimeout
+    ModbusUnit MovesNotUsed NcSilent NoSamples NodeNeverHeard NotAcknowledged OverrideChanged PdoMissing
+    PitchSuspect ReadOnlyStore ResourceHigh ScaleSuspect SerialPortGone SerialShape SerialTimeout SourceLost
+    StoreFault SyncLost SyncPeriodSuspect TableSilent
+"""
+CONDITIONS = frozenset(_LASTING.split())
 ENDED_BY: Mapping[str, tuple[str, ...]] = {
     "StoreRecovered": ("DiskFull", "ReadOnlyStore", "StoreFault"),
     "GuardFound": ("GuardLost",),

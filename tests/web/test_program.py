@@ -358,7 +358,9 @@ PASS = {
 @pytest.mark.parametrize(("ended_by", "shown"), [("Finished", None), ("SyncLost", "SyncLost")])
 def test_jobs_of_the_history_have_their_predicted_and_measured_errors(ended_by: str, shown: str | None) -> None:
     texts = [passes._text({**PASS, "ended_by": ended_by}), "pass 4 of a: nothing that is known here"]
-    notices = [StoredNotice(k, Notice("PassMeasured", "info", text), Stamp(1.7e9, "boot", k)) for k, text in enumerate(texts)]
+    notices = [
+        StoredNotice(k, Notice("PassMeasured", "info", text), Stamp(1.7e9, "boot", k)) for k, text in enumerate(texts)
+    ]
     (job,) = jobs(notices)
     assert (job["program"], job["pass"], job["ended_by"]) == ("part 1.ngc", 3, shown)
     assert (job["measured_um"], job["max_um"], job["predicted_um"], job["without_um"]) == (0.92, 2.1, 0.6, 41.2)

@@ -42,7 +42,9 @@ def test_each_word_that_is_used_is_written_down_once() -> None:
 
 def sentences(*paths: Path) -> dict[str, set[str]]:
     """Return by key what is filled into each sentence of these files."""
-    found = re.findall(r'^\s*"([\w.()]+)": "(.*)",?$', "\n".join(path.read_text("utf-8") for path in paths), re.MULTILINE)
+    found = re.findall(
+        r'^\s*"([\w.()]+)": "(.*)",?$', "\n".join(path.read_text("utf-8") for path in paths), re.MULTILINE
+    )
     return {key: set(re.findall(r"\{\w+\}", text)) for key, text in found}
 
 

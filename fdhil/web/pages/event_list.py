@@ -50,7 +50,7 @@ class Earlier(BaseModel):
 class Waiting(BaseModel):
     """An alarm that is active or waits: its newest notice, the ``numbers`` of those that wait, what the others said.
 
-    ``until`` is when its cause ended, null while it is active; ``count`` is how often it was raised since ``first_time``.
+    ``until`` is when its cause ended, null while it is active; it was raised ``count`` times since ``first_time``.
     """
 
     newest: Event
@@ -65,7 +65,8 @@ class Waiting(BaseModel):
 class Events(BaseModel):
     """Alarms that are active or wait, the most urgent first; a page of the other notices, newest first.
 
-    The end of an alarm is no notice of its own here, but where severity info is asked for. ``older_before`` asks for the next page, null at the oldest.
+    The end of an alarm is no notice of its own here, but where severity info is asked for. ``older_before`` asks for
+    the next page, null at the oldest.
     """
 
     waiting: list[Waiting]
@@ -96,7 +97,9 @@ def page(notices: Sequence[StoredNotice], *, limit: int, before: int | None = No
     shown = [alarm for alarm in table.shown() if _is(alarm.newest, **only)]
     active = {alarm.newest.number for alarm in shown if alarm.until is None}
     waiting = [stored for stored in notices if stored.is_open and _is(stored, **only)]
-    others = [stored for stored in notices if not stored.is_open and stored.number not in active and _is(stored, **only)]
+    others = [
+        stored for stored in notices if not stored.is_open and stored.number not in active and _is(stored, **only)
+    ]
     older = [stored for stored in others if before is None or stored.number < before]
     newest = older[-limit:][::-1]
     return Events(
