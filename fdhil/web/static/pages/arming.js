@@ -75,11 +75,13 @@ async function choose(context, only) {
   }
 
   // the forecast of the page Program, as it is or made now
-  async function predict({program: {name}, method: chosen}, current) {
+  async function predict({program: {name, sha256}, method: chosen}, current) {
     if (chosen !== FORECAST_METHOD) { predicted.textContent = t("arm.predicted.none"); return; }
     predicted.textContent = t("arm.predicting");
     try {
-      let told = await context.post(`/api/program/named?${new URLSearchParams({name})}`);
+      const {programs} = await context.get("/api/program");
+      let told = programs.some(({digest, state}) => digest === sha256 && state !== "failed" && state !== "cancelled")
+        ? await context.get(`/api/program/${sha256}`) : await context.post(`/api/program/named?${new URLSearchParams({name})}`);
       while (current() && dialog.open && ["waiting", "computing"].includes(told.state)) {
         await new Promise((resolve) => setTimeout(resolve, POLL_MS));
         told = await context.get(`/api/program/${told.digest}`);

@@ -159,7 +159,7 @@ function smallChart(axis, name, {value, low, high, unit, first, change, limit, l
   const half = high === null ? null : (high - value) * factor;
   const [least, most] = first === null ? [null, null] : [first - Math.abs(first) * limit, first + Math.abs(first) * limit];
   const text = half === null ? decimal(value * factor, 3) : `${decimal(value * factor, places(half))} ± ${decimal(half, places(half))}`;
-  const moved = change === null ? t("change.none") : t("machine.of", {change: decimal(change * 100, 1), limit: decimal(limit * 100, 0)});
+  const moved = change === null ? t("change.none") : t("machine.of", {change: signed(change, decimal), limit: decimal(limit * 100, 0)});
   return [el("p", {}, el("strong", {}, name), el("span", {class: "soft"}, ` ${shownUnit}`)), el("p", {}, text),
     band({label: t("machine.band", {axis, name, change: moved}), course, low, high, least, most}),
     el("p", {}, lamp(light, ""), ` ${moved}`, light === "bad" ? `, ${t("change.bad")}` : "")];
@@ -167,7 +167,7 @@ function smallChart(axis, name, {value, low, high, unit, first, change, limit, l
 
 // one decimal beyond the place where half the interval begins
 const places = (half) => (half ? Math.max(0, Math.min(7, 1 - Math.floor(Math.log10(half)))) : 4);
-const signed = (change, decimal) => `${change >= 0.0005 ? "+" : ""}${decimal(change * 100, 1)} %`;
+const signed = (change, decimal) => `${change >= 0.0005 ? "+" : ""}${decimal(change * 100, 1)}`;
 
 function parameterTables(told, only, context) {
   const {t, when} = context;
@@ -190,6 +190,6 @@ function parameterRow(name, {value, low, high, unit, change, limit, light}, {t, 
   const half = high === null ? null : (high - value) * factor, shown = places(half);
   const interval = low === null ? "–" : t("machine.from.to", {low: decimal(low * factor, shown), high: decimal(high * factor, shown)});
   return [name, decimal(value * factor, shown), interval, {text: shownUnit, class: "word"},
-    change === null ? "–" : signed(change, decimal), `±${number(limit * 100, 3)} %`,
+    change === null ? "–" : `${signed(change, decimal)} %`, `±${number(limit * 100, 3)} %`,
     {text: lamp(light, t(`change.${light}`)), class: "word"}];
 }

@@ -57,6 +57,7 @@ function dropPlace(kept, named, context) {
     }
   }
 
+  // forecast again: its parameters may be newer
   async function takeNamed(name) {
     try {
       context.go(`/program/${(await context.post(`/api/program/named?${new URLSearchParams({name})}`)).digest}`);

@@ -49,7 +49,7 @@ export default {
   "machine.details": "Einzelheiten in Tabellen",
   "machine.parameters.axis": "Achse {axis}",
   "machine.band": "{name} der Achse {axis} im Wartungsband: {change}",
-  "machine.of": "{change} von ±{limit} %",
+  "machine.of": "{change} / ±{limit} %",
   "machine.urgent": "Jetzt:",
   "machine.axes": "Achsen",
   "machine.axes.caption": "Die Achsen, wie der Daemon sie sieht",

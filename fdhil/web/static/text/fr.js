@@ -39,7 +39,7 @@ export default {
   "machine.details": "Détails en tableaux",
   "machine.parameters": "Paramètres",
   "machine.parameters.axis": "Axe {axis}",
-  "machine.of": "{change} sur ±{limit} %",
+  "machine.of": "{change} / ±{limit} %",
   "machine.axes": "Axes",
   "machine.axis": "Axe",
   "machine.state": "État",

@@ -14,7 +14,7 @@ export default {
   "machine.details": "Details in tables",
   "machine.parameters.axis": "Axis {axis}",
   "machine.band": "{name} of axis {axis} within its maintenance band: {change}",
-  "machine.of": "{change} of ±{limit} %",
+  "machine.of": "{change} / ±{limit} %",
   "machine.urgent": "Now:",
   "machine.axes": "Axes",
   "machine.axes.caption": "The axes as the daemon sees them",
