@@ -21,7 +21,7 @@ _LASTING = """
     HeartbeatLost MaintenanceDue ModbusCrc ModbusException ModbusPortGone ModbusShape ModbusStale ModbusTimeout
     ModbusUnit MovesNotUsed NcSilent NoSamples NodeNeverHeard NotAcknowledged OverrideChanged PdoMissing
     PitchSuspect ReadOnlyStore ResourceHigh ScaleSuspect SerialPortGone SerialShape SerialTimeout SourceLost
-    StoreFault SyncLost SyncPeriodSuspect TableSilent
+    StoreFault SyncLost SyncPeriodSuspect TableSilent TransceiverFault
 """
 CONDITIONS = frozenset(_LASTING.split())
 ENDED_BY: Mapping[str, tuple[str, ...]] = {
