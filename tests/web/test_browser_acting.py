@@ -99,6 +99,21 @@ def test_a_whole_arm_and_disarm_by_the_keyboard_alone(stage: Stage, tab: Tab) ->
     tab.says("#standing", tab.word("state", state="OFF"))
 
 
+def test_program_is_armed_on_the_page_of_its_forecast(stage: Stage, operator: Tab) -> None:
+    machine, page = "section:has(#program-machine)", operator.page
+    operator.open(f"/program/{stage.forecast(stage.token('operator'))}")
+    operator.says(machine, operator.word("program.machine.not_armed"))
+    stage.settled()
+    page.get_by_role("button", name=operator.word("arm.open")).click()
+    page.get_by_label(operator.word("arm.method"), exact=True).select_option("inverse")
+    operator.says("#arm-predicted", "µm RMS without correction")
+    page.get_by_role("button", name=operator.word("arm.confirm")).click()
+    page.get_by_role("dialog").wait_for(state="detached")
+    operator.says(machine, operator.word("guard.ARMED"))
+    page.get_by_role("button", name=operator.word("disarm"), exact=True).click()
+    operator.says(machine, operator.word("program.machine.not_armed"))
+
+
 def test_what_is_asked_can_be_taken_back(stage: Stage, operator: Tab) -> None:
     operator.open("/machine")
     operator.page.get_by_role("button", name=operator.word("arm.open")).click()

@@ -82,6 +82,7 @@ function drawNavigation() {
   document.getElementById("nav").replaceChildren(el("ul", {}, PAGES.map((name) => el("li", {},
     el("a", {href: `/${name}`}, t(`nav.${name}`))))));
   document.getElementById("skip").textContent = t("skip");
+  document.getElementById("zone").textContent = t("times.zone", {zone: Intl.DateTimeFormat().resolvedOptions().timeZone});
 }
 
 function markNavigation(name) {

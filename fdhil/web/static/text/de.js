@@ -11,6 +11,7 @@ export default {
   "page.missing": "Unter dieser Adresse gibt es keine Seite.",
   "page.failed": "Diese Seite konnte nicht angezeigt werden: {text}",
   "page.loading": "Wird geladen …",
+  "times.zone": "Zeiten in der Zone {zone}",
   "skip": "Zum Inhalt",
   "login": "Anmelden",
   "login.title": "Anmelden",

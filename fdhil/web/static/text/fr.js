@@ -10,6 +10,7 @@ export default {
   "nav.fleet": "Parc",
   "page.missing": "Il n'y a pas de page à cette adresse.",
   "page.loading": "Chargement …",
+  "times.zone": "Heures dans le fuseau {zone}",
   "skip": "Aller au contenu",
   "login": "Se connecter",
   "login.title": "Se connecter",
