@@ -47,7 +47,8 @@ export async function show(main, path, context) {
       fault ? faultBox(fault) : [], told?.status ? el("p", {class: "soft"}, heardText(told.status, context)) : []);
     if (!told) return;
     traces.update(Object.fromEntries(Object.entries(told.axes).filter(([axis]) => only === null || axis === only)));
-    const alarms = fault ? [] : (status?.alarms?.first ?? []).filter(({state}) => state === "active");
+    const listed = (status?.troubles ?? []).map(({code, axis}) => code + axis);
+    const alarms = fault ? [] : (status?.alarms?.first ?? []).filter(({state, code, axis}) => state === "active" && !listed.includes(code + axis));
     draw("needs", [told.next, alarms], needs(told.next, alarms, context));
     const axes = axisRows(told, status, only, context);
     draw("axes", [axes.key, fault?.code], table({
