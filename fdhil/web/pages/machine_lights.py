@@ -123,7 +123,7 @@ def _learning(status: Mapping[str, Any]) -> Iterator[Step]:
     unknown = [axis for axis, told in status["axes"].items() if told["parameters"] is None]
     if unknown and status["source"]["state"] == "listening":
         text = f"The parameters of {', '.join(unknown)} are not identified yet."
-        yield Step(text=text, advice="let the NC make a few rapids (G0) of each, back and forth, over most of the travel")
+        yield Step(text=text, advice="let the NC make a few rapids (G0) of each, both ways, over most of the travel")
 
 
 def _ready(status: Mapping[str, Any], acting: bool) -> Iterator[Step]:
