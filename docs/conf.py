@@ -17,6 +17,9 @@ nitpicky = True
 
 html_theme = "furo"
 html_title = "fdhil"
+html_static_path = ["static"]
+html_js_files = ["copy.js"]
+html_css_files = ["copy.css"]
 
 # pages that stand beside the folder of documents, and where the site has them
 BESIDE = {"README.md": "/index.md", "CHANGELOG.md": "/about/changelog.md", "CONTRIBUTING.md": "/about/contributing.md",

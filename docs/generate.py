@@ -19,6 +19,7 @@ import click
 from fdhil import errors
 from fdhil.cli.main import cli, leaves
 from fdhil.config.template import default, sections, template, toml
+from fdhil.daemon.alarms import CONDITIONS
 from fdhil.daemon.notice_words import WORDS
 from fdhil.guard.core import FEED_HOLD_S, SETTLED_CYCLES
 from fdhil.guard.interlocks import CATALOGUE, EFFECT
@@ -169,14 +170,24 @@ def notice_reference() -> str:
         "# Notices",
         "",
         "Generated from `fdhil/daemon/notice_words.py`. A notice of severity minor or MAJOR waits until somebody",
-        "acknowledges it; its own text tells the cause. What the guard watches has its words in",
-        "[the guard's table](guard.md).",
+        "acknowledges it; its own text tells the cause. Those marked * are conditions: their alarm is active until the",
+        "machine reports the end. What the guard watches has its words in [the guard's table](guard.md), where",
+        ", ".join(f"`{code}`" for code in sorted(CONDITIONS - set(WORDS))) + " are conditions.",
         "",
         "| class | what it means for the machine | what to do |",
         "|---|---|---|",
     ]
     return (
-        "\n".join([*lines, *(f"| `{code}` | {effect} | {action} |" for code, (effect, action) in WORDS.items())]) + "\n"
+        "\n".join(
+            [
+                *lines,
+                *(
+                    f"| `{code}`{'*' * (code in CONDITIONS)} | {effect} | {action} |"
+                    for code, (effect, action) in WORDS.items()
+                ),
+            ]
+        )
+        + "\n"
     )
 
 

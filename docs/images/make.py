@@ -11,12 +11,13 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from matplotlib import colormaps, style
+from matplotlib import style
 from matplotlib.figure import Figure
 from PIL import Image, ImageChops
 
 from fdhil.cli.demo.loop import read_trace
 from fdhil.report import figures, find_browser
+from fdhil.report.maps import error_colours
 from fdhil.report.pdf import run_browser
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -91,7 +92,7 @@ def screenshot(browser: str, folder: Path, page: Path, picture: Path, width: int
     assert used is not None
     cropped = image.crop((0, 0, width, min(SHOWN.get(page.stem, TALLEST), used[3] + 20)))
     often = (cropped.quantize(COLOURS).getpalette() or [])[: 3 * COLOURS]
-    scale = 255 * colormaps["viridis"](np.linspace(0, 1, OF_SCALE))[:, :3]
+    scale = 255 * error_colours()(np.linspace(0, 1, OF_SCALE))[:, :3]
     palette = Image.new("P", (1, 1))
     palette.putpalette([*often, *scale.round().astype(int).ravel().tolist()])
     cropped.quantize(palette=palette, dither=Image.Dither.NONE).save(picture, optimize=True)

@@ -76,6 +76,12 @@ def show(status: Mapping[str, Any], console: Console | None = None) -> None:
     for trouble in status.get("troubles", []):
         where = f"{trouble['axis']}: " if trouble["axis"] else ""
         out.print(f"[red]{escape(where + trouble['code'])}[/red]: {escape(trouble['text'])}")
+    for alarm in _other_alarms(status):
+        where = f"{alarm['axis']}: " if alarm["axis"] else ""
+        often = f", {alarm['count']} times since {alarm['first']}" if alarm["count"] > 1 else ""
+        out.print(
+            f"[red]{escape(where + alarm['code'])}[/red] active since {alarm['since']}{often}: {escape(alarm['text'])}"
+        )
     out.print(_axes_table(status["axes"]))
     for axis, told in status["axes"].items():
         if unused := _unused(told):
@@ -88,6 +94,13 @@ def show(status: Mapping[str, Any], console: Console | None = None) -> None:
         out.print(f"notices that wait to be acknowledged: {waiting['count']}, of them MAJOR {waiting['MAJOR']}")
     for notice in status["notices"][-5:]:
         out.print(escape(_notice_line(notice)))
+
+
+def _other_alarms(status: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the active alarms that are no troubles of the daemon, which are shown on their own."""
+    shown = {(trouble["code"], trouble["axis"]) for trouble in status.get("troubles", [])}
+    alarms = (status.get("alarms") or {}).get("first", [])
+    return [one for one in alarms if one["state"] == "active" and (one["code"], one["axis"]) not in shown]
 
 
 def _notice_line(notice: Mapping[str, Any]) -> str:

@@ -72,6 +72,8 @@ class Acquisition:
         async with self._open_source(self._config) as source:
             self.source = source
             self._hearing.source_opened(asyncio.get_running_loop().time())
+            if self.opened.is_set():
+                self._tell([Notice("SourceLost", "info", "The machine's source is open again.")])
             self.opened.set()
             await source.run(take)
 

@@ -50,12 +50,14 @@ class GantryWatch:
                     del self._waiting[name]
 
     def look(self) -> tuple[bool, Sequence[Notice]]:
-        """Return whether any axis was skewed since the last look, and a notice for each that was not before."""
+        """Return whether any axis was skewed since the last look, and a notice for each whose skew begins or ends."""
         found = {axis: um for axis, um in self._largest_um.items() if um > self._limit_um[axis]}
         new = [axis for axis in found if axis not in self._skewed]
+        over = [Notice("GantrySkew", "info", "the drives agree again", axis) for axis in self._skewed - set(found)]
         self._skewed = set(found)
         self._largest_um = dict.fromkeys(self._limit_um, 0.0)
-        return bool(found), [Notice("GantrySkew", "MAJOR", self._text(axis, found[axis]), axis) for axis in new]
+        begun = [Notice("GantrySkew", "MAJOR", self._text(axis, found[axis]), axis) for axis in new]
+        return bool(found), begun + over
 
     def _text(self, axis: str, um: float) -> str:
         return f"the drives {axis} and {axis}2 are {um:.0f} um apart, {self._limit_um[axis]:g} are allowed"

@@ -160,10 +160,17 @@ class FloodGate:
 
     def admit(self, code: str, now_s: float) -> int | None:
         """Return how many lines of this class were held back before this one, or None to hold this one back too."""
-        tokens, then, held = self._buckets.get(code, (float(BURST), now_s, 0))
-        tokens = min(float(BURST), tokens + (now_s - then) * REFILL_PER_S)
+        tokens, held = self._tokens(code, now_s)
         if tokens < 1.0:
             self._buckets[code] = (tokens, now_s, held + 1)
             return None
         self._buckets[code] = (tokens - 1.0, now_s, 0)
         return held
+
+    def would_admit(self, code: str, now_s: float) -> bool:
+        """Return whether a line of this class would be admitted now."""
+        return self._tokens(code, now_s)[0] >= 1.0
+
+    def _tokens(self, code: str, now_s: float) -> tuple[float, int]:
+        tokens, then, held = self._buckets.get(code, (float(BURST), now_s, 0))
+        return min(float(BURST), tokens + (now_s - then) * REFILL_PER_S), held

@@ -4,7 +4,7 @@ A viewer costs the daemon a line per block of samples, made once for all of them
 viewer has room for so many lines, and what finds none is skipped and told. Nothing waits for a viewer.
 
 The lines: ``begin`` says the period, the axes and the order of the signals; ``samples`` has the first ``tick`` of a
-block, ``ticks`` after it where some are missing, and ``values``, float32 (5, n), NaN where a drive tells no voltage;
+block, ``ticks`` after it where some are missing, and ``values``, float32 (7, n), NaN where a drive tells no voltage;
 ``voltage`` is that of a sensor of its own, by the host's clock, to which ``times`` lays the ticks; ``temperature`` is
 one reading; ``skipped`` counts the lines that this viewer lost; ``alive`` is said when there is nothing else to say.
 """
@@ -23,7 +23,7 @@ from fdhil.config import MachineConfig
 from fdhil.json_lines import encode_line
 from fdhil.records import AxisSamples, Temperature, TickTimes, VoltageSamples
 
-SIGNALS = ("voltage_v", "current_a", "speed_rad_s", "following_error_um", "offset_um")
+SIGNALS = ("voltage_v", "current_a", "speed_rad_s", "following_error_um", "offset_um", "position_mm", "demand_mm")
 MAX_VIEWERS = 4
 MAX_WAITING = 400  # lines of one viewer: five seconds of four axes
 ALIVE_S = 1.0
@@ -129,7 +129,8 @@ async def _set_within(event: asyncio.Event, limit_s: float) -> None:
 def _samples(block: AxisSamples) -> dict[str, Any]:
     voltage = np.full(block.tick.size, np.nan) if block.voltage_v is None else block.voltage_v
     error_um = (block.demand_mm - block.position_mm) * 1e3
-    values = np.stack([voltage, block.current_a, block.speed_rad_s, error_um, block.offset_mm * 1e3])
+    motor = [voltage, block.current_a, block.speed_rad_s]
+    values = np.stack([*motor, error_um, block.offset_mm * 1e3, block.position_mm, block.demand_mm])
     after = block.tick - block.tick[0]
     whole = int(after[-1]) == block.tick.size - 1
     return {

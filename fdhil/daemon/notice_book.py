@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fdhil.arming.answers import refusal
+from fdhil.daemon.alarms import AlarmTable, alarms_status
 from fdhil.daemon.journal import printable
 from fdhil.errors import FdhilError
 from fdhil.records import Notice
@@ -36,11 +37,13 @@ class NoticeBook:
         self._lock = threading.Lock()
         self._known: dict[int, StoredNotice | Acknowledgement] = {}
         self._last: deque[tuple[Notice, int]] = deque(maxlen=LAST_STORED)
+        self._alarms = AlarmTable()
 
     def begin(self, notices: Sequence[StoredNotice]) -> None:
         """Start from what the history has, oldest first."""
         with self._lock:
             self._last.clear()
+            self._alarms = AlarmTable(notices)
             asking = [notice for notice in notices if notice.notice.severity != "info"]
             self._known = {notice.number: notice.acknowledged or notice for notice in asking}
 
@@ -48,10 +51,13 @@ class NoticeBook:
         """Note that a notice was stored."""
         with self._lock:
             self._last.append((notice, number))
+            kept = StoredNotice(number, notice, stamp)
+            self._alarms.take(kept)
             if notice.severity != "info":
-                self._known[number] = StoredNotice(number, notice, stamp)
+                self._known[number] = kept
                 for old in list(self._known)[:-NEWEST]:
                     del self._known[old]
+                    self._alarms.forget(old)
 
     def chosen(self, request: Mapping[str, Any]) -> list[int]:
         """Return the open notices that a request names; NotAcknowledged where it names none that there is."""
@@ -72,6 +78,7 @@ class NoticeBook:
     def acknowledged(self, given: Acknowledgement) -> None:
         """Note that notices were acknowledged."""
         with self._lock:
+            self._alarms.acknowledge(given)
             for number in given.notices:
                 if number in self._known:
                     self._known[number] = given
@@ -94,6 +101,16 @@ class NoticeBook:
             "MAJOR": major,
             "newest": [notice_document(notice) for notice in waiting[-TOLD_OPEN:]],
         }
+
+    def alarms(self) -> dict[str, Any]:
+        """Return the alarms for the status, the most urgent first."""
+        with self._lock:
+            return alarms_status(self._alarms.shown(), TOLD_OPEN)
+
+    def left_active(self) -> list[Notice]:
+        """Return the ends of the conditions that the daemon before this one left."""
+        with self._lock:
+            return self._alarms.left_active()
 
     def _open(self) -> list[StoredNotice]:
         return [known for known in self._known.values() if isinstance(known, StoredNotice)]

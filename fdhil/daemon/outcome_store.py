@@ -107,6 +107,7 @@ class OutcomeStore:
         notices = []
         try:
             notices += self._open()
+            notices += self.notices.left_active()
         except StoreError as error:
             if error.code == "CorruptFile":
                 notices += self._put_aside(error)

@@ -19,7 +19,7 @@ from fdhil.arming.guard_link import TRIPPED, VOIDING
 from fdhil.arming.standing import ADOPT, START_AND_ADOPT, Standing
 from fdhil.commissioning.void import void_record
 from fdhil.config import MachineConfig, unlikely
-from fdhil.daemon import blackbox, heap, journal
+from fdhil.daemon import alarms, blackbox, heap, journal
 from fdhil.daemon.acquisition import Acquisition, OpenSource
 from fdhil.daemon.audited import Audited
 from fdhil.daemon.clock import ClockWatch, newest_record_s
@@ -80,6 +80,7 @@ class Service:
         self._void_axes = asyncio.Queue[str]()  # each once at most: ``_void_by`` has the newest that speaks against it
         self._void_by: dict[str, str] = {}
         self._gate = journal.FloodGate()
+        self._held: dict[alarms.Key, Notice] = {}  # by condition the newest notice, while a flood holds it back
         self._audit = Audited(self._handle, config.store.directory, clock)
         desk, access = self._desk, config.access
         self._control = ControlServer(
@@ -237,9 +238,13 @@ class Service:
                 if notice.axis not in self._void_by:
                     self._void_axes.put_nowait(notice.axis)
                 self._void_by[notice.axis] = notice.text
-        for shown in self._say([self._watch.nc.placed(notice, now_s) for notice in notices]):
-            if isinstance(shown, Notice) and not self._notices.full():
-                self._notices.put_nowait(shown)
+        placed = [self._watch.nc.placed(notice, now_s) for notice in notices]
+        self._held |= {alarms.key_of(notice): notice for notice in placed if notice.code in alarms.CONDITIONS}
+        for shown in self._say(placed):
+            if isinstance(shown, Notice):
+                self._held.pop(alarms.key_of(shown), None)
+                if not self._notices.full():
+                    self._notices.put_nowait(shown)
 
     async def _keep_notices(self) -> None:
         while True:
@@ -265,9 +270,10 @@ class Service:
         """Show outcomes: one log line each (a flood becomes a count), the newest in the status. Return those shown."""
         now_s, shown = self._clock.now_s(), []
         for outcome in outcomes:
-            self._watch.outcome_came(outcome, now_s)
             text, severity = journal.line_of(outcome)
             held = self._gate.admit(outcome.code if isinstance(outcome, Notice) else type(outcome).__name__, now_s)
+            if held is not None or not isinstance(outcome, Notice):
+                self._watch.outcome_came(outcome, now_s)
             if held is not None:
                 shown.append(outcome)
                 journal.write_line(text + (f" ({held} more like this were not written)" if held else ""), severity)
@@ -297,7 +303,8 @@ class Service:
             now_s = self._clock.now_s()
             if self._acquisition.source is not None:
                 self._watch.hearing.counted(self._acquisition.source.counters(), now_s)
-            self._tell(self._watch.troubles(now_s))
+            again = [notice for notice in self._held.values() if self._gate.would_admit(notice.code, now_s)]
+            self._tell([*again, *self._watch.troubles(now_s)])
             skewed, notices = self._gantry.look()
             self._tell(notices)
             if skewed:
@@ -367,6 +374,7 @@ class Service:
             "passes": self._desk.passes,
             "store": store,
             "unacknowledged": self._store.notices.status(),
+            "alarms": self._store.notices.alarms(),
         }
 
 

@@ -18,8 +18,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INK, REFERENCE = "#1d2733", "#9aa5b1"
-# colours that stay apart in print and for colour-blind readers (Okabe and Ito)
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+# the colours of the web pages too (``app.css``, ``program.css``): hues of Okabe and Ito, which stay apart in print and
+# for colour-blind readers, dark enough to be read as text on white; and the shades of an error, from little to much
+COLOURS = ("#0072b2", "#b84f00", "#007a59", "#a3437c", "#8a5c00", "#5b5f97")
+SHADES = ("#a9bccb", "#7fa8c4", "#4f93b5", "#4379a8", "#6b5ba5", "#94407f", "#b3261e", "#6d0b12")
 LEFT, RIGHT, BELOW, ABOVE = 0.8, 0.2, 0.55, 0.35  # margins, inches
 LETTERS_PER_INCH = 15.5  # of a legend
 HANDLE_LETTERS = 8  # what a legend's line takes beside its name

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fdhil.records import Float
-from fdhil.report.drawing import COLOURS, INK, LEGEND_LINE, REFERENCE, drawing, legend_above, legend_rows
+from fdhil.report.drawing import COLOURS, INK, LEGEND_LINE, REFERENCE, SHADES, drawing, legend_above, legend_rows
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
     from matplotlib.collections import LineCollection
-    from matplotlib.colors import Normalize
+    from matplotlib.colors import Colormap, Normalize
     from matplotlib.image import AxesImage
 
 PIECES = 600  # of a coloured path
@@ -47,6 +47,13 @@ class Place:
     name: str
     x_mm: float
     y_mm: float
+
+
+def error_colours() -> Colormap:
+    """Return the colours of an error from little to much, those of the map on the page *Program*."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    return LinearSegmentedColormap.from_list("error", SHADES)
 
 
 def magnified(reference_mm: Float, actual_mm: Float, factor: float) -> Float:
@@ -141,7 +148,7 @@ def error_map(
             drawn: ScalarMappable = _as_points(axes, path_mm, error_um)
         else:
             drawn = _as_lines(axes, path_mm, error_um)
-        drawn.set_cmap("viridis")
+        drawn.set_cmap(error_colours())
         drawn.set_norm(_scale(largest_um, least_um))
         left, bottom, _, tall = axes.get_position().bounds
         axes.set_position((left, bottom, 1 - left - 0.95 / WIDTH, tall))

@@ -121,6 +121,7 @@ function chart(picture, told, number) {
       cursor: { sync: { key: sync.key, setSeries: false }, y: false, drag: { x: true, y: false } },
       hooks: { draw: [drawBeside(told, panel)] },
     }, uPlot.join(panel.traces.map((trace) => [trace.grid, trace.y])), live);
+    panel.traces.forEach((trace, n) => { if (!trace.label) plot.root.querySelectorAll(".u-series")[n + 1].hidden = true; });
     new ResizeObserver(() => plot.setSize({ width: live.clientWidth, height: plot.height })).observe(live);
   });
 }

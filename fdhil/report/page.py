@@ -7,6 +7,8 @@ from html import escape
 from importlib.metadata import version
 from importlib.resources import files
 from importlib.util import find_spec
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 
 from fdhil.errors import FdhilError
@@ -26,13 +28,17 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A titled part of the page: text, tables, then figures as (caption, inline SVG), one a row when ``wide``."""
+    """A titled part of the page: text, tables, then figures as (caption, inline SVG), one a row when ``wide``.
+
+    Sections of one ``chapter`` follow one another under its title.
+    """
 
     title: str
     text: str = ""
     tables: Sequence[Table] = ()
     figures: Sequence[tuple[str, str]] = ()
     wide: bool = False
+    chapter: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,9 +77,12 @@ def html(page: Page, now: datetime | None = None) -> str:
     made_by = f"fdhil {version('fdhil')}"
     written = (now or datetime.now(UTC)).strftime("%Y-%m-%d %H:%M UTC")
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    environment.filters.update(typeset=typeset, picture=_picture)
+    environment.filters.update(typeset=typeset, picture=_picture, anchor=lambda title: title.lower().replace(" ", "-"))
+    numbered = enumerate((section.chapter, section.title) for section in page.sections)
+    chapters = groupby(((chapter, (k + 1, title)) for k, (chapter, title) in numbered), key=itemgetter(0))
     return environment.from_string(_carried("page.html.j2")).render(
         page=page,
+        chapters=[(chapter, [title for _, title in titles]) for chapter, titles in chapters],
         is_word=_is_word,
         made_by=made_by,
         stamp=f"Written {written} by {made_by}",

@@ -11,7 +11,7 @@ def notice_document(stored: StoredNotice) -> dict[str, Any]:
     notice = stored.notice
     return {
         "number": stored.number,
-        "time": _date(stored.stamp),
+        "time": date_of(stored.stamp),
         "axis": notice.axis,
         "code": notice.code,
         "severity": notice.severity,
@@ -22,8 +22,9 @@ def notice_document(stored: StoredNotice) -> dict[str, Any]:
 
 def acknowledgement_document(given: Acknowledgement | None) -> dict[str, Any] | None:
     """Return who acknowledged a notice, when, and what was remarked, as JSON has it; None where nobody did."""
-    return None if given is None else {"who": given.who, "time": _date(given.stamp), "note": given.note}
+    return None if given is None else {"who": given.who, "time": date_of(given.stamp), "note": given.note}
 
 
-def _date(stamp: Stamp) -> str:
+def date_of(stamp: Stamp) -> str:
+    """Return when a row was stored, in UTC as ISO 8601 has it."""
     return datetime.fromtimestamp(stamp.wall_s, UTC).isoformat(timespec="seconds")

@@ -18,6 +18,8 @@ UNITS = {
     "speed_rad_s": "rad/s",
     "following_error_um": "µm",
     "offset_um": "µm",
+    "position_mm": "mm",
+    "demand_mm": "mm",
     "temperature_c": "°C",
 }
 DRAWN = (*SIGNALS, "temperature_c")
@@ -53,7 +55,7 @@ class Ring:
         return max(self._first, self.end - self.capacity)
 
     def put(self, ticks: NDArray[np.int64], values: NDArray[Any]) -> None:
-        """Take rows in: ``ticks`` (n,) that rise, behind all before them, and the daemon's signals (5, n)."""
+        """Take rows in: ``ticks`` (n,) that rise, behind all before them, and the daemon's signals (7, n)."""
         if self._values is None:
             self._values = np.full((len(DRAWN), self.capacity), np.nan, np.float32)
             self._first = self.end = int(ticks[0])

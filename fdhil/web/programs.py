@@ -43,24 +43,33 @@ def listed(folder: Path) -> list[Program]:
 
 def look_at(folder: Path | None, name: str) -> Program:
     """Return a program with its digest (blocking). Refused for a name that is no file of the folder."""
+    with _opened(folder, name, LARGEST) as file:
+        status = os.fstat(file.fileno())
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    assert folder is not None
+    path = str(folder.resolve() / name)
+    return Program(name=name, size_bytes=status.st_size, changed_wall_s=status.st_mtime, sha256=digest, path=path)
+
+
+def content_of(folder: Path | None, name: str, most: int) -> bytes:
+    """Return the bytes of a program (blocking). Refused for a name that is no file of the folder, or a larger file."""
+    with _opened(folder, name, most) as file:
+        return file.read(most)
+
+
+def _opened(folder: Path | None, name: str, most: int) -> BufferedReader:
     if folder is None:
         text = "no folder is named whose programs may be armed from a browser"
         raise Refused(409, "NoPrograms", text, "set web.programs_directory, or use fdhil arm CONFIG PROGRAM")
     if not re.fullmatch(NAME, name):
         raise Refused(422, "BadName", "this is no name of a program", "letters, digits, . _ and -, at most 64")
-    with _opened(folder, name) as file:
-        status = os.fstat(file.fileno())
-        if status.st_size > LARGEST:
-            raise Refused(422, "BadName", f"{name} is no program that can be armed here", "use fdhil arm")
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    path = str(folder.resolve() / name)
-    return Program(name=name, size_bytes=status.st_size, changed_wall_s=status.st_mtime, sha256=digest, path=path)
-
-
-def _opened(folder: Path, name: str) -> BufferedReader:
     try:
-        return open_named(folder, name)
+        file = open_named(folder, name)
     except StoreError as error:
         if error.code == "BadName":
             raise Refused(422, "BadName", f"{name} is no program that can be armed here", "use fdhil arm") from None
         raise Refused(404, "NotFound", f"{name} is not there or cannot be read", "look at the list again") from None
+    if os.fstat(file.fileno()).st_size > most:
+        file.close()
+        raise Refused(422, "BadName", f"{name} is too large to be used from a browser", "use fdhil arm")
+    return file

@@ -304,9 +304,20 @@ def test_status_tells_what_waits_and_who_acknowledged(machine: Path, tmp_path: P
     status = status_of(tmp_path)
     given = {"who": "anna", "time": "2026-11-22T14:00:00+00:00", "note": ""}
     notice = {"age_s": 5.0, **NOTICE, "acknowledged": given}
-    told = status | {"unacknowledged": {"count": 3, "MAJOR": 1, "newest": []}, "notices": [notice]}
+    since = {"since": "2026-11-22T14:00:00+00:00", "until": None, "first": "2026-11-22T13:00:00+00:00"}
+    alarm = {
+        "code": "HeartbeatLost",
+        "axis": "X",
+        "severity": "MAJOR",
+        "text": "no heartbeat",
+        "state": "active",
+        "count": 8,
+    }
+    alarms = {"active": 1, "unacknowledged": 0, "first": [{**alarm, **since}]}
+    told = status | {"unacknowledged": {"count": 3, "MAJOR": 1, "newest": []}, "notices": [notice], "alarms": alarms}
     with answering(machine, told):
         out = fdhil("status", machine, capsys=capsys)[1]
+    assert "X: HeartbeatLost active since 2026-11-22T14:00:00+00:00, 8 times since" in " ".join(out.split())
     assert "notices that wait to be acknowledged: 3, of them MAJOR 1" in out
     assert "41" in out
     assert "(acknowledged by anna)" in " ".join(out.split())

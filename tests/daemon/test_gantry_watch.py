@@ -44,6 +44,9 @@ def test_skew_is_reported_once_and_counts_as_long_as_it_lasts(watch: GantryWatch
         ]
     watch.feed(samples("Y", 150, 20.0))
     watch.feed(samples("Y2", 150, 30.0))
+    skewed, notices = watch.look()
+    assert not skewed
+    assert [(notice.code, notice.severity, notice.axis) for notice in notices] == [("GantrySkew", "info", "Y")]
     assert watch.look() == (False, [])
 
 

@@ -67,7 +67,7 @@ async def line_of(reader: asyncio.StreamReader, kind: str) -> Line:
 
 
 def values_of(line: Line) -> Any:
-    """Return the signals (5, n) of a block."""
+    """Return the signals (7, n) of a block."""
     return unpacked(line["values"], "<f4").reshape(len(SIGNALS), -1)
 
 
@@ -107,7 +107,7 @@ async def test_signals_units_gaps_and_sensors_of_their_own(tmp_path: Path) -> No
         voltage = await line_of(reader, "voltage")
         writer.close()
     assert unpacked(whole["ticks"], "<i4").tolist() == [0, 1, 3]
-    np.testing.assert_allclose(values_of(whole)[:, 1], [101, 202, 303, 404, 505])
+    np.testing.assert_allclose(values_of(whole)[:, 1], [101, 202, 303, 404, 505, 0, 0.404], rtol=1e-6)
     assert "ticks" not in single
     assert np.isnan(values_of(single)[0, 0])
     assert unpacked(voltage["t_ns"], "<i8").tolist() == [5, 6]

@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 import fdhil
+from fdhil.daemon.alarms import CONDITIONS
 from fdhil.daemon.notice_words import WORDS, words_of
+from fdhil.drivers.can import error_frames
 from fdhil.guard.interlocks import CATALOGUE, EFFECT, Alarm, Reaction
 from fdhil.records import Notice
 
@@ -55,3 +57,15 @@ def test_no_class_has_words_in_two_places() -> None:
 
 def test_a_class_that_is_not_known_is_left_to_its_text() -> None:
     assert words_of(Notice("Unheard", "minor", "why")) == ("", "")
+
+
+NEWS = {"Armed", "BlackBox", "CoarseStamps", "PassMeasured", "StoreRecovered"}
+ENDED = re.compile(r'Notice\(\s*"([^"]*)",\s*"info"')
+
+
+def test_classes_whose_end_is_reported_are_conditions() -> None:
+    texts = [path.read_text("utf-8") for path in Path(fdhil.__file__).parent.rglob("*.py")]
+    ended = {code for text in texts for code in ENDED.findall(text)} | set(error_frames._RECOVERED)
+    assert len(ended) > len(NEWS)
+    assert ended - NEWS <= CONDITIONS
+    assert {*WORDS, *CATALOGUE, "ReadOnlyStore"} >= CONDITIONS

@@ -11,7 +11,7 @@ import pytest
 
 from fdhil.errors import FdhilError
 from fdhil.records import Parameters, Stages, Window, frozen
-from fdhil.report import Page, Section, Table, figures, write
+from fdhil.report import Page, Section, Table, figures, html, write
 
 PARAMETERS = Parameters(R=0.5, L=0.005, K=0.8, Jt=0.075, ft=0.05, Cd=5.0)
 
@@ -87,6 +87,15 @@ def test_the_page_needs_nothing_from_elsewhere(tmp_path: Path) -> None:
     assert re.findall(r"<script[^>]", text) == []  # none with an address
     assert "default-src 'none'" in text  # and the browser is told to load nothing
     assert not list(tmp_path.rglob("*.part"))
+
+
+def test_long_page_has_contents_whose_links_lead_to_its_chapters_and_sections() -> None:
+    chapters = ("", "Section 2 of it", "Section 2 of it", "Section 3 of it")
+    text = html(Page("long", "", sections=[Section(f"part {k}", chapter=name) for k, name in enumerate(chapters)]))
+    linked = re.findall(r'href="#([\w-]+)"', text)
+    assert linked == ["section-1", "section-2-of-it", "section-2", "section-3", "section-3-of-it", "section-4"]
+    assert [text.count(f'id="{name}"') for name in linked] == [1] * len(linked)
+    assert 'aria-label="Contents"' not in html(Page("short", "", sections=[Section("only one")]))
 
 
 def test_a_page_that_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:

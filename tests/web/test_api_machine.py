@@ -111,8 +111,8 @@ async def test_half_a_character_and_a_number_that_is_none_end_no_answer(tmp_path
         ({"samples_s_ago": None}, [], "none", "no samples came yet"),
         ({"samples_s_ago": 9.0}, [], "none", "no samples for 9 s"),
         ({"parameters": None}, [], "none", "let the NC make a few rapids"),
-        ({"parameters": None, "refused_by": {"A": 1, "B": 2}}, [], "none", "2 rapids were not believed because of B"),
-        ({"last_window": {"accepted": False, "reasons": ["Low: no"]}}, [], "warn", "was not believed: Low: no"),
+        ({"parameters": None, "refused_by": {"A": 1, "B": 2}}, [], "none", "2 rapids were refused because of B"),
+        ({"last_window": {"accepted": False, "reasons": ["Low: no"]}}, [], "warn", "was refused: Low: no"),
         ({"warnings": ["W: w"]}, [], "warn", "W: w"),
     ],
 )
@@ -144,6 +144,7 @@ def _lost() -> Iterator[tuple[dict[str, Any], str, bool]]:
     yield {"troubles": [{"axis": "X", "code": "C", "text": "what; then do"}]}, "then do", False
     yield {"axes": {"X": CALM | {"parameters": None}}}, "a few rapids (G0)", False
     yield {"unacknowledged": {"count": 2, "MAJOR": 1}}, "see the page Events", False
+    yield {"alarms": {"active": 1}}, "see the page Events", False
     yield {"armed": {"program": "p"}}, "start the program at the NC", False
     yield {"state": "OFF(SHADOW)"}, "start fdhil-guard to correct", False
     yield {}, "fdhil arm CONFIG PROGRAM", False

@@ -36,6 +36,13 @@ def log_in_by_keyboard(tab: Tab, name: str, password: str) -> None:
     tab.page.keyboard.press("Enter")
 
 
+def choose_by_keyboard(tab: Tab) -> None:
+    """Choose program and method in the dialogue of arming."""
+    for label, chosen in ((tab.word("arm.program"), "corner"), (tab.word("arm.method"), "inverse")):
+        tab.tab_to(label)
+        tab.page.keyboard.type(chosen)
+
+
 def test_a_stranger_sees_nothing_of_the_machine(stage: Stage, tab: Tab) -> None:
     for path in ("/machine", "/rapids", "/events", "/panel"):
         tab.open(path)
@@ -73,7 +80,11 @@ def test_a_whole_arm_and_disarm_by_the_keyboard_alone(stage: Stage, tab: Tab) ->
     stage.settled()
     tab.tab_to(tab.word("arm.open"))
     tab.page.keyboard.press("Enter")
+    confirm = tab.page.get_by_role("button", name=tab.word("arm.confirm"))
+    assert confirm.is_disabled()  # nothing is chosen for anybody
+    choose_by_keyboard(tab)
     tab.says("#arm-plan", "corner.ngc")  # what it will move
+    tab.says("#arm-predicted", "µm RMS without correction")
     assert tab.violations() == []
     assert stage.status_when(lambda told: True)["state"] == "OFF"  # it asks first
     tab.tab_to(tab.word("arm.confirm"))
@@ -88,9 +99,25 @@ def test_a_whole_arm_and_disarm_by_the_keyboard_alone(stage: Stage, tab: Tab) ->
     tab.says("#standing", tab.word("state", state="OFF"))
 
 
+def test_program_is_armed_on_the_page_of_its_forecast(stage: Stage, operator: Tab) -> None:
+    machine, page = "section:has(#program-machine)", operator.page
+    operator.open(f"/program/{stage.forecast(stage.token('operator'))}")
+    operator.says(machine, operator.word("program.machine.not_armed"))
+    stage.settled()
+    page.get_by_role("button", name=operator.word("arm.open")).click()
+    page.get_by_label(operator.word("arm.method"), exact=True).select_option("inverse")
+    operator.says("#arm-predicted", "µm RMS without correction")
+    page.get_by_role("button", name=operator.word("arm.confirm")).click()
+    page.get_by_role("dialog").wait_for(state="detached")
+    operator.says(machine, operator.word("guard.ARMED"))
+    page.get_by_role("button", name=operator.word("disarm"), exact=True).click()
+    operator.says(machine, operator.word("program.machine.not_armed"))
+
+
 def test_what_is_asked_can_be_taken_back(stage: Stage, operator: Tab) -> None:
     operator.open("/machine")
     operator.page.get_by_role("button", name=operator.word("arm.open")).click()
+    choose_by_keyboard(operator)
     operator.says("#arm-plan", "corner.ngc")
     operator.page.keyboard.press("Escape")
     assert operator.page.get_by_role("dialog").count() == 0

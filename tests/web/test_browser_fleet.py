@@ -58,13 +58,13 @@ def test_the_page_is_for_everyone(path: str, url: str, chromium: Browser) -> Non
         assert tab.wider() == []
 
 
-def test_what_is_due_and_who_is_unlike_its_sisters_leads_to_its_axis(url: str, chromium: Browser) -> None:
+def test_what_is_due_and_who_differs_from_its_peers_leads_to_its_axis(url: str, chromium: Browser) -> None:
     with opened(chromium, url) as tab:
         tab.open("/")
         tab.says("section:has(h2:text-is('Due')) tr", "mill-2, axis X")
-        tab.says("section:has(h2:text-is('Unlike their sisters')) tr", "+8")
-        tab.page.get_by_label("Sisters have the same").select_option("lubricant")
-        tab.says("section:has(h2:text-is('Unlike their sisters')) tr", "mill-4, axis X")
+        tab.says("section:has(h2:text-is('Different from their peers')) tr", "+8")
+        tab.page.get_by_label("Peers have the same").select_option("lubricant")
+        tab.says("section:has(h2:text-is('Different from their peers')) tr", "mill-4, axis X")
         tab.page.locator("section:has(h2:text-is('Due')) a", has_text="mill-2, axis X").first.click()
         tab.says("h1", "mill-2, axis X")
         tab.page.locator(".chart .plot canvas").nth(5).wait_for()

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.debian, pytest.mark.timeout(900)]
 STATE = "main p[role=status]"
-CURRENT = "figure.chart:nth-of-type(2)"
+CURRENT = "figure.chart:has(figcaption:has-text('Current'))"
 
 
 @pytest.fixture

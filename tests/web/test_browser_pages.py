@@ -69,3 +69,15 @@ def test_a_page_is_for_everyone(page: str, paths: dict[str, str], reader: Tab) -
     assert without_digits(wide) - without_digits(reader.labels()) == set()  # notices may come meanwhile
     assert reader.wider() == []
     assert reader.page.evaluate("document.getAnimations().length") == 0
+
+
+@pytest.mark.parametrize(("locale", "title"), [("de-DE", "Ereignisse"), ("fr-FR", "Événements"), ("it-IT", "Events")])
+def test_pages_are_in_the_language_of_the_browser(
+    locale: str, title: str, stage: Stage, chromium: Browser, token: str
+) -> None:
+    with opened(chromium, stage.url, locale=locale) as tab:
+        tab.log_in(token)
+        tab.open("/events")
+        assert tab.page.locator("h1").inner_text() == title
+        assert tab.page.evaluate("document.documentElement.lang") in (locale[:2], "en")
+        assert tab.violations() == []

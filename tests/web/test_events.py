@@ -60,7 +60,8 @@ async def _get(client: httpx.AsyncClient, **wanted: Any) -> Any:
 
 async def test_what_waits_is_in_front_by_kind_with_cause_effect_and_next_action(client: httpx.AsyncClient) -> None:
     told = await _get(client)
-    tripped, due = told["waiting"]
+    due, tripped = told["waiting"]  # what is active is in front
+    assert (due["state"], due["until"], tripped["state"], tripped["count"]) == ("active", None, "gone", 2)
     assert (tripped["newest"]["code"], tripped["numbers"], due["newest"]["code"]) == (
         "GuardTripped", [4, 2], "MaintenanceDue",
     )  # fmt: skip
@@ -68,8 +69,21 @@ async def test_what_waits_is_in_front_by_kind_with_cause_effect_and_next_action(
     assert newest["cause"] == "EchoMismatch: axis X: the drive's offset is not the one that was sent"
     assert newest["effect"] == "the offset is ramped to zero and the correction is off until it is armed again"
     assert newest["action"] == "check the PDO mapping and the scaling"
-    assert (told["waiting_count"], told["waiting_major"], told["newest_waiting"]) == (3, 2, 4)
+    assert (told["active_count"], told["waiting_count"], told["waiting_major"], told["newest_waiting"]) == (1, 3, 2, 4)
     assert [(event["code"], event["acknowledged"]["who"]) for event in told["others"]] == [("StrayFiles", "anna")]
+
+
+async def test_end_of_an_alarm_is_its_until_and_no_notice_of_its_own(
+    client: httpx.AsyncClient, machine: MachineConfig
+) -> None:
+    with History.open(machine.store.directory) as history:
+        history.add_notice(Notice("MaintenanceDue", "info", "ft is back at 0.05 N.m.s", "Y"), Stamp(1.8e9, "boot", 9))
+        history.add_acknowledgement(Acknowledgement((3,), "anna", "", Stamp.now()))
+    told = await _get(client)
+    assert [kind["newest"]["code"] for kind in told["waiting"]] == ["GuardTripped"]
+    due = next(event for event in told["others"] if event["code"] == "MaintenanceDue")
+    assert (due["severity"], due["until"]) == ("minor", "2027-01-15T08:00:00+00:00")
+    assert [event["code"] for event in told["others"]].count("MaintenanceDue") == 1
 
 
 async def test_the_list_is_filtered_and_paged(client: httpx.AsyncClient, machine: MachineConfig) -> None:

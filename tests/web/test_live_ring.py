@@ -22,7 +22,7 @@ PERIOD_S = 0.001
 
 
 def rows(ticks: Any) -> Any:
-    """Return signals (5, n) that tell their tick: k times the tick, k = 1 to 5."""
+    """Return signals (7, n) that tell their tick: k times the tick, k = 1 to 7."""
     return np.outer(np.arange(1, 1 + len(SIGNALS)), np.asarray(ticks)).astype(np.float32)
 
 

@@ -17,17 +17,20 @@ from fastapi import FastAPI
 from numpy.testing import assert_allclose
 
 from fdhil import correction
+from fdhil.arming import passes
 from fdhil.config import MachineConfig
 from fdhil.correction.learning import Lesson
 from fdhil.errors import ProgramError
 from fdhil.prediction.models import nominal_models
 from fdhil.program import load_trajectory
+from fdhil.records import Notice
 from fdhil.store.history import History
 from fdhil.store.lessons import lesson_path, write_lesson
-from fdhil.store.rows import Stamp
+from fdhil.store.rows import Stamp, StoredNotice
 from fdhil.web.answers import Refused
 from fdhil.web.app import make_app
 from fdhil.web.forecast import desk, process
+from fdhil.web.forecast.lessons import jobs
 from fdhil.web.forecast.view import knots
 from tests.bench import bench_config
 from tests.store.made import published
@@ -339,6 +342,46 @@ def test_what_passes_taught_is_told_of_this_machine_alone(client: Client, machin
     (learned,) = told["lessons"]
     assert learned["program"] == "ab" * 16
     assert learned["curve_um"] == [9.0, 3.0, 1.0]
+
+
+PASS = {
+    "program": "/srv/part 1.ngc",
+    "pass": 3,
+    "ended_by": "Finished",
+    "measured": {"rms_um": 0.92, "max_um": 2.1},
+    "predicted": {"rms_um": 0.6, "uncertainty_um": 0.4},
+    "predicted_without": {"rms_um": 41.2},
+    "gain": {"measured": 44.8, "predicted": 68.7},
+}
+
+
+@pytest.mark.parametrize(("ended_by", "shown"), [("Finished", None), ("SyncLost", "SyncLost")])
+def test_jobs_of_the_history_have_their_predicted_and_measured_errors(ended_by: str, shown: str | None) -> None:
+    texts = [passes._text({**PASS, "ended_by": ended_by}), "pass 4 of a: nothing that is known here"]
+    notices = [
+        StoredNotice(k, Notice("PassMeasured", "info", text), Stamp(1.7e9, "boot", k)) for k, text in enumerate(texts)
+    ]
+    (job,) = jobs(notices)
+    assert (job["program"], job["pass"], job["ended_by"]) == ("part 1.ngc", 3, shown)
+    assert (job["measured_um"], job["max_um"], job["predicted_um"], job["without_um"]) == (0.92, 2.1, 0.6, 41.2)
+
+
+@pytest.mark.usefixtures("processes")
+def test_program_of_the_folder_is_forecast_by_its_name(machine: MachineConfig, tmp_path: Path) -> None:
+    (tmp_path / "part.ngc").write_text("G21 G90 G94\nG1 X5 F1000\nM2\n")
+    web = machine.web.model_copy(update={"programs_directory": tmp_path})
+    client = Client(make_app(machine.model_copy(update={"web": web})))
+    try:
+        told = client.post("/api/program/named?name=part.ngc", headers=WRITES).json()
+        while told["state"] in ("waiting", "computing"):
+            client.wait()
+            told = client.get(f"/api/program/{told['digest']}").json()
+        assert (told["state"], told["name"]) == ("done", "part.ngc")
+        assert client.post("/api/program/named?name=other.ngc", headers=WRITES).status_code == 404
+        assert client.post("/api/program/named?name=../machine.toml", headers=WRITES).status_code == 422
+        assert client.get("/api/program/jobs").json() == {"jobs": []}
+    finally:
+        client.close()
 
 
 def test_knots_are_the_best_that_few_points_can_tell() -> None:

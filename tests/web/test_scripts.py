@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 
 from fdhil.report import typography
+from fdhil.report.drawing import COLOURS, SHADES
 from fdhil.web.app import SHELL, STATIC
 
 SCRIPTS = sorted(STATIC.rglob("*.js"))
 WORDS = re.compile(r'^\s*"([\w.()]+)": ', re.MULTILINE)
 
 
-def keys(name: str) -> set[str]:
-    """Return the keys of a file of words, or of all of them."""
-    return {key for path in (STATIC / "text").rglob(name) for key in WORDS.findall(path.read_text("utf-8"))}
+ENGLISH = [STATIC / "text" / "en.js", *sorted((STATIC / "text" / "en").glob("*.js"))]
+OTHERS = sorted(set((STATIC / "text").glob("*.js")) - set(ENGLISH))
 
 
 def test_each_page_of_the_shell_has_its_script() -> None:
@@ -31,13 +31,31 @@ def test_each_module_that_is_imported_is_there() -> None:
 
 
 def test_each_word_that_is_used_is_written_down_once() -> None:
-    known = keys("*.js")
+    parts = [key for path in ENGLISH for key in WORDS.findall(path.read_text("utf-8"))]
+    known = set(parts)
     for path in SCRIPTS:
         code = "\n".join(line for line in path.read_text("utf-8").splitlines() if not line.startswith("//"))
         used = set(re.findall(r'\bt\("([\w.]+)"', code))
         assert used <= known, (path.name, used - known)
-    parts = [key for path in (STATIC / "text").rglob("*.js") for key in WORDS.findall(path.read_text("utf-8"))]
     assert [key for key in known if parts.count(key) > 1] == []
+
+
+def sentences(*paths: Path) -> dict[str, set[str]]:
+    """Return by key what is filled into each sentence of these files."""
+    found = re.findall(
+        r'^\s*"([\w.()]+)": "(.*)",?$', "\n".join(path.read_text("utf-8") for path in paths), re.MULTILINE
+    )
+    return {key: set(re.findall(r"\{\w+\}", text)) for key, text in found}
+
+
+@pytest.mark.parametrize("path", OTHERS, ids=lambda path: path.stem)
+def test_another_language_has_keys_of_the_english_and_fills_in_the_same(path: Path) -> None:
+    english, other = sentences(*ENGLISH), sentences(path)
+    assert other
+    assert {key: filled for key, filled in other.items() if english.get(key) != filled} == {}
+    chosen = re.search(r"const LANGUAGES = (\[.*?\]);", (STATIC / "text.js").read_text("utf-8"))
+    assert chosen is not None
+    assert path.stem in json.loads(chosen[1])
 
 
 @pytest.mark.parametrize(
@@ -57,3 +75,10 @@ def test_units_are_set_by_the_rule_of_the_reports() -> None:
     table = re.search(r"const PRINTED = \{(.*?)\};", text, re.DOTALL)
     assert table is not None
     assert json.loads("{" + table[1].strip().rstrip(",") + "}") == typography._PRINTED
+
+
+def test_colours_are_those_of_the_reports() -> None:
+    styles = "".join((STATIC / name).read_text("utf-8") for name in ("app.css", "pages/program.css"))
+    for name, colours in (("series", COLOURS), ("shade", SHADES)):
+        light = dict(reversed(re.findall(rf"--{name}-(\d): (#\w+);", styles)))
+        assert tuple(light[key] for key in sorted(light)) == colours

@@ -36,7 +36,12 @@ REFUSED_EVERY = 9
 
 NOTICES = (
     Notice("Armed", "info", "armed corner.ngc: contour error 41.2 um RMS is predicted to become 0.6 um"),
-    Notice("PassMeasured", "info", "pass 3 of corner.ngc: contour error measured 0.9 um RMS"),
+    Notice(
+        "PassMeasured",
+        "info",
+        "pass 3 of corner.ngc: contour error measured 0.92 um RMS, 2.1 at most (predicted 0.60 ± 0.40; "
+        "without correction 41.2 predicted; gain 44.8, predicted 68.7)",
+    ),
     Notice("ArmRefused", "minor", "ModelNotFresh: axis X was identified 11 h ago"),
     Notice("GuardState", "MAJOR", "ACTIVE -> OFF: DriveEmergency", "X"),
     Notice("GuardTripped", "MAJOR", "DriveEmergency: drive X sent emergency 0x4310", "X"),

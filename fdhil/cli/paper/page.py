@@ -1,6 +1,7 @@
 """Lays the claims out as one page and as one document for machines."""
 
 import math
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,6 +17,7 @@ CITATION = (
     'X. Desforges, A. Habbadi, G. Dessein, "Trajectory shortcoming prediction from physical parameter estimation"'
 )
 SHOWN, NOT_SHOWN = "✓", "✗"
+_SECTION = re.compile(r"[Ss]ections? (\d)")
 SUMMARY_HEAD = ("claim", "verdict", "shown by", "place in the paper")
 
 
@@ -41,8 +43,14 @@ def page(claims: Sequence[Claim]) -> Page:
         title="The paper, claim by claim",
         subtitle=f"{CITATION}: every equation, figure and claim put to trials on simulated machines.",
         headline=[(verdict, str(number)) for verdict, number in counts(claims).items()],
-        sections=[_verdicts(claims), *(_section(claim) for claim in claims), _scenarios(claims)],
+        sections=[_verdicts(claims), *map(_section, sorted(claims, key=_chapter)), _scenarios(claims)],
     )
+
+
+def _chapter(claim: Claim) -> str:
+    """Return the chapter of the page that a claim belongs to: the section of the paper that has it."""
+    found = _SECTION.search(claim.source)
+    return f"Section {found[1]} of the paper" if found else "The paper's conclusion"
 
 
 def _verdicts(claims: Sequence[Claim]) -> Section:
@@ -70,6 +78,7 @@ def _section(claim: Claim) -> Section:
         " ".join(part for part in parts if part),
         tables=[_trials(claim), *claim.tables],
         figures=[(picture.caption, picture.svg) for picture in claim.pictures],
+        chapter=_chapter(claim),
     )
 
 

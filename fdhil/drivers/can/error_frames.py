@@ -26,6 +26,9 @@ _QUIET_NS = 10_000_000_000  # until what no longer comes is over: until then it 
 _RECOVERED = {
     "BusOff": "The CAN controller is back on the bus.",
     "ErrorPassive": "The CAN controller is error-active again.",
+    "BusErrors": "No frame was damaged for 10 s.",
+    "NotAcknowledged": "No frame was left without acknowledgement for 10 s.",
+    "TransceiverFault": "The CAN transceiver has reported no fault for 10 s.",
 }
 
 Severity = Literal["minor", "MAJOR"]

@@ -1,12 +1,21 @@
-"""What programs have learned: the curve of each one by its passes, and what the daemon measured of the last ones."""
+"""What programs have learned, what the daemon measured of the last passes, and the history of all passes."""
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from fdhil.config import MachineConfig
 from fdhil.store.lessons import kept_lessons
+from fdhil.store.notice_document import date_of
+from fdhil.store.rows import StoredNotice
 
 SHOWN = 30
+_NUMBER = r"([\d.]+)"
+_PASS = re.compile(
+    rf"pass (\d+) of (.+?): contour error measured {_NUMBER} um RMS, {_NUMBER} at most "
+    rf"\(predicted {_NUMBER}[^;]*; without correction {_NUMBER} predicted"
+)
+"""How ``fdhil.arming.passes`` reports a pass: its notice is what the history keeps of it."""
 
 
 def lessons(config: MachineConfig, names: Mapping[str, str]) -> list[dict[str, Any]]:
@@ -35,3 +44,18 @@ def lessons(config: MachineConfig, names: Mapping[str, str]) -> list[dict[str, A
 def passes(status: Mapping[str, Any] | None) -> Sequence[Mapping[str, Any]]:
     """Return the passes that the running daemon has measured, oldest first; none where no daemon runs."""
     return [] if status is None else status.get("passes", [])
+
+
+def jobs(notices: Iterable[StoredNotice]) -> Iterator[dict[str, Any]]:
+    """Yield the passes that the history keeps, in the order of its notices; errors in um, RMS but ``max_um``."""
+    for stored in notices:
+        found = _PASS.match(stored.notice.text) if stored.notice.code == "PassMeasured" else None
+        if found is not None:
+            figures = dict(
+                zip(
+                    ("measured_um", "max_um", "predicted_um", "without_um"), map(float, found.groups()[2:]), strict=True
+                )
+            )
+            ended = re.search(r"; it was ended by (\w+)", stored.notice.text)
+            about = {"number": stored.number, "time": date_of(stored.stamp), "pass": int(found[1]), "program": found[2]}
+            yield {**about, **figures, "severity": stored.notice.severity, "ended_by": ended[1] if ended else None}

@@ -1,16 +1,16 @@
-"""The notices as the browser has them: those that wait in front, each with its cause, effect and next action."""
+"""Alarms and notices as the browser has them: active alarms first, each with cause, effect and next action."""
 
 from collections.abc import Sequence
 from typing import Any, Literal
 
 from pydantic import BaseModel
 
+from fdhil.daemon.alarms import MOST_TOGETHER, Alarm, AlarmTable
 from fdhil.daemon.notice_words import words_of
-from fdhil.store.notice_document import notice_document
-from fdhil.store.rows import StoredNotice
+from fdhil.store.notice_document import date_of, notice_document
+from fdhil.store.rows import Stamp, StoredNotice
 
 MOST_PAGE = 200
-MOST_TOGETHER = 1000
 MOST_EARLIER = 50
 Severity = Literal["info", "minor", "MAJOR"]
 
@@ -36,6 +36,7 @@ class Event(BaseModel):
     effect: str
     action: str
     acknowledged: Acknowledged | None
+    until: str | None = None
 
 
 class Earlier(BaseModel):
@@ -47,21 +48,29 @@ class Earlier(BaseModel):
 
 
 class Waiting(BaseModel):
-    """The notices of one class and place that wait: the newest, the ``numbers`` of all, and what the others said."""
+    """An alarm that is active or waits: its newest notice, the ``numbers`` of those that wait, what the others said.
+
+    ``until`` is when its cause ended, null while it is active; it was raised ``count`` times since ``first_time``.
+    """
 
     newest: Event
+    state: Literal["active", "gone"]
+    until: str | None
+    count: int
     numbers: list[int]
     first_time: str
     earlier: list[Earlier]
 
 
 class Events(BaseModel):
-    """Notices: those that wait, by kind, MAJOR in front; a page of the others, newest first.
+    """Alarms that are active or wait, the most urgent first; a page of the other notices, newest first.
 
-    ``older_before`` asks for the next page, null at the oldest.
+    The end of an alarm is no notice of its own here, but where severity info is asked for. ``older_before`` asks for
+    the next page, null at the oldest.
     """
 
     waiting: list[Waiting]
+    active_count: int
     waiting_count: int
     waiting_major: int
     newest_waiting: int | None
@@ -70,12 +79,13 @@ class Events(BaseModel):
     codes: list[str]
 
 
-def event(stored: StoredNotice) -> Event:
-    """Return a notice with the words that explain it."""
+def event(stored: StoredNotice, until: Stamp | None = None) -> Event:
+    """Return a notice with the words that explain it, and when its cause ended."""
     effect, action = words_of(stored.notice)
     text = stored.notice.text
     cause = text.partition(f"; {effect}")[0] if effect else text  # the guard's own sentence tells all three
-    return Event(**notice_document(stored), cause=cause, effect=effect, action=action)
+    ended = None if until is None else date_of(until)
+    return Event(**notice_document(stored), cause=cause, effect=effect, action=action, until=ended)
 
 
 def page(notices: Sequence[StoredNotice], *, limit: int, before: int | None = None, **only: Any) -> Events:
@@ -83,36 +93,37 @@ def page(notices: Sequence[StoredNotice], *, limit: int, before: int | None = No
 
     Without a severity those of severity info are left out.
     """
-    chosen = [stored for stored in notices if _is(stored, **only)]
-    waiting = [stored for stored in chosen if stored.is_open]
-    others = [stored for stored in chosen if not stored.is_open and (before is None or stored.number < before)]
-    shown = others[-limit:][::-1]
+    table = AlarmTable(notices)
+    shown = [alarm for alarm in table.shown() if _is(alarm.newest, **only)]
+    active = {alarm.newest.number for alarm in shown if alarm.until is None}
+    waiting = [stored for stored in notices if stored.is_open and _is(stored, **only)]
+    others = [
+        stored for stored in notices if not stored.is_open and stored.number not in active and _is(stored, **only)
+    ]
+    older = [stored for stored in others if before is None or stored.number < before]
+    newest = older[-limit:][::-1]
     return Events(
-        waiting=_by_kind(waiting),
+        waiting=[_together(alarm) for alarm in shown],
+        active_count=len(active),
         waiting_count=len(waiting),
         waiting_major=sum(stored.notice.severity == "MAJOR" for stored in waiting),
         newest_waiting=waiting[-1].number if waiting else None,
-        others=[event(stored) for stored in shown],
-        older_before=shown[-1].number if len(others) > limit else None,
+        others=[event(stored, table.ended.get(stored.number)) for stored in newest],
+        older_before=newest[-1].number if len(older) > limit else None,
         codes=sorted({stored.notice.code for stored in notices}),
     )
 
 
-def _by_kind(waiting: Sequence[StoredNotice]) -> list[Waiting]:
-    kinds: dict[tuple[str, str], list[StoredNotice]] = {}
-    for stored in waiting[::-1]:
-        kinds.setdefault((stored.notice.code, stored.notice.axis), []).append(stored)
-    told = [_together(kind[:MOST_TOGETHER]) for kind in kinds.values()]
-    return sorted(told, key=lambda kind: (kind.newest.severity != "MAJOR", -kind.newest.number))
-
-
-def _together(kind: Sequence[StoredNotice]) -> Waiting:
-    documents = [notice_document(stored) for stored in kind]
+def _together(alarm: Alarm) -> Waiting:
+    documents = [notice_document(stored) for stored in list(alarm.raised)[::-1]]
     earlier = [{key: told[key] for key in ("number", "time", "text")} for told in documents[1 : MOST_EARLIER + 1]]
     return Waiting(
-        newest=event(kind[0]),
-        numbers=[stored.number for stored in kind],
-        first_time=documents[-1]["time"],
+        newest=event(alarm.newest),
+        state=alarm.state,
+        until=None if alarm.until is None else date_of(alarm.until),
+        count=alarm.count,
+        numbers=sorted(alarm.waiting, reverse=True)[:MOST_TOGETHER],
+        first_time=date_of(alarm.first),
         earlier=[Earlier(**told) for told in earlier],
     )
 

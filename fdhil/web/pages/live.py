@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import math
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
@@ -140,12 +141,13 @@ async def stream(
         await socket.close(TRY_LATER, f"{MAX_BROWSERS} browsers look on already; close one of them")
         return
     view = View(named, seconds, columns, feed.period_s)
+    travel = {axis: here.config.axis[axis].screw_pitch_mm / math.tau for axis in named}
     signals = [{"name": name, "unit": UNITS[name]} for name in DRAWN]
     begin = {"sync_period_s": feed.period_s, "axes": named, "signals": signals, "ticks_per_column": view.per_column}
     viewer = Viewer(owner, time.monotonic())
     async with feed.watched(viewer):
         with suppress(WebSocketDisconnect):  # it left
-            await socket.send_json({**begin, "kept_s": KEPT_S})
+            await socket.send_json({**begin, "kept_s": KEPT_S, "mm_per_rad": travel})
             await socket.close(POLICY, await _converse(socket, view, viewer, feed, here))
 
 

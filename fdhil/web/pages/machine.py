@@ -1,6 +1,6 @@
 """The machine: what its daemon says, how the axes are, and what to do next."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from fastapi import APIRouter
@@ -17,6 +17,7 @@ from fdhil.web.context import Asking, Here
 from fdhil.web.pages.machine_lights import AxisLight, Light, Step, axis_light, change_light, steps
 
 router = APIRouter(prefix="/api/machine")
+COURSE = 40
 START = Step(text="The daemon does not answer.", advice="start it with fdhil run CONFIG, and look at its log")
 
 
@@ -32,7 +33,10 @@ class Machine(BaseModel):
 
 
 class Parameter(BaseModel):
-    """A published parameter in SI units: its 95 % interval, its first value, and how far it may change."""
+    """A published parameter in SI units: its 95 % interval, its first value, and how far it may change.
+
+    ``course`` are its values in the newest published sets, oldest first.
+    """
 
     value: float
     low: float | None
@@ -42,6 +46,7 @@ class Parameter(BaseModel):
     change: float | None
     limit: float
     light: Light
+    course: list[float] = []
 
 
 class Published(BaseModel):
@@ -99,14 +104,15 @@ def parameters(here: Here) -> AllPublished:
 
 
 def _published(history: History, axis: str, config: MachineConfig) -> Published | None:
-    newest = history.revisions(axis, limit=1)
+    newest = history.revisions(axis, limit=COURSE)
     if not newest:
         return None
-    return published_document(newest[0], history.first_revision(axis), config)
+    return published_document(newest, history.first_revision(axis), config)
 
 
-def published_document(newest: Revision, first: Revision | None, config: MachineConfig) -> Published:
-    """Return a revision beside the first one of its axis."""
+def published_document(revisions: Sequence[Revision], first: Revision | None, config: MachineConfig) -> Published:
+    """Return the newest of an axis' revisions (oldest first), compared with the first one ever."""
+    newest = revisions[-1]
     shown: ParameterSet = newest.set
     firsts = first.set.parameters.as_dict() if first else {}
     limits = config.maintenance.model_dump()
@@ -115,6 +121,7 @@ def published_document(newest: Revision, first: Revision | None, config: Machine
         half = None if told["high"] is None else told["high"] - told["value"]
         change, light = change_light(told["value"], half, firsts.get(name), limits[name])
         beside = {"first": firsts.get(name), "change": change, "limit": limits[name], "light": light}
+        beside["course"] = [known[name] for each in revisions if name in (known := each.set.parameters.as_dict())]
         found[name] = Parameter(**{key: told[key] for key in ("value", "low", "high", "unit")}, **beside)
     return Published(
         revision=shown.revision,

@@ -12,7 +12,7 @@ from fdhil.arming.standing import ADOPT, START_AND_ADOPT
 Light = Literal["good", "warn", "bad", "none"]
 LIVE_S = 2.0
 NEAR = 0.5
-"""The share of a maintenance limit from which a parameter is told to move."""
+"""The share of a maintenance limit from which a parameter is reported to move."""
 ENABLED = "Operation enabled"
 DRIVE_FAULTS = ("Fault", "Fault reaction active")
 
@@ -47,7 +47,7 @@ def axis_light(axis: Mapping[str, Any], troubles: list[str]) -> AxisLight:
         return AxisLight(light="none", text=_unpublished(axis))
     if last and not last["accepted"]:
         why = f": {last['reasons'][0]}" if last["reasons"] else ""
-        return AxisLight(light="warn", text=f"the last rapid was not believed{why}")
+        return AxisLight(light="warn", text=f"the last rapid was refused{why}")
     if axis.get("warnings"):
         return AxisLight(light="warn", text=str(axis["warnings"][0]))
     return AxisLight(light="good", text="in order")
@@ -58,7 +58,7 @@ def _unpublished(axis: Mapping[str, Any]) -> str:
     if not refused:
         return "no parameters yet; let the NC make a few rapids (G0) of this axis"
     code, count = max(refused.items(), key=lambda pair: pair[1])
-    return f"no parameters yet: {count} rapids were not believed because of {code}"
+    return f"no parameters yet: {count} rapids were refused because of {code}"
 
 
 def change_light(value: float, half: float | None, first: float | None, limit: float) -> tuple[float | None, Light]:
@@ -105,10 +105,13 @@ def _troubles(status: Mapping[str, Any]) -> Iterator[Step]:
     for trouble in status["troubles"]:
         text, _, advice = str(trouble["text"]).partition("; ")
         where = f"{trouble['axis']}: " if trouble["axis"] else ""
-        yield Step(text=f"{where}{trouble['code']}: {text}", advice=advice)
+        yield Step(text=f"{where}{text} ({trouble['code']})", advice=advice)
 
 
 def _waiting(status: Mapping[str, Any]) -> Iterator[Step]:
+    if active := (status.get("alarms") or {}).get("active"):
+        count = "One alarm is active." if active == 1 else f"{active} alarms are active."
+        yield Step(text=count, advice="see the page Events", page="/events")
     waiting = status.get("unacknowledged") or {"count": 0}
     if waiting["count"]:
         major = f", {waiting['MAJOR']} of them major" if waiting.get("MAJOR") else ""
@@ -119,8 +122,8 @@ def _waiting(status: Mapping[str, Any]) -> Iterator[Step]:
 def _learning(status: Mapping[str, Any]) -> Iterator[Step]:
     unknown = [axis for axis, told in status["axes"].items() if told["parameters"] is None]
     if unknown and status["source"]["state"] == "listening":
-        text = f"Nothing is known of {', '.join(unknown)} yet."
-        yield Step(text=text, advice="let the NC make a few rapids (G0) of each, to and fro, over most of the travel")
+        text = f"The parameters of {', '.join(unknown)} are not identified yet."
+        yield Step(text=text, advice="let the NC make a few rapids (G0) of each, both ways, over most of the travel")
 
 
 def _ready(status: Mapping[str, Any], acting: bool) -> Iterator[Step]:

@@ -3,6 +3,7 @@
 A program that is dropped is forecast in a process of its own. Nothing here reaches the machine.
 """
 
+import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from itertools import islice
@@ -12,17 +13,20 @@ from fastapi import APIRouter, Depends, FastAPI, Path, Query, Request
 from pydantic import BaseModel
 from starlette.requests import HTTPConnection
 
-from fdhil.errors import ConnectError, DeviceTimeout
+from fdhil.errors import ConnectError, DeviceTimeout, StoreError
+from fdhil.store.history import RECENT_NOTICES
 from fdhil.web.answers import Refused
 from fdhil.web.context import Here
 from fdhil.web.forecast.desk import STATES, Desk, Job, Work
-from fdhil.web.forecast.lessons import lessons, passes
+from fdhil.web.forecast.lessons import jobs, lessons, passes
 from fdhil.web.forecast.view import Box, course, line_place, plane_of, view
 from fdhil.web.gate import LARGEST_PROGRAM
 from fdhil.web.json_answer import Json
+from fdhil.web.programs import NAME, content_of
 
 LARGEST_MM = 1e7
 MOST_LINES = 400
+MOST_JOBS = 100
 LONGEST_LINE = 400
 
 
@@ -82,6 +86,12 @@ class Learning(BaseModel):
     passes: list[dict[str, Any]]
 
 
+class Jobs(BaseModel):
+    """The newest passes of corrected programs that the history keeps, newest first."""
+
+    jobs: list[dict[str, Any]]
+
+
 class Line(BaseModel):
     """One line of a program's text."""
 
@@ -134,6 +144,28 @@ async def programs(desk: Programming) -> Programs:
 async def drop(request: Request, desk: Programming, name: Annotated[str, Query(min_length=1, max_length=255)]) -> Told:
     """Take an NC program, or a demand where ``name`` ends in .csv, as the body's bytes, and have it forecast."""
     return _told(await desk.take(name, request.stream()))
+
+
+@router.post("/named", status_code=202)
+async def take_named(here: Here, desk: Programming, name: Annotated[str, Query(pattern=NAME)]) -> Told:
+    """Have a program forecast that is in the folder of the programs that may be armed from here."""
+    content = await asyncio.to_thread(content_of, here.config.web.programs_directory, name, LARGEST_PROGRAM)
+    return _told(await desk.take(name, _once(content)))
+
+
+async def _once(content: bytes) -> AsyncIterator[bytes]:
+    yield content
+
+
+@router.get("/jobs")
+def finished_jobs(here: Here) -> Jobs:
+    """Return the passes of corrected programs with their predicted and measured errors; none without a history."""
+    try:
+        with here.history() as history:
+            found = list(jobs(history.notices(limit=RECENT_NOTICES)))
+    except StoreError:
+        found = []
+    return Jobs(jobs=found[::-1][:MOST_JOBS])
 
 
 @router.get("/learning")

@@ -3,7 +3,7 @@
 import {el, faultBox, lamp} from "/static/dom.js";
 import {ask, download, get, onLoginNeeded, post, socket} from "/static/ask.js";
 import {logIn, logOut, lookWho, onSession, session} from "/static/session.js";
-import {lookNow, watch} from "/static/status.js";
+import {lookNow, until, watch} from "/static/status.js";
 import {typeset} from "/static/typeset.js";
 import {ago, decimal, number, t, when} from "/static/text.js";
 
@@ -16,7 +16,7 @@ let endPage = null;
 let turn = 0;
 
 // what a page is given beside its place and the parts of its path
-export const context = {ask, get, post, socket, download, watch, lookNow, session, logIn, disarm: disarmNow, go, say, t, ago, decimal, number, when};
+export const context = {ask, get, post, socket, download, watch, lookNow, until, session, logIn, disarm: disarmNow, go, say, t, ago, decimal, number, when};
 
 // tell something: for who listens at once, for who sees for a while
 const SHOWN_MS = 12000;
@@ -47,7 +47,7 @@ async function show() {
   markNavigation(path.name);
   say("");
   document.body.classList.toggle("bare", HIDDEN.includes(path.name));
-  document.title = `${[...PAGES].includes(path.name) ? t(`nav.${path.name}`) : path.name} – fdhil`;
+  nameMachine();
   main.setAttribute("aria-busy", "true");
   main.replaceChildren(el("p", {class: "soft"}, t("page.loading")));
   const end = await shown(path, () => mine === turn).catch(failed);
@@ -82,12 +82,20 @@ function drawNavigation() {
   document.getElementById("nav").replaceChildren(el("ul", {}, PAGES.map((name) => el("li", {},
     el("a", {href: `/${name}`}, t(`nav.${name}`))))));
   document.getElementById("skip").textContent = t("skip");
+  document.getElementById("zone").textContent = t("times.zone", {zone: Intl.DateTimeFormat().resolvedOptions().timeZone});
 }
 
 function markNavigation(name) {
   for (const link of document.querySelectorAll("#nav a")) {
     if (link.pathname === `/${name}`) link.setAttribute("aria-current", "page"); else link.removeAttribute("aria-current");
   }
+}
+
+// product and machine, on every page
+function nameMachine() {
+  document.getElementById("machine-name").textContent = named ? ` · ${named}` : "";
+  const name = pathOf(new URL(location.href)).name;
+  document.title = [[...PAGES].includes(name) ? t(`nav.${name}`) : name, named, "fdhil"].filter(Boolean).join(" – ");
 }
 
 // the state of the correction, and the buttons that are always there
@@ -98,7 +106,9 @@ const login = el("button", {type: "button", class: "quiet"});
 async function disarmNow() {
   say(t("disarm.asked"));
   try {
-    say(t("disarm.done", await post("/api/machine/disarm")));
+    const answer = await post("/api/machine/disarm");
+    await until((status) => !status.armed);  // what the head shows, and what is said, agree
+    say(t("disarm.done", answer));
   } catch (fault) {
     say(`${fault.code}: ${fault.text}. ${fault.advice}`);
   }
@@ -114,8 +124,9 @@ function drawStanding() {
   document.getElementById("standing").replaceChildren(OF_A_MACHINE ? state : "", disarm, login);
 }
 
-let silent = false;
-function drawState({status, fault}) {
+let silent = false, named = "";
+function drawState({told, status, fault}) {
+  if (told && named !== told.machine) { named = told.machine; nameMachine(); }
   if (fault && !silent) say(fault.status === 0 ? fault.text : t("daemon.silent"));
   if (!fault && silent) say(t("daemon.back"));
   silent = Boolean(fault);
@@ -137,6 +148,8 @@ addEventListener("popstate", show);
 let unwatch = null;
 let readable;
 onSession(() => {
+  if (session().role === null) named = "";
+  nameMachine();
   drawStanding();
   unwatch?.();
   unwatch = session().role === null || !OF_A_MACHINE ? null : watch(drawState);

@@ -9,7 +9,7 @@
 // onZoom({from, to} | null) takes a wish to see a stretch; without it the chart just shows it. onCursor(place | null) is told
 // the place under the cursor. Charts with the same ``sync`` share their cursor. A series may have ``dash``, ``points`` or
 // ``width``; ``steady`` keeps the scale of what moves from trembling, ``zero`` keeps 0 in sight, ``log`` counts in powers
-// of ten, ``time`` is for seconds since 1970, ``level`` [{label, value}] are lines across; of a series with ``band`` and
+// of ten, ``span`` is the least that the scale shows, ``time`` is for seconds since 1970, ``level`` [{label, value}] are lines across; of a series with ``band`` and
 // ``bars`` nothing but its reach is kept.
 
 import {el} from "/static/dom.js";
@@ -237,7 +237,8 @@ function limits(told) {
     if (told.zero) known.push(0);
     if (!known.length) return held ?? [0, 1];
     const [least, most] = [Math.min(...known), Math.max(...known)];
-    const margin = (most - least || Math.abs(most) || 1) * 0.06;
+    const wider = Math.max(0, ((told.span ?? 0) - (most - least)) / 2);
+    const margin = wider || (most - least || Math.abs(most) || 1) * 0.06;
     const wanted = [least - margin, most + margin];
     const fits = held && wanted[0] >= held[0] && wanted[1] <= held[1] && wanted[1] - wanted[0] > 0.4 * (held[1] - held[0]);
     if (!told.steady || !fits) held = wanted;

@@ -12,7 +12,8 @@ const LINES_AROUND = 7;
 const LEAST_UM = 0.001;  // what no drive resolves
 const MOST_NEAR_MM = 5;  // to each side of a place that is shown; less in a small part
 
-export async function showForecast(shown, told, query, context) {
+// ``next`` is what the page shows behind the figures
+export async function showForecast(shown, told, query, context, next) {
   const {t, get} = context;
   const forecast = told.forecast;
   const base = `/api/program/${told.digest}`;
@@ -44,7 +45,7 @@ export async function showForecast(shown, told, query, context) {
 
   const feeds = feedsSection(told, context, (line) => goToLine(line));
   shown.replaceChildren(
-    figures(told, context),
+    figures(told, context), next,
     el("section", {"aria-labelledby": "map-title"},
       el("h2", {id: "map-title"}, t("program.map")),
       el("div", {class: "tools"},
@@ -303,7 +304,7 @@ function figures(told, context) {
   const forecast = told.forecast;
   const {before, after, refused} = forecast;
   const half = after.uncertainty_um;
-  const left = half === null ? number(after.rms_um, 3) : t("program.uncertain", {rms: number(after.rms_um, 3), half: number(half, 2)});
+  const left = half === null ? number(after.rms_um, 3) : t("program.uncertain", {rms: number(after.rms_um, 3), most: number(after.rms_um + half, 2)});
   const rows = [[t("program.before"), number(before.rms_um, 3), number(before.max_um, 3)]];
   if (!refused.length) rows.push([t("program.after", forecast), left, number(after.max_um, 3)]);
   const sure = half === null ? t("program.gain.model") : forecast.gain_at_least === null ? t("program.gain.unsure")

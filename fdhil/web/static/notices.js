@@ -19,8 +19,20 @@ export function answered(notice) {
   return t(given.note ? "events.acknowledged.note" : "events.acknowledged", {...given, time: minute(given.time)});
 }
 
+// "HeartbeatLost" as "Heartbeat lost"; what is written in capitals stays so
+const CAPITALS = ["Nc", "Pdo", "Sync", "Crc", "Pc", "Nmt"];
+export function classWords(code) {
+  const words = code.match(/[A-Z]?[a-z0-9]+|[A-Z]+(?![a-z])/g) ?? [code];
+  return words.map((word, k) => (CAPITALS.includes(word) ? word.toUpperCase() : k ? word.toLowerCase() : word)).join(" ");
+}
+
+export const sentence = (text) => (text ? `${text[0].toUpperCase()}${text.slice(1).replace(/\.$/, "")}.` : "");
+export const classOf = ({code}) => el("span", {class: "class"}, classWords(code), " ", el("code", {}, code));
+export const noticeText = (notice) => sentence(notice.cause ?? notice.text);
+
 export function noticeList(notices) {
   return el("ul", {class: "plain"}, notices.map((notice) => el("li", {},
-    el("p", {}, gravity(notice), " ", el("strong", {}, notice.code), `, ${where(notice)}: ${notice.text}`),
-    el("p", {class: "soft"}, `${minute(notice.time)} (${t("events.number")} ${notice.number}) `, answered(notice)))));
+    el("p", {}, gravity(notice), " ", el("strong", {}, noticeText(notice))),
+    el("p", {class: "soft"}, `${where(notice)}, ${notice.until ? t("events.from.until", {from: minute(notice.time), until: minute(notice.until)}) : minute(notice.time)} (${t("events.number")} ${notice.number}) `,
+      answered(notice), " ", classOf(notice)))));
 }

@@ -34,3 +34,13 @@ export function watch(f) {
 }
 
 export const lookNow = look;
+
+// resolves with true as soon as the status passes the test, with false when it has not within so many ms
+export function until(test, within = 10000) {
+  return new Promise((resolve) => {
+    const end = (passed) => { clearTimeout(timer); queueMicrotask(() => stop()); resolve(passed); };
+    const timer = setTimeout(() => end(false), within);
+    const stop = watch(({status, fault}) => { if (status && !fault && test(status)) end(true); });
+    look();
+  });
+}

@@ -3,13 +3,15 @@
 import english from "/static/text/en.js";
 import {typeset} from "/static/typeset.js";
 
-const LANGUAGES = {en: english};  // another one is a file beside en.js and a line here
-const chosen = (navigator.languages ?? []).map((told) => told.slice(0, 2)).find((told) => told in LANGUAGES) ?? "en";
+const LANGUAGES = ["en", "de", "fr"];  // another one is a file of its name next to en.js, and its name here
+const chosen = (navigator.languages ?? []).map((told) => told.slice(0, 2)).find((told) => LANGUAGES.includes(told)) ?? "en";
+const own = chosen === "en" ? english : (await import(`/static/text/${chosen}.js`)).default;
+document.documentElement.lang = chosen;
 
 export const language = chosen;
 
 export function t(key, values = {}) {
-  const words = LANGUAGES[chosen][key] ?? english[key] ?? key;
+  const words = own[key] ?? english[key] ?? key;
   return typeset(words.replace(/\{(\w+)\}/g, (whole, name) => (name in values ? String(values[name]) : whole)));
 }
 

@@ -1,10 +1,16 @@
-// Arming: choose what, see what it may move, confirm. To disarm asks nothing; the button for that is in the head of every page.
+// Arming: choose what, see its predicted error and what it may move, confirm. To disarm asks nothing; the button for that is
+// in the head of every page.
 
 import {el, faultBox, table} from "/static/dom.js";
 
-export function armingPanel(context) {
+const POLL_MS = 400;
+const FORECAST_METHOD = "inverse";
+const UNSET = "-";
+
+// ``only``: {name, digest} of the one program that may be armed there; else it is chosen in the dialogue
+export function armingPanel(context, only = null) {
   const {t, session} = context;
-  const open = el("button", {type: "button", class: "primary", id: "arm", onclick: () => choose(context)}, t("arm.open"));
+  const open = el("button", {type: "button", class: "primary", id: "arm", onclick: () => choose(context, only)}, t("arm.open"));
   const why = el("p", {class: "soft"});
   const node = el("div", {class: "actions"}, open, why);
   function update(status, fault) {
@@ -18,7 +24,7 @@ export function armingPanel(context) {
   return {node, update, end: () => document.getElementById("arming")?.close()};
 }
 
-async function choose(context) {
+async function choose(context, only) {
   const {t} = context;
   let choice;
   try {
@@ -27,12 +33,15 @@ async function choose(context) {
     context.say(`${fault.code}: ${fault.text}`);
     return;
   }
-  const program = el("select", {id: "arm-program", onchange: () => look()},
-    choice.programs.map(({name}) => el("option", {value: name}, name)),
-    choice.feedforward ? el("option", {value: ""}, t("arm.program.none")) : null);
-  const method = el("select", {id: "arm-method", onchange: () => look()},
-    choice.methods.map((name) => el("option", {value: name, selected: name === "inverse"}, t(`method.${name}`))));
+  const unset = () => el("option", {value: UNSET, selected: true, disabled: true}, t("arm.choose"));
+  const names = choice.programs.map(({name}) => name).filter((name) => only === null || name === only.name);
+  const program = el("select", {id: "arm-program", onchange: () => look()}, only === null ? unset() : null,
+    names.map((name) => el("option", {value: name}, name)),
+    choice.feedforward && only === null ? el("option", {value: ""}, t("arm.program.none")) : null);
+  const method = el("select", {id: "arm-method", onchange: () => look()}, unset(),
+    choice.methods.map((name) => el("option", {value: name}, t(`method.${name}`))));
   const shown = el("div", {"aria-live": "polite", id: "arm-plan"});
+  const predicted = el("p", {"aria-live": "polite", id: "arm-predicted"});
   const told = el("div", {"aria-live": "assertive"});
   const confirm = el("button", {type: "submit", class: "primary", disabled: true}, t("arm.confirm"));
   // the dialog covers the head of the page, and with it the button that must always be there
@@ -40,8 +49,8 @@ async function choose(context) {
   const dialog = el("dialog", {id: "arming", "aria-labelledby": "arm-title"}, el("form", {method: "dialog", onsubmit: act},
     el("h2", {id: "arm-title"}, t("arm.title")),
     el("label", {for: "arm-program"}, t("arm.program")), program,
-    choice.programs.length || choice.feedforward ? null : el("p", {}, t("arm.programs.none")),
-    el("label", {for: "arm-method"}, t("arm.method")), method, shown, told,
+    program.options.length > (only === null) ? null : el("p", {}, only ? t("arm.program.elsewhere", only) : t("arm.programs.none")),
+    el("label", {for: "arm-method"}, t("arm.method")), method, shown, predicted, told,
     el("p", {class: "actions"}, confirm, el("button", {type: "button", onclick: () => dialog.close()}, t("arm.cancel")), disarm)));
   let plan = null;
   let turn = 0;
@@ -52,13 +61,40 @@ async function choose(context) {
     plan = null;
     confirm.disabled = true;
     told.replaceChildren();
+    predicted.textContent = "";
+    if ([program.value, method.value].includes(UNSET) || only && !names.length) return;
     const query = new URLSearchParams({method: method.value, ...(program.value ? {program: program.value} : {})});
     const found = await context.get(`/api/machine/plan?${query}`).catch((fault) => ({fault}));
     if (mine !== turn) return;
     if (found.fault) { shown.replaceChildren(faultBox(found.fault)); return; }
+    if (only && found.program?.sha256 !== only.digest) { shown.replaceChildren(el("p", {class: "fault"}, t("arm.program.elsewhere", only))); return; }
     plan = found;
     confirm.disabled = false;
     shown.replaceChildren(...planNodes(plan, context));
+    if (plan.program) predict(plan, () => mine === turn);
+  }
+
+  // the forecast of the page Program, as it is or made now
+  async function predict({program: {name, sha256}, method: chosen}, current) {
+    if (chosen !== FORECAST_METHOD) { predicted.textContent = t("arm.predicted.none"); return; }
+    predicted.textContent = t("arm.predicting");
+    try {
+      const {programs} = await context.get("/api/program");
+      let told = programs.some(({digest, state}) => digest === sha256 && state !== "failed" && state !== "cancelled")
+        ? await context.get(`/api/program/${sha256}`) : await context.post(`/api/program/named?${new URLSearchParams({name})}`);
+      while (current() && dialog.open && ["waiting", "computing"].includes(told.state)) {
+        await new Promise((resolve) => setTimeout(resolve, POLL_MS));
+        told = await context.get(`/api/program/${told.digest}`);
+      }
+      if (!current()) return;
+      const forecast = told.forecast;
+      const um = (value) => context.number(value, 3);
+      predicted.textContent = !forecast ? t("arm.predicted.failed", {text: told.fault?.text ?? told.state})
+        : forecast.refused.length ? t("arm.predicted.refused", forecast.refused[0])
+          : t("arm.predicted", {before: um(forecast.before.rms_um), after: um(forecast.after.rms_um), max: um(forecast.after.max_um)});
+    } catch (fault) {
+      if (current()) predicted.textContent = t("arm.predicted.failed", {text: fault.text ?? fault.message});
+    }
   }
 
   async function act(event) {
@@ -69,6 +105,8 @@ async function choose(context) {
     try {
       const answer = await context.post("/api/machine/arm",
         {program: plan.program?.name ?? null, method: plan.method, confirm: plan.confirm}, {signal: stopping.signal});
+      told.replaceChildren(el("p", {}, t("arm.waiting")));
+      await context.until((status) => status.armed || status.state === "OFF(SHADOW)");  // closed when the guard says so
       context.say(answer.text);
       dialog.close();
     } catch (fault) {
@@ -85,7 +123,6 @@ async function choose(context) {
   dialog.addEventListener("close", () => { stopping.abort(); dialog.remove(); document.getElementById("arm")?.focus(); });
   document.body.append(dialog);
   dialog.showModal();
-  if (choice.programs.length || choice.feedforward) look();
 }
 
 function planNodes(plan, {t, number, when}) {

@@ -1,8 +1,8 @@
 // Alarms with cause, effect and next action, those that wait in front; black boxes: /events?axis=X&code=C&severity=S.
 
 import {boxesSection} from "/static/black_boxes.js";
-import {el, faultBox} from "/static/dom.js";
-import {dress, gravity, minute, noticeList, where} from "/static/notices.js";
+import {el, faultBox, lamp} from "/static/dom.js";
+import {answered, classOf, classWords, dress, gravity, minute, noticeList, noticeText, sentence, where} from "/static/notices.js";
 import {session} from "/static/session.js";
 import {t} from "/static/text.js";
 
@@ -27,7 +27,7 @@ export async function show(main, path, context) {
   let mark = null;
   const unwatch = context.watch(({status, fault}) => {
     if (fault || !status.unacknowledged) return;
-    const now = JSON.stringify([status.unacknowledged.count, status.unacknowledged.newest.at(-1)?.number, status.notices.at(-1)?.number]);
+    const now = JSON.stringify([status.unacknowledged.count, status.unacknowledged.newest.at(-1)?.number, status.alarms?.active, status.notices.at(-1)?.number]);
     if (mark !== null && now !== mark) again();
     mark = now;
   });
@@ -39,10 +39,10 @@ export async function show(main, path, context) {
   }
 
   function draw() {
-    count.textContent = told.waiting_count
-      ? t("events.waiting.count", {count: told.waiting_count, major: told.waiting_major}) : t("events.waiting.none");
-    waiting.replaceChildren(...(told.waiting_count ? [
-      actAll(), el("ul", {class: "plain"}, told.waiting.map((kind) => el("li", {}, card(kind)))),
+    const {active_count: active, waiting_count: waits, waiting_major: major} = told;
+    count.textContent = told.waiting.length ? t("events.count", {active, waits, major}) : t("events.none");
+    waiting.replaceChildren(...(told.waiting.length ? [
+      actAll(), el("ul", {class: "plain"}, told.waiting.map((alarm) => el("li", {}, card(alarm)))),
     ] : []));
     others.replaceChildren(told.others.length ? noticeList(told.others) : el("p", {}, t("events.others.none")),
       told.older_before ? el("p", {}, el("button", {type: "button", onclick: older}, t("events.older"))) : "");
@@ -63,20 +63,25 @@ export async function show(main, path, context) {
     }, t("events.acknowledge.all", {count: told.waiting_count})));
   }
 
-  function card({newest, numbers, first_time: first, earlier}) {
+  function card({newest, state, until, count: times, numbers, first_time: first, earlier}) {
     const about = t(numbers.length > 1 ? "events.acknowledge.ask.kind" : "events.acknowledge.ask.one", {...newest, count: numbers.length});
     const act = () => askToAcknowledge(about, {notices: numbers}, context).then((done) => done && again());
-    const said = [["events.cause", newest.cause], ["events.effect", newest.effect], ["events.next", newest.action]];
-    const often = numbers.length > 1 ? t("events.times", {count: numbers.length, first: minute(first), last: minute(newest.time)}) : minute(newest.time);
-    return el("article", {"aria-labelledby": `notice-${newest.number}`},
-      el("h3", {id: `notice-${newest.number}`}, gravity(newest), ` ${newest.code}, ${where(newest)}`),
-      el("p", {class: "soft"}, `${often} (${t("events.number")} ${newest.number})`),
-      el("dl", {class: "said"}, said.filter(([, text]) => text).map(([key, text]) => [el("dt", {}, t(key)), el("dd", {}, text)])),
-      earlier.length ? el("details", {}, el("summary", {}, t("events.earlier", {count: numbers.length - 1})),
-        el("ul", {}, earlier.map((told) => el("li", {}, `${minute(told.time)} (${told.number}): ${told.text}`)))) : null,
-      session().acting ? el("p", {class: "actions"}, el("button", {
-        type: "button", onclick: act, "aria-label": t("events.acknowledge.one", newest),
-      }, t("events.acknowledge"))) : null);
+    const active = state === "active", since = minute(newest.time), ended = until ? minute(until) : null;
+    const span = active ? t("events.since", {from: since}) : ended === since ? since : t("events.from.until", {from: since, until: ended});
+    const often = times > 1 ? t("events.times", {count: times, first: minute(first)}) : "";
+    const said = el("dl", {class: "said"}, [["events.effect", newest.effect], ["events.next", newest.action]].filter(([, text]) => text)
+      .map(([key, text]) => [el("dt", {}, t(key)), el("dd", {}, sentence(text))]));
+    const list = earlier.length ? el("ul", {}, earlier.map((told) => el("li", {}, `${minute(told.time)} (${told.number}): ${told.text}`))) : null;
+    const more = el("details", {}, el("summary", {}, list ? t("events.earlier", {count: times - 1}) : t("events.more")), active ? null : said, list);
+    return el("article", {class: state, "aria-labelledby": `notice-${newest.number}`},
+      el("div", {},
+        el("h3", {id: `notice-${newest.number}`}, noticeText(newest)),
+        el("p", {}, lamp(active ? {MAJOR: "bad", minor: "warn"}[newest.severity] : "none", t(`events.state.${state}`)), ` ${span}. ${often} `,
+          el("span", {class: "soft"}, gravity(newest), ` ${where(newest)}, ${t("events.number")} ${newest.number}. `, classOf(newest), " ", numbers.length ? "" : answered(newest))),
+        active ? said : null, active && !list ? null : more),
+      numbers.length && session().acting ? el("button", {
+        type: "button", onclick: act, "aria-label": t("events.acknowledge.one", {...newest, code: classWords(newest.code)}),
+      }, t("events.acknowledge")) : null);
   }
 }
 
@@ -89,7 +94,7 @@ function filter(told, only, context) {
     el("label", {for: `filter-${name}`}, t(`events.filter.${name}`)),
     el("select", {id: `filter-${name}`, name, onchange: change},
       el("option", {value: ""}, t(name === "severity" ? "events.filter.grave" : "events.filter.any")),
-      choices[name].map((value) => el("option", {value, selected: value === only[name]}, name === "severity" ? t(`events.${value}`) : value)))));
+      choices[name].map((value) => el("option", {value, selected: value === only[name]}, name === "severity" ? t(`events.${value}`) : name === "code" ? classWords(value) : value)))));
   function change(event) {
     const next = {...only, [event.target.name]: event.target.value};
     const query = new URLSearchParams(Object.entries(next).filter(([, value]) => value));

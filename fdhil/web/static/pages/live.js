@@ -1,14 +1,21 @@
-// The page live: the signals of the axes as they pass, frozen and enlarged down to single samples.
+// The page live: the chosen signals of the axes and their path as they pass, frozen and enlarged down to single samples.
 
 import {chart} from "/static/chart.js";
 import {el, table} from "/static/dom.js";
 import {Columns, decode} from "/static/pages/live_columns.js";
+import {LivePath} from "/static/pages/live_path.js";
 
 const SECONDS = [1, 2, 5, 10, 20, 60];
 const MOST_COLUMNS = 800, FEWEST_COLUMNS = 150;
 const RETRY_MS = [500, 1000, 2000, 5000];
 const TABLE_MS = 500;
 const NOTE_MS = 5000;
+// in the order of the page: how little a chart shows at least, so that noise at rest looks like noise
+const SPANS = {
+  position_mm: 0.1, demand_mm: 0.1, speed_rad_s: 2, following_error_um: 2, current_a: 1, voltage_v: 2, offset_um: 2, temperature_c: 1,
+};
+const FIRST = ["position_mm", "speed_rad_s", "following_error_um", "current_a", "path"];
+const TALL = 240;
 
 export async function show(main, path, context) {
   const page = new Live(main, path, context);
@@ -20,6 +27,7 @@ class Live {
   constructor(main, path, context) {
     Object.assign(this, {context, main, t: context.t, charts: [], columns: null, frozen: null, tries: 0, over: false, at: null});
     this.wanted = path.query.get("axis")?.split(",") ?? null;
+    this.chosen = new Set(path.query.get("signals")?.split(",") ?? FIRST);
     this.seconds = SECONDS.includes(Number(path.query.get("seconds"))) ? Number(path.query.get("seconds")) : 10;
     this.draw();
   }
@@ -30,6 +38,7 @@ class Live {
     this.state = el("p", {role: "status"}, t("live.connecting"));
     this.note = el("p", {role: "status"});
     this.axes = el("fieldset", {class: "choices"}, el("legend", {}, t("live.axes")));
+    this.signals = el("fieldset", {class: "choices"}, el("legend", {}, t("live.charts")));
     this.select = el("select", {id: "live-seconds", onchange: () => this.look(Number(this.select.value))},
       SECONDS.map((value) => el("option", {value, selected: value === this.seconds}, t("live.seconds.value", {seconds: value}))));
     this.freezing = button("live.freeze", () => (this.frozen ? this.go() : this.freeze()));
@@ -42,11 +51,11 @@ class Live {
     this.main.append(
       el("h1", {}, t("nav.live")),
       el("section", {"aria-label": t("live.controls")},
-        el("div", {class: "choices"}, this.axes, el("span", {}, el("label", {for: "live-seconds"}, t("live.seconds")), this.select)),
+        el("div", {class: "choices"}, this.axes, this.signals, el("span", {}, el("label", {for: "live-seconds"}, t("live.seconds")), this.select)),
         el("div", {class: "actions"}, this.freezing, this.moving),
         this.state, this.note),
       el("section", {}, this.values),
-      el("section", {}, el("h2", {}, t("live.charts")), el("p", {class: "soft"}, t("live.hint")), this.field));
+      el("section", {"aria-label": t("live.charts")}, el("p", {class: "soft"}, t("live.hint")), this.field));
     this.enable();
     this.timer = setInterval(() => this.tell(), TABLE_MS);
   }
@@ -113,11 +122,35 @@ class Live {
       const box = el("input", {type: "checkbox", checked: this.shown.has(axis), onchange: () => this.choose(axis, box.checked)});
       this.axes.append(el("label", {class: `choice series-${begin.axes.indexOf(axis) % 6 + 1}`}, box, ` ${axis}`));
     }
-    this.charts = begin.signals.map(({name, unit}) => chart(this.field, {
-      caption: this.t(`live.${name}`), unit, sync: "live", steady: true, height: 170, x: {label: this.t("live.time"), unit: "s"},
+    this.place = Object.fromEntries(begin.signals.map(({name}, s) => [name, s]));
+    this.units = Object.fromEntries(begin.signals.map(({name, unit}) => [name, name === "speed_rad_s" ? "mm/s" : unit]));
+    this.names = Object.keys(SPANS).filter((name) => name in this.place);
+    this.charts = this.names.map((name) => chart(this.field, {
+      caption: this.t(`live.${name}`), unit: this.units[name], sync: "live", steady: true, height: TALL, span: SPANS[name],
+      x: {label: this.t("live.time"), unit: "s"},
       series: begin.axes.map((axis, k) => ({label: axis, colour: k % 6 + 1, band: true, hidden: !this.shown.has(axis)})),
       onZoom: (stretch) => this.see(stretch), onCursor: (at) => { this.at = at; },
     }));
+    this.path = new LivePath(this.field, TALL);
+    for (const name of [...this.names, ...(begin.axes.length > 1 ? ["path"] : [])]) {
+      const box = el("input", {type: "checkbox", checked: this.chosen.has(name), onchange: () => this.chooseSignal(name, box.checked)});
+      this.signals.append(el("label", {class: "choice"}, box, ` ${this.t(`live.${name}`)}`));
+    }
+  }
+
+  chooseSignal(name, wanted) {
+    if (wanted) this.chosen.add(name); else this.chosen.delete(name);
+    this.remember();
+    if (this.frozen?.samples) this.fetch(this.frozen);
+    else if (this.columns) this.fill(this.frozen?.columns ?? this.columns);
+    this.tell();
+  }
+
+  // a signal as it is shown: the speed is that of the table
+  shownAs(name, axis, {low, high}) {
+    if (name !== "speed_rad_s") return {low, high};
+    const scaled = (values) => values.map((value) => (value === null ? null : value * this.begun.mm_per_rad[axis]));
+    return {low: scaled(low), high: scaled(high)};
   }
 
   choose(axis, wanted) {
@@ -139,16 +172,28 @@ class Live {
 
   remember() {
     const all = this.shown.size === this.begun.axes.length;
-    const query = new URLSearchParams({...(all ? {} : {axis: [...this.shown].join(",")}), seconds: this.seconds});
+    const same = FIRST.length === this.chosen.size && FIRST.every((name) => this.chosen.has(name));
+    const query = new URLSearchParams({
+      ...(all ? {} : {axis: [...this.shown].join(",")}), ...(same ? {} : {signals: [...this.chosen].join(",")}), seconds: this.seconds,
+    });
     history.replaceState({}, "", `/live?${query}`);
   }
 
   fill(columns) {
-    this.charts.forEach((each, s) => {
-      const values = this.begun.axes.map((axis) => columns.of(axis, s));
-      each.figure.hidden = !values.some(({low}) => low.some((value) => value !== null));
-      each.set(columns.x, values);
+    this.drawSignals(columns.x, (axis, name) => columns.of(axis, this.place[name]));
+  }
+
+  // draws what is chosen; ``of`` returns {low, high} of an axis' signal
+  drawSignals(x, of) {
+    this.charts.forEach((each, n) => {
+      const name = this.names[n];
+      each.figure.hidden = !this.chosen.has(name);
+      if (each.figure.hidden) return;
+      const values = this.begun.axes.map((axis) => this.shownAs(name, axis, of(axis, name)));
+      each.set(x, values);
     });
+    const plane = this.begun.axes.filter((axis) => this.shown.has(axis)).slice(0, 2);
+    this.path.show(this.chosen.has("path") && plane.length === 2 && "position_mm" in this.place ? plane : null, of);
   }
 
   // frozen ---------------------------------------------------------------------------------------------------------
@@ -221,11 +266,10 @@ class Live {
       if (this.frozen !== frozen || this.over) return;
       frozen.samples = told;
       const width = told.ticks_per_column;
-      const names = this.begun.signals.map(({name}) => name);
-      const length = told.axes[axes[0]][names[0]].low.length;
+      const length = told.axes[axes[0]].current_a.low.length;
       if (!axes.some((axis) => told.axes[axis].current_a.low.some((value) => value !== null))) this.remark(this.t("live.none"));
       const x = Array.from({length}, (_, k) => (told.first_tick + (k + 0.5) * width - 0.5 - end) * dt);
-      this.charts.forEach((each, s) => each.set(x, axes.map((axis) => told.axes[axis][names[s]])));
+      this.drawSignals(x, (axis, name) => told.axes[axis][name]);
       this.tell();
     } catch (fault) {
       if (fault.name === "AbortError" || this.frozen !== frozen || this.over) return;
@@ -245,7 +289,7 @@ class Live {
 
   tell() {
     const {t, begun, columns, frozen, header} = this;
-    if (!begun) return;
+    if (!begun || !this.names) return;
     const text = (words) => { if (this.state.textContent !== words) this.state.textContent = words; };
     const width_ms = (ticks) => this.context.number(ticks * begun.sync_period_s * 1e3, 3);
     if (frozen?.samples) {
@@ -263,29 +307,38 @@ class Live {
 
   drawValues() {
     const {t, begun, context: {number}} = this;
+    const names = this.names.filter((name) => this.chosen.has(name));
     const columns = this.frozen?.columns ?? this.columns;
     const held = document.activeElement?.closest?.(".scroll") && this.values.contains(document.activeElement);
     const place = this.at === null ? null : this.indexAt(this.at);
     this.values.replaceChildren(table({
       caption: place === null ? t("live.values") : t("live.values.at", {at: number(-this.at, 5)}),
-      head: [t("live.axis"), ...begun.signals.map(({name, unit}) => `${t(`live.${name}`)} (${unit})`)],
-      rows: begun.axes.filter((axis) => this.shown.has(axis)).map((axis) => [axis, ...begun.signals.map((_, s) => {
-        if (place === null) return number(columns.newest(axis, s));
-        const [low, high] = this.valueAt(axis, s, place);
-        return low === high ? number(low) : t("chart.between", {low: number(low), high: number(high)});
+      head: [t("live.axis"), ...names.map((name) => `${t(`live.${name}`)} (${this.units[name]})`)],
+      rows: begun.axes.filter((axis) => this.shown.has(axis)).map((axis) => [axis, ...names.map((name) => {
+        if (place === null) {
+          const value = columns.newest(axis, this.place[name]);
+          return value === null ? "–" : this.fixed(name, this.shownAs(name, axis, {low: [value], high: [value]}).low[0]);
+        }
+        const [low, high] = this.valueAt(axis, name, place).map((value) => (value === null ? null : this.fixed(name, value)));
+        return low === null ? "–" : low === high ? low : t("chart.between", {low, high});
       })]),
     }));
     if (held) this.values.querySelector(".scroll").focus();
   }
 
   indexAt(at) {
-    const plot = this.charts[0]?.plot;
+    const plot = this.charts.find((each) => !each.figure.hidden)?.plot;
     const index = plot ? plot.valToIdx(at) : null;
     return index === undefined ? null : index;
   }
 
-  valueAt(axis, s, index) {
-    const plot = this.charts[s].plot, k = 1 + 2 * this.begun.axes.indexOf(axis);
+  // as many decimals for every value of a signal, so that digits do not jump
+  fixed(name, value) {
+    return this.context.decimal(value, name.endsWith("_mm") ? 3 : name === "current_a" ? 2 : 1);
+  }
+
+  valueAt(axis, name, index) {
+    const plot = this.charts[this.names.indexOf(name)].plot, k = 1 + 2 * this.begun.axes.indexOf(axis);
     return [plot.data[k][index] ?? null, plot.data[k + 1][index] ?? null];
   }
 

@@ -1,21 +1,26 @@
 // Programs before they are cut: drop one, see where and why it errs, without and with the correction.
 
-import {el, faultBox, table} from "/static/dom.js";
+import {el, faultBox, lamp, table} from "/static/dom.js";
 import {showForecast} from "/static/forecast.js";
+import {minute} from "/static/notices.js";
+import {armingPanel} from "/static/pages/arming.js";
 
-const POLL_MS = 400;
+const POLL_MS = 400, PASSES = 5, JOBS = 10, NAMED = 20;
 const OVER = ["done", "failed", "cancelled"];
 
 export async function show(main, path, context) {
   const {t} = context;
   const [digest] = path.rest;
   await useStyles();
-  const kept = await context.get("/api/program");
+  const [kept, {programs: named}] = await Promise.all([context.get("/api/program"), context.get("/api/machine/programs")]);
   kept.programs = kept.programs.filter((each) => each.digest !== digest);
   const shown = el("div", {});
-  const drop = dropPlace(kept, context);
-  main.append(el("h1", {}, t("program.title")), ...(digest ? [shown, drop] : [drop]), await learning(context));
-  return digest ? follow(shown, digest, path.query, context) : null;
+  const drop = dropPlace(kept, named, context);
+  const running = digest ? el("div", {}) : null;
+  main.append(el("h1", {}, t("program.title")), ...(digest ? [shown, drop] : [drop]), await jobs(context), await learning(context));
+  if (!digest) return null;
+  const ends = [follow(shown, digest, path.query, context, running, (told) => ends.push(onTheMachine(running, told, context)))];
+  return () => ends.forEach((end) => end());
 }
 
 // wait until the styles are there, so that nothing is drawn without them
@@ -25,7 +30,7 @@ export function useStyles() {
   return new Promise((drawn) => document.head.append(el("link", {rel: "stylesheet", href: place, onload: drawn, onerror: drawn})));
 }
 
-function dropPlace(kept, context) {
+function dropPlace(kept, named, context) {
   const {t} = context;
   const megabytes = Math.floor(kept.largest_bytes / 2 ** 20);
   const told = el("div", {"aria-live": "polite"});
@@ -52,6 +57,15 @@ function dropPlace(kept, context) {
     }
   }
 
+  // forecast again: its parameters may be newer
+  async function takeNamed(name) {
+    try {
+      context.go(`/program/${(await context.post(`/api/program/named?${new URLSearchParams({name})}`)).digest}`);
+    } catch (fault) {
+      told.replaceChildren(faultBox(fault));
+    }
+  }
+
   const over = (on) => (event) => { event.preventDefault(); box.classList.toggle("over", on); };
   box.addEventListener("dragover", over(true));
   box.addEventListener("dragleave", over(false));
@@ -59,12 +73,14 @@ function dropPlace(kept, context) {
   return el("section", {"aria-labelledby": "program-drop"},
     el("h2", {id: "program-drop"}, t("program.drop.title")),
     el("p", {}, t("program.drop.text")), box, told,
+    named.length ? el("div", {}, el("h3", {}, t("program.named")), el("ul", {class: "actions plain"}, named.slice(0, NAMED).map(({name}) => el("li", {},
+      el("button", {type: "button", class: "quiet", onclick: () => takeNamed(name)}, name))))) : null,
     kept.programs.length ? el("div", {}, el("h3", {}, t("program.kept")), el("ul", {}, kept.programs.map((each) => el("li", {},
       el("a", {href: `/program/${each.digest}`}, each.name), each.state === "done" ? "" : ` (${t(`program.state.${each.state}`)})`)))) : null);
 }
 
 // asks until the forecast is over, then shows it; returns what ends it
-function follow(shown, digest, query, context) {
+function follow(shown, digest, query, context, next, onDone) {
   const {t} = context;
   const words = el("span", {});
   const cancel = el("button", {type: "button", onclick: () => context.post(`/api/program/${digest}/cancel`).catch(() => null)}, t("program.cancel"));
@@ -91,7 +107,10 @@ function follow(shown, digest, query, context) {
 
   async function conclude(told) {
     if (waiting.isConnected) context.say(t(`program.${told.state}`, told));
-    if (told.state === "done") end = await showForecast(shown, told, query, context);
+    if (told.state === "done") {
+      end = await showForecast(shown, told, query, context, next);
+      if (!ended) onDone(told);
+    }
     else if (told.state === "failed") shown.replaceChildren(el("section", {}, el("h2", {}, told.name), faultBox(told.fault)));
     else shown.replaceChildren(el("section", {}, el("p", {}, t("program.cancelled", told))));
     if (ended) end?.();
@@ -121,13 +140,56 @@ async function learning(context) {
       each.passes, number(each.without_um, 3),
       {text: each.curve_um.slice(-10).map((um) => number(um, 3)).join("  "), class: "word"}, curve(each, t)]),
   }));
-  part.append(el("p", {}, told.daemon ? (told.passes.length ? "" : t("program.passes.none")) : t("program.passes.silent")));
-  if (told.passes.length) part.append(table({
-    caption: t("program.passes.caption"),
-    head: [t("program.learning.program"), t("program.learning.passes"), t("program.passes.measured"), t("program.passes.predicted"), {text: t("program.passes.ended"), class: "word"}],
-    rows: told.passes.map((each) => [
-      each.program.split("/").pop(), each.pass, number(each.measured.rms_um, 3), number(each.predicted.rms_um, 3), {text: each.ended_by, class: "word"}]),
-  }));
+  return part;
+}
+
+// arm what was judged, and see its passes: measured next to predicted
+function onTheMachine(place, told, context) {
+  const {t, number} = context;
+  const arming = armingPanel(context, {name: told.name, digest: told.digest});
+  const state = el("p", {role: "status"}), passes = el("div", {});
+  place.replaceChildren(el("section", {"aria-labelledby": "program-machine"},
+    el("h2", {id: "program-machine"}, t("program.machine")), state, arming.node, passes));
+  let drawn = "";
+  const stop = context.watch(({status, fault}) => {
+    arming.update(status, fault);
+    const own = (status?.passes ?? []).filter((each) => each.program_digest === told.digest).slice(-PASSES).reverse();
+    const armed = status?.armed?.program_digest === told.digest;
+    const key = JSON.stringify([armed, status?.state, own.map((each) => each.pass)]);
+    if (key === drawn) return;
+    drawn = key;
+    state.textContent = armed ? t(`guard.${status.guard?.state ?? "absent"}`) : t("program.machine.not_armed");
+    passes.replaceChildren(own.length ? table({
+      caption: t("program.machine.passes"), head: [t("program.jobs.pass"), t("program.passes.predicted"), t("program.passes.measured"), t("program.jobs.max")],
+      rows: own.map((each) => [each.pass, number(each.predicted.rms_um, 3), number(each.measured.rms_um, 3), number(each.measured.max_um, 3)]),
+    }) : "");
+  });
+  return () => { stop(); arming.end(); };
+}
+
+// every pass that the history keeps, a page at a time
+async function jobs(context) {
+  const {t, number} = context;
+  const part = el("section", {"aria-labelledby": "program-jobs"}, el("h2", {id: "program-jobs"}, t("program.jobs")));
+  const {jobs: all} = await context.get("/api/program/jobs");
+  if (!all.length) { part.append(el("p", {}, t("program.jobs.none"))); return part; }
+  const list = el("div", {});
+  const more = el("button", {type: "button", onclick: () => draw(shown + JOBS)}, t("program.jobs.more"));
+  let shown = 0;
+  function draw(count) {
+    shown = count;
+    list.replaceChildren(table({
+      caption: t("program.jobs.caption"), stack: true,
+      head: [t("program.learning.program"), t("program.jobs.when"), t("program.jobs.pass"), t("program.jobs.without"), t("program.passes.predicted"),
+        t("program.passes.measured"), t("program.jobs.max"), {text: t("program.passes.ended"), class: "word"}],
+      rows: all.slice(0, shown).map((each) => [each.program, minute(each.time), each.pass, number(each.without_um, 3), number(each.predicted_um, 3),
+        {text: lamp({info: "good", minor: "warn", MAJOR: "bad"}[each.severity], number(each.measured_um, 3))}, number(each.max_um, 3),
+        {text: each.ended_by ?? t("program.jobs.whole"), class: "word"}]),
+    }));
+    more.hidden = shown >= all.length;
+  }
+  draw(JOBS);
+  part.append(list, more);
   return part;
 }
 

@@ -4,6 +4,7 @@ import {el, faultBox, lamp, table} from "/static/dom.js";
 import {decimal, number, t, when} from "/static/text.js";
 
 const MOST_COMPARED = 2;
+const PAGE = {wide: 25, narrow: 10};
 
 export async function show(main, path, context) {
   dress();
@@ -93,7 +94,9 @@ class List {
     this.asking?.abort();
     const asking = this.asking = new AbortController();
     try {
-      const told = await this.context.get(this.address("/api/rapids", ["axis", "verdict", "code", "before"]), {signal: asking.signal});
+      const limit = PAGE[matchMedia("(max-width: 40rem)").matches ? "narrow" : "wide"];
+      const address = this.address("/api/rapids", ["axis", "verdict", "code", "before"]);
+      const told = await this.context.get(`${address}${address.includes("?") ? "&" : "?"}limit=${limit}`, {signal: asking.signal});
       this.draw(told);
       return told.rapids.length;
     } catch (fault) {

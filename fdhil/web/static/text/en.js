@@ -20,6 +20,7 @@ export default {
   "page.missing": "There is no page at this address.",
   "page.failed": "This page could not be shown: {text}",
   "page.loading": "Loading …",
+  "times.zone": "Times in the zone {zone}",
   "skip": "Skip to content",
   "login": "Log in",
   "login.title": "Log in",
