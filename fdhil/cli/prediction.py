@@ -15,7 +15,7 @@ import click
 from fdhil import tables
 from fdhil.cli.compiling import forewarn
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, FILE, OutputFile, Positive, Writing
+from fdhil.cli.options import AS_JSON, CONFIG_OPTION, FILE, OutputFile, Positive, Writing
 from fdhil.records import INTERVAL_95
 from fdhil.report.parameter_view import MEANING
 
@@ -54,9 +54,7 @@ def _shared(wanted: Callable[..., int | None]) -> Callable[..., int | None]:
     for option in reversed(
         (
             click.argument("program", type=FILE, metavar="PROGRAM|DEMAND.csv"),
-            click.option(
-                "--config", "config_path", type=FILE, required=True, help="The machine's configuration (TOML)."
-            ),
+            CONFIG_OPTION,
             click.option("--model", "model_path", type=FILE, help="Parameters of each axis (JSON)."),
             click.option("--from-history", is_flag=True, help="Use the newest validated parameters of the store."),
             click.option("--out", type=OutputFile(), help="Write a CSV with a row per SYNC period."),

@@ -120,7 +120,7 @@ def _tell(out: Path, recorded: RecordedDemand | None, written: bool) -> None:
         click.echo(NOTHING_MOVED, err=True)
         return
     rows = recorded.reference.time_s.size
-    click.echo(f"{rows} rows, {recorded.reference.time_s[-1]:.3f} s" + (f", written to {out}" if written else ""))
+    click.echo(f"{rows} rows, {recorded.reference.time_s[-1]:.3f} s")
     for gap in recorded.gaps[:_SHOWN_GAPS]:
         lost, at_s = gap.stop - gap.first, recorded.reference.time_s[gap.first]
         click.echo(f"lost: {lost} rows of axis {gap.axis} at {at_s:.3f} s", err=True)

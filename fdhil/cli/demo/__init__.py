@@ -127,4 +127,5 @@ def _tables(loop: Loop, realistic: Realistic, report: Path) -> None:
         console.print(table)
     before, mirror, after = loop.cuts[:3]
     gains = f"mirror {before.rms_um / mirror.rms_um:.1f}, inverse {before.rms_um / after.rms_um:.1f}"
-    console.print(f"RMS contour error, measured, smaller by a factor of: [bold]{gains}[/]. Report: {report}")
+    console.print(f"RMS contour error, measured, smaller by a factor of: [bold]{gains}[/].")
+    console.print(f"wrote {report}", soft_wrap=True)
