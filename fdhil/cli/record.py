@@ -59,7 +59,7 @@ def record(config: Path, out: Path, seconds: float | None, rest: float, with_gap
     if as_json:
         click.echo(json.dumps(_document(out, recorded, written)))
     else:
-        _tell(out, recorded, written)
+        _tell(recorded, written)
     if recorded is None or not recorded.complete:
         click.get_current_context().exit(1)
 
@@ -115,7 +115,7 @@ def _document(out: Path, recorded: RecordedDemand | None, written: bool) -> dict
     }
 
 
-def _tell(out: Path, recorded: RecordedDemand | None, written: bool) -> None:
+def _tell(recorded: RecordedDemand | None, written: bool) -> None:
     if recorded is None:
         click.echo(NOTHING_MOVED, err=True)
         return
