@@ -48,6 +48,7 @@ class _Ended(NamedTuple):
     due_s: float
     cause: str
     summary: Mapping[str, Any]
+    late: str
 
 
 class Passes:
@@ -97,11 +98,11 @@ class Passes:
         if self._running is not None:
             self._running.hear_nc(state)
 
-    def end(self, cause: str, summary: Mapping[str, Any]) -> None:
-        """The guard has ended the correction."""
+    def end(self, cause: str, summary: Mapping[str, Any], late: str = "") -> None:
+        """The guard has ended the correction; ``late`` says how late this computer was where that was the cause."""
         if self._running is not None:
             due_s = self._clock.now_s() + LATE_S
-            self._ended.append(_Ended(self._running, self._models, due_s, cause, summary))
+            self._ended.append(_Ended(self._running, self._models, due_s, cause, summary, late))
             self._running = None
 
     def digest(self) -> list[Notice]:
@@ -129,6 +130,7 @@ class Passes:
             "program_digest": digest,
             "pass": self._count[digest],
             "ended_by": ended.cause,
+            "late": ended.late,
             **measured,
             "predicted": {key: summary["after"].get(key) for key in ("rms_um", "uncertainty_um")},
             "predicted_without": {"rms_um": summary["before"]["rms_um"]},
@@ -333,7 +335,9 @@ def _text(told: Mapping[str, Any]) -> str:
     if gain["predicted"] is not None and gain["measured"] is not None:
         text += f"; gain {gain['measured']:.3g}, predicted {gain['predicted']:.3g}"
     text += ")"
-    return text if told["ended_by"] == FINISHED else f"{text}; it was ended by {told['ended_by']}"
+    if told["ended_by"] == FINISHED:
+        return text
+    return f"{text}; it ended early: {told['late'] or told['ended_by']}"
 
 
 def _lesson_text(lesson: Lesson) -> str:
@@ -344,6 +348,8 @@ def _lesson_text(lesson: Lesson) -> str:
 def _notice(told: Mapping[str, Any], text: str) -> Notice:
     """Say what was measured, and louder where it is not what was promised."""
     measured, half = told["measured"]["rms_um"], told["predicted"]["uncertainty_um"]
+    if told["late"]:
+        return Notice("PassMeasured", "minor", f"{text}; take load off this PC, then arm again")
     if measured > WORSE * told["predicted_without"]["rms_um"]:
         return Notice("PassMeasured", "MAJOR", f"{text}: worse than without; leave it off and identify again")
     if half is not None and measured > told["predicted"]["rms_um"] + half:

@@ -89,11 +89,11 @@ def read_pass(path: Path) -> dict[str, Any]:
     def errors(um: "Float") -> dict[str, float]:
         return {"rms_um": rms(um), "max_um": float(np.max(np.abs(um)))}
 
-    path, table = (table_path(axes, each) for each in (reference, actual))
+    programmed, table = (table_path(axes, each) for each in (reference, actual))
     return {
         "file": str(path),
         "rows": int(time_s.size),
-        "contour": errors(contour_error_um(path, table, float(np.median(np.diff(time_s))))),
+        "contour": errors(contour_error_um(programmed, table, float(np.median(np.diff(time_s))))),
         "axes": {axis: errors(1e3 * (actual - reference)[:, k]) for k, axis in enumerate(axes)},
     }
 

@@ -103,8 +103,8 @@ def test_stopped_trial_goes_on_within_the_room_that_it_began_with(bench: Bench) 
             raise KeyboardInterrupt
 
     progress = Progress(bench.config.store.directory, "X")
+    operator = Operator(bench.report, bench.look, results.__setitem__, stop_in_the_rapid)
     with pytest.raises(KeyboardInterrupt):
-        operator = Operator(bench.report, bench.look, results.__setitem__, stop_in_the_rapid)
         try_axis(bench.config, bench.record, ROOM, operator, progress)
     stood_mm = bench.stands_mm
     assert stood_mm > 40.0
