@@ -54,6 +54,8 @@ def show(status: Mapping[str, Any], console: Console | None = None) -> None:
         out.print(escape(nc_line(nc)))
     loads = "".join(f", {bus} loaded {load:.0f} %" for bus, load in status["bus_load_percent"].items())
     out.print(escape(f"correction: {status['state']}, guard {_guard(guard)}{loads}"))
+    if lateness := guard.get("lateness"):
+        out.print(lateness_line(lateness["recent"]))
     stands = status.get("may_stand", {"nothing": True})
     if guard.get("state") == "lost":
         out.print(f"[red]{escape(guard['text'])}[/red]")
@@ -122,6 +124,14 @@ def _guard(guard: Mapping[str, Any]) -> str:
     if state == "lost":
         return f"lost, heard {_ago(heard_s)} ago in state {guard.get('last_state')}"
     return state if heard_s <= GUARD_LIVE_S else f"{state} when it answered last, {_ago(heard_s)} ago"
+
+
+def lateness_line(recent: Mapping[str, Any]) -> str:
+    """Say how late this PC was in the last minute or two, as the guard measured it."""
+    worst = f"the slowest after {recent['worst_us'] / 1e3:.2f} ms"
+    if not recent["late"]:
+        return f"this PC: none of the last {grouped(recent['turns'])} offsets late, {worst}"
+    return f"[red]this PC: {grouped(recent['late'])} of the last {grouped(recent['turns'])} offsets late[/red], {worst}"
 
 
 def nc_line(nc: Mapping[str, Any]) -> str:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from fdhil.store.rows import Revision, StoredWindow
 
 NEWEST_NOTICES = 500
+PASS = "PassMeasured"
 
 
 def read_history(
@@ -73,6 +74,16 @@ def read_notices(machine: MachineConfig, axis: str | None = None) -> list[dict[s
         known = stored.notices(limit=RECENT_NOTICES)
     asking = [n for n in known if n.notice.severity != "info" and axis in (None, n.notice.axis)]
     return [notice_document(notice) for notice in asking[-NEWEST_NOTICES:]]
+
+
+def read_passes(machine: MachineConfig) -> list[dict[str, Any]]:
+    """Return the notices of the passes that were cut corrected, oldest first. StoreError."""
+    from fdhil.store.history import RECENT_NOTICES, History
+    from fdhil.store.notice_document import notice_document
+
+    with History.read(machine.store.directory) as stored:
+        known = stored.notices(limit=RECENT_NOTICES)
+    return [notice_document(notice) for notice in known if notice.notice.code == PASS]
 
 
 def _row(revision: Revision) -> dict[str, Any]:

@@ -115,7 +115,7 @@ def test_stopped_trial_goes_on_within_the_room_that_it_began_with(bench: Bench) 
     assert bench.steps == ["timing", "return", "test rapids", "restore", "identification", "acceptance"]
     assert float(results["room"]["stands"].split()[0]) == pytest.approx(stood_mm, abs=0.02)
     assert (results["room"]["from"], results["room"]["to"]) == ("-2.000 mm", "130.000 mm")
-    assert "toward minus at 20 mm/s" in results["room"]["return"]
+    assert "toward minus at 20 mm/s" in str(results["room"]["return"])
     assert min(positions) > -2.0
     assert max(positions) < 130.0
     assert tried.found.keys() >= {"jog", "test rapids", "identification", "acceptance"}

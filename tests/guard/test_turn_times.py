@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 
@@ -60,7 +60,9 @@ def test_late_offsets_explain_what_a_drive_shows_soon_after_them_and_nothing_els
 
 
 @pytest.mark.parametrize(("clock", "refused"), [("monotonic", True), ("sync", False)])
-def test_arming_is_refused_above_the_stated_share_of_late_turns(clock: str, refused: bool) -> None:
+def test_arming_is_refused_above_the_stated_share_of_late_turns(
+    clock: Literal["monotonic", "sync"], refused: bool
+) -> None:
     turns = TurnTimes(replace(MADE, clock=clock))
     allowed = round(MOST_LATE * LEAST_TURNS * 2)
     for k in range(2 * LEAST_TURNS):
@@ -89,7 +91,7 @@ def test_guard_refuses_to_arm_on_a_late_pc_and_shows_how_late(make: Callable[...
     now_s = shop.guard._now_s()
     for _ in range(2 * LEAST_TURNS):
         shop.guard._turns.add(0.4, True, now_s)
-    asked = {
+    asked: dict[str, dict[str, Any]] = {
         "arm": {"program_digest": DIGEST, "facts": dict(FACTS_GIVEN)},
         "feedforward": {"facts": FACTS, "laws": LAW},
     }
