@@ -22,7 +22,7 @@ from fdhil.correction.learning import Lesson
 from fdhil.errors import StoreError
 from fdhil.prediction import contour_error_um
 from fdhil.prediction.contour import WINDOW_S
-from fdhil.prediction.gain import plus_minus
+from fdhil.prediction.gain import at_most
 from fdhil.records import AxisSamples, Float, Int, MoveKind, NcState, Notice, Parameters, Reason, table_path
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
@@ -327,9 +327,10 @@ def _gains(summary: Mapping[str, Any], measured: Mapping[str, Any]) -> dict[str,
 
 def _text(told: Mapping[str, Any]) -> str:
     name, measured, half = Path(told["program"]).name, told["measured"], told["predicted"]["uncertainty_um"]
-    spread = "" if half is None else f" {plus_minus(half, 2)}"
+    predicted = told["predicted"]["rms_um"]
+    shown = f"{predicted:.2f} by the model" if half is None else at_most(predicted, half)
     text = f"pass {told['pass']} of {name}: contour error measured {measured['rms_um']:.2f} um RMS,"
-    text += f" {measured['max_um']:.1f} at most (predicted {told['predicted']['rms_um']:.2f}{spread};"
+    text += f" {measured['max_um']:.1f} at most (predicted {shown};"
     text += f" without correction {told['predicted_without']['rms_um']:.1f} predicted"
     gain = told["gain"]
     if gain["predicted"] is not None and gain["measured"] is not None:

@@ -48,6 +48,10 @@ def _shared(wanted: Callable[..., int | None]) -> Callable[..., int | None]:
 
     @functools.wraps(wanted)
     def command(**options: Any) -> int | None:
+        if options["report"] or options["pdf"]:
+            from fdhil.report import require
+
+            require()  # before the work
         own = {name: value for name, value in options.items() if name not in Asked.__dataclass_fields__}
         return wanted(Asked(**{name: options[name] for name in Asked.__dataclass_fields__}), **own)
 
@@ -195,9 +199,7 @@ def _report(asked: Asked, config: MachineConfig, found: Prediction | Correction,
     if asked.report is None and asked.pdf is None:
         return
     from fdhil.records import Prediction
-    from fdhil.report import deliver, require
-
-    require()
+    from fdhil.report import deliver
     from fdhil.report.path import correction_page, prediction_page
 
     name, machine = asked.program.name, config.machine.name

@@ -108,7 +108,13 @@ def by_axis(
             axis,
             [row for row in rows if row["axis"] == axis],
             told.get(axis),
-            machine.axis[axis].nominal.model_dump() if axis in machine.axis else {},
+            _nominal(machine, axis) if axis in machine.axis else {},
         )
         for axis in axes
     ]
+
+
+def _nominal(machine: MachineConfig, axis: str) -> dict[str, float]:
+    """Return the nominal values that somebody knows: a guess is none."""
+    settings = machine.axis[axis]
+    return settings.nominal.model_dump(exclude=set[str](settings.guessed))

@@ -114,7 +114,7 @@ async def test_each_pass_is_told_beside_what_was_predicted(
             answer = await shop.arm(program)
             assert answer["ok"], answer
             assert "is predicted to become" in answer["text"]
-            assert " ± " in answer["text"]
+            assert "um RMS (95 %), " in answer["text"]
             assert answer["after"]["uncertainty_um"] > 0.5  # no better than the last moves were predicted
             for block in heard(reference, is_at):
                 shop.desk.hear(block)

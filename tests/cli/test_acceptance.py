@@ -127,7 +127,8 @@ def test_report_has_a_header_passes_open_notices_and_lateness(
     assert "no limit was set" in out
     shown = html.unescape(page.read_text("utf-8"))
     for words in (
-        "Muster AG", "Hall 3", f"X {RECORD.serial}, Y {RECORD.serial}", "pass 1 of p.ngc", "LimitActive: an internal limit is active",
+        "Muster AG", "Hall 3", f"X {RECORD.serial}, Y {RECORD.serial}", "pass 1 of p.ngc",
+        "LimitActive: an internal limit is active",
         "No limit was set", f"of {measured['turns']} wake-ups",
     ):  # fmt: skip
         assert words in shown, words

@@ -73,3 +73,25 @@ def test_unknown_word_is_answered_by_the_nearest_one(typed: list[str], meant: st
     code, _, err = fdhil(*typed, capsys=capsys)
     assert code == 2
     assert f"Did you mean '{meant}'" in err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("demo", "--out", "out"),
+        ("paper", "--out", "out"),
+        ("predict", "part.csv", "--report", "r.html"),
+        ("report", "--out", "r.html"),
+        ("acceptance", "--out", "r.html"),
+        ("history", "--plot", "h.svg"),
+    ],
+)
+def test_missing_library_is_named_before_anything_is_started(
+    arguments: tuple[str, ...], folder: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = set(folder.iterdir())
+    monkeypatch.setattr("fdhil.report.page.find_spec", lambda _name: None)
+    code, out, err = fdhil(*arguments, capsys=capsys)
+    assert (code != 0, out) == (True, "")
+    assert err == "fdhil: a report needs two libraries (the extra 'report'): pip install jinja2 matplotlib\n"
+    assert set(folder.iterdir()) == before

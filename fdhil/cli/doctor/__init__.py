@@ -29,7 +29,7 @@ SCHEMA = "fdhil-doctor-1"
 @CONFIG
 @click.option("--offline", is_flag=True, help="Look at this PC alone, and leave buses and sensors in peace.")
 @click.option("--latency", "seconds", type=Positive(1.0, 86_400.0), metavar="SECONDS",
-              help="Measure for so long how late this PC wakes up; the acceptance report lists the result.")  # fmt: skip
+              help="Measure for so long how late this PC wakes up; the acceptance report lists it.")  # fmt: skip
 @AS_JSON
 @verdict
 def doctor(config: Path, offline: bool, seconds: float | None, as_json: bool) -> int:

@@ -85,8 +85,8 @@ def latency_text(found: Mapping[str, Any]) -> str:
     """Return a measurement in one sentence."""
     return (
         f"of {found['turns']} wake-ups every {found['period_us'] / 1e3:g} ms half were at most "
-        f"{found['p50_us']:.0f} us late, 99.9 % {found['p999_us']:.0f} us, the worst {found['worst_us']} us; {found['late']} by more than a "
-        f"period ({found['scheduling']})"
+        f"{found['p50_us']:.0f} us late, 99.9 % {found['p999_us']:.0f} us, the worst {found['worst_us']} us; "
+        f"{found['late']} by more than a period ({found['scheduling']})"
     )
 
 
