@@ -9,7 +9,7 @@ from fdhil.prediction.circular import Circular
 from fdhil.report import Page, Section, Table
 from fdhil.report.circular import polar
 from fdhil.report.history_verdict import LATEST_HEAD, latest_rows
-from fdhil.report.parameter_view import MEANING
+from fdhil.report.parameter_view import MEANING, minute
 from fdhil.report.path import correction_page
 
 CIRCLE_ROWS = (
@@ -131,14 +131,13 @@ def _running(found: Findings) -> Section:
     """What was measured while it ran: the passes with the correction, what waits for an answer, how late the PC is."""
     head = ("time", "severity", "what")
     passes, notices = (
-        [[f"{n['time'][:16].replace('T', ' ')} UTC", n["severity"], n["text"]] for n in told]
-        for told in (found.passes, found.notices)
+        [[minute(n["time"]), n["severity"], n["text"]] for n in told] for told in (found.passes, found.notices)
     )
     tables = [Table(head, rows, title) for rows, title in
               ((passes, "Passes with the correction"), (notices, "Open notices")) if rows]  # fmt: skip
     late = "How late this PC is was not measured: run fdhil doctor --latency 600."
     if found.latency is not None:
-        late = f"This PC, measured {found.latency['time'][:16].replace('T', ' ')} UTC: {latency_text(found.latency)}."
+        late = f"This PC, measured {minute(found.latency['time'])}: {latency_text(found.latency)}."
     none = [what for what, rows in (("No pass was cut with the correction.", passes), ("No notice is open.", notices))
             if not rows]  # fmt: skip
     return Section("In operation", " ".join([*none, late]), tables)

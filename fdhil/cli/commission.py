@@ -142,6 +142,8 @@ def _progress_of(machine: MachineConfig, axis: str) -> Progress:
 
 def _tell_plan(machine: MachineConfig, axes: list[str], asked: Asked) -> int:
     """Say what would be done; 1 where the room is too small for it."""
+    from fdhil.report.parameter_view import minute
+
     plans: dict[str, list[dict[str, Any]]] = {}
     refused = None
     for axis in axes:
@@ -155,7 +157,7 @@ def _tell_plan(machine: MachineConfig, axes: list[str], asked: Asked) -> int:
     for axis, steps in plans.items():
         asked.say(f"axis {axis}, nothing is sent now:")
         for number, step in enumerate(steps, 1):
-            done = f" Done {step['done_utc']}, kept if the drive is the same." if step["done_utc"] else ""
+            done = f" Done {minute(step['done_utc'])}, kept if the drive is the same." if step["done_utc"] else ""
             asked.say(f"  {number} of {len(steps)}, {step['step']}: {told(step['does'], step['moves'])}{done}")
     if refused is not None:
         click.echo(f"refused: {refused}", err=True)

@@ -58,7 +58,9 @@ class Guide:
 
     def kept(self, name: str, step: Step) -> None:
         """Report that a step need not be done, and what it found."""
-        self._say(f"{self._head(name)}: kept, it was done {step.done_utc}; {result_text(name, step.found)}")
+        from fdhil.report.parameter_view import minute
+
+        self._say(f"{self._head(name)}: kept, it was done {minute(step.done_utc)}; {result_text(name, step.found)}")
 
     def result(self, step: str, found: Found) -> None:
         """Report what a step found."""

@@ -193,8 +193,8 @@ def believed(axis: Mapping[str, Any]) -> str:
         for name, told in (axis.get("terms") or {}).items()
     )
     left, table = axis.get("unexplained_um"), (axis.get("last_window") or {}).get("at_table")
-    seen = f"the table was {table['error_rms_um']:.3g} um RMS off in the last rapid" if table else ""
-    parts = [terms, "" if left is None else f"{left:.2g} um of a rapid unexplained", seen, *axis.get("warnings", [])]
+    seen = f"the table was {table['error_rms_um']:.2f} um RMS off in the last rapid" if table else ""
+    parts = [terms, "" if left is None else f"{left:.2f} um of a rapid unexplained", seen, *axis.get("warnings", [])]
     return "; ".join(part for part in parts if part)
 
 
@@ -231,7 +231,7 @@ def show_history(rows: Sequence[Mapping[str, Any]], console: Console | None = No
         names = list(of_axis[0]["parameters"])
         first, last = (of_axis[k]["time"][:10] for k in (0, -1))
         table = narrow_table(f"axis {axis}: {len(of_axis)} revisions, {first} to {last}")
-        for text in ("rev", "time", "degC", "win", *map(head, names)):
+        for text in ("rev", "time\nUTC", "degC", "win", *map(head, names)):
             table.add_column(text, no_wrap=True)
         for row in of_axis[-newest:]:
             degrees = "-" if row["temperature_c"] is None else f"{row['temperature_c']:.1f}"
