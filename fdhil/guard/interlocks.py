@@ -64,6 +64,7 @@ class Alarm:
 
 
 Alarms = tuple[Alarm, ...]
+LATE = "this PC was late"
 _R, _H, _F, _N = Reaction.RAMP_DOWN, Reaction.HOLD, Reaction.FREEZE, Reaction.REFUSE
 # class: (reaction while sending, cause, next action)
 CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {

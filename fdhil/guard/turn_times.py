@@ -11,6 +11,7 @@ from collections import deque
 from math import inf
 from typing import Any, NamedTuple
 
+from fdhil.guard.interlocks import LATE
 from fdhil.guard.settings import Settings
 
 BINS_US = (20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000, 20_000, 50_000)
@@ -65,7 +66,8 @@ class TurnTimes:
         """Return how late this computer was where that explains what a drive shows; empty where it does not."""
         if code not in CONSEQUENCES or now_s - self._latest_s > RECENT_S:
             return ""
-        return f"this PC was late ({self._late} offsets, worst {self._late_worst_s * 1e3:.1f} ms)"
+        offsets = "1 offset" if self._late == 1 else f"{self._late} offsets"
+        return f"{LATE} ({offsets}, worst {self._late_worst_s * 1e3:.1f} ms)"
 
     def refusal(self) -> str:
         """Return why nothing may be armed on this computer now; empty where it may."""

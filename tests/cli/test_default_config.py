@@ -67,7 +67,7 @@ def test_predict_takes_machine_toml_and_reports_what_it_wrote(folder: Path, caps
 
 
 @pytest.mark.parametrize(
-    ("typed", "meant"), [(["stauts"], "status"), (["fleet", "colect"], "collect"), (["status", "--wach"], "--watch")]
+    ("typed", "meant"), [(["xstatus"], "status"), (["fleet", "colect"], "collect"), (["status", "--wach"], "--watch")]
 )
 def test_unknown_word_is_answered_by_the_nearest_one(typed: list[str], meant: str, capsys: Any) -> None:
     code, _, err = fdhil(*typed, capsys=capsys)

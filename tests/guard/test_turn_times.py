@@ -110,7 +110,7 @@ def test_guard_says_that_the_pc_was_late_where_that_ended_the_correction(make: C
     shop.run(3)
     cause = shop.ask(client, {"request": "status"})["cause"]
     assert cause["code"] == "LimitActive"
-    assert cause["late"] == "this PC was late (1 offsets, worst 9.0 ms)"
-    assert cause["text"].startswith("this PC was late (1 offsets, worst 9.0 ms): that is why axis X: an internal limit")
+    assert cause["late"] == "this PC was late (1 offset, worst 9.0 ms)"
+    assert cause["text"].startswith("this PC was late (1 offset, worst 9.0 ms): that is why axis X: an internal limit")
     assert "take load off this PC" in cause["advice"]
     assert any("this PC was late" in event.get("text", "") for event in shop.events())
