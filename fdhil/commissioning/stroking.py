@@ -12,21 +12,24 @@ from fdhil.commissioning.strokes import GENTLE, Room, Stroke
 from fdhil.errors import DriveFault
 
 SLACK_MM = 0.05  # by which an axis that came back may stand next to where it began
+STOOD_MM = 1.0  # an axis that moved by more since it was stopped was moved, or has lost its position
 RETURN_MM_S = 20.0
 RETURN_ACCELERATION_MM_S2 = 200.0
 
 
 class Travel(NamedTuple):
-    """From where to where an axis may go in machine coordinates, and where it stood when that was given."""
+    """From where to where an axis may go in machine coordinates, and where it stood at the start and when stopped."""
 
     low_mm: float
     high_mm: float
     start_mm: float = math.nan
+    stopped_mm: float = math.nan
 
-    def is_from(self, room: Room, mm_per_unit: float) -> bool:
-        """Whether this is the travel that ``room`` gave at the start; it then means the same from any position."""
+    def is_resumed(self, room: Room, mm_per_unit: float, here_mm: float) -> bool:
+        """Whether ``room`` gave this travel at the start, and the axis stands where the trial was stopped."""
         low_mm, high_mm = (self.start_mm + way * mm_per_unit for way in (room.back, room.forward))
-        return max(abs(self.low_mm - low_mm), abs(self.high_mm - high_mm)) < SLACK_MM
+        same = max(abs(self.low_mm - low_mm), abs(self.high_mm - high_mm)) < SLACK_MM
+        return same and abs(here_mm - self.stopped_mm) < STOOD_MM
 
 
 def position_mm(master: Master) -> float:
@@ -37,13 +40,13 @@ def position_mm(master: Master) -> float:
 def travel_of(master: Master, record: CommissioningRecord, room: Room, given: Travel | None = None) -> Travel:
     """Return where the axis may go; DriveFault where another limit of its travel is nearer, or it stands outside.
 
-    ``given`` is the travel of the trial that was stopped: the same room goes on meaning it, wherever the axis stands
-    inside; another room counts from where it stands, and must be inside ``given``.
+    ``given`` is the travel of the trial that was stopped: the same room means it again where the axis still stands
+    where it was stopped. Any other room counts from where the axis stands, and must be inside ``given``.
     """
     settings = master.config.axis[master.axis]
     scaling, said, unit = settings.scaling, settings.setpoints, settings.mm_per_unit
     here = position_mm(master)
-    resumed = given is not None and given.is_from(room, unit) and given.low_mm <= here <= given.high_mm
+    resumed = given is not None and given.is_resumed(room, unit, here)
     start = given.start_mm if given is not None and resumed else here
     low, high = start + room.back * unit, start + room.forward * unit
     limits: dict[str, Travel] = {}
@@ -53,7 +56,7 @@ def travel_of(master: Master, record: CommissioningRecord, room: Room, given: Tr
         limits["[axis.*.setpoints]"] = Travel(*said.travel_mm)
     if given is not None and not resumed:
         limits["the room that the trial began with"] = Travel(given.low_mm - SLACK_MM, given.high_mm + SLACK_MM)
-    for by, (least, most, _) in limits.items():
+    for by, (least, most, *_) in limits.items():
         if low < least or high > most:
             text = f"it stands at {settings.shown(here, form='.3f')} and may go from {least / unit:g} to "
             text += f"{settings.shown(most, form='g')} by {by}, not {room} {settings.unit} from here"

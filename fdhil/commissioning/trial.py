@@ -23,7 +23,7 @@ from fdhil.commissioning.timing import judge_answers, judge_sync, measure
 from fdhil.commissioning.watchdog import watched
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.bus import CanBus
-from fdhil.errors import DeviceError, DriveFault
+from fdhil.errors import DeviceError, DriveFault, StoreError
 from fdhil.pipeline import Known
 from fdhil.records import Outcome, Recording
 
@@ -92,7 +92,7 @@ def try_axis(
             travel_mm = allowed(master, record, room, progress, now)
             back = plan_return(master, travel_mm)
             operator.result(GIVEN, _shown(master, travel_mm) | {"return": None if back is None else str(back)})
-            with guarded(master):
+            with where_stopped(master, progress, now), guarded(master):
                 if back is not None:
                     operator.report("return")
                     enable(master)
@@ -120,8 +120,22 @@ def allowed(master: Master, record: CommissioningRecord, room: Room, progress: P
     given = progress.found(GIVEN, now)
     travel_mm = travel_of(master, record, room, Travel(**given) if given else None)
     if given is None:
-        progress.keep(GIVEN, now, travel_mm._asdict())
+        progress.keep(
+            GIVEN, now, {"low_mm": travel_mm.low_mm, "high_mm": travel_mm.high_mm, "start_mm": travel_mm.start_mm}
+        )
     return travel_mm
+
+
+@contextmanager
+def where_stopped(master: Master, progress: Progress, now: str) -> Iterator[None]:
+    """Keep where the axis stands after whatever ends a trial early: from there it may be resumed."""
+    try:
+        yield
+    except BaseException:  # Ctrl-C, too
+        if given := progress.found(GIVEN, now):
+            with suppress(StoreError):  # why it ended is told
+                progress.keep(GIVEN, now, {**given, "stopped_mm": position_mm(master)})
+        raise
 
 
 def _shown(master: Master, travel_mm: Travel) -> dict[str, str]:

@@ -109,6 +109,14 @@ def test_stopped_trial_goes_on_within_the_room_that_it_began_with(bench: Bench) 
     stood_mm = bench.stands_mm
     assert stood_mm > 40.0
     assert results["room"]["return"] is None
+    kept = progress.found("room", progress._steps["room"].holds_for)
+    assert kept is not None
+    moved = {**kept, "stopped_mm": stood_mm - 5.0}  # as if somebody had moved it since, or the encoder lost its zero
+    progress.keep("room", progress._steps["room"].holds_for, moved)
+    for _ in range(2):
+        with pytest.raises(DriveFault, match=r"by the room that the trial began with, not -2 to \+130 mm from here"):
+            bench.tried()
+    progress.keep("room", progress._steps["room"].holds_for, kept)
     bench.steps.clear()
     operator = Operator(bench.report, bench.look, results.__setitem__, positions.append)
     tried = try_axis(bench.config, bench.record, ROOM, operator, Progress(bench.config.store.directory, "X"))
