@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from fdhil.commissioning.init.told import Told
 
 SCHEMA = "fdhil-init-1"
-MAX_ANSWER_BYTES = 256 * 1024
 INTERFACES = Path("/sys/class/net")
 CAN_TYPE = "280"  # ARPHRD_CAN of the kernel
 NEXT = (
