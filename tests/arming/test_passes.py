@@ -131,7 +131,7 @@ async def test_each_pass_is_told_beside_what_was_predicted(
     assert second["measured"]["rms_um"] == pytest.approx(second["predicted_without"]["rms_um"], rel=1e-3)
     assert "pass 1 of gentle.ngc: contour error measured" in first["text"]
     assert first["gain"]["measured"] == pytest.approx(first["gain"]["predicted"], rel=1e-3)
-    assert "ended by StaleData" in third["text"]
+    assert "ended early: StaleData" in third["text"]
     assert any("more than predicted; identify again" in notice.text for notice in shop.told)
     assert any("worse than without; leave it off" in notice.text for notice in shop.told)
 
