@@ -50,7 +50,7 @@ def lines(page: Path) -> list[str]:
     """Return the commands of the page's shell blocks, fenced or indented, in order, without comments."""
     text = page.read_text("utf-8")
     indented = re.findall(r"^    (.*)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), re.MULTILINE)
-    shown = "\n".join([*blocks(page, "sh"), *indented])
+    shown = "\n".join([*blocks(page, "sh"), *blocks(page, "bash"), *indented])
     return [line.partition("  #")[0].strip() for line in shown.splitlines() if re.match(r"fdhil(-guard)? ", line)]
 
 
@@ -105,6 +105,41 @@ def test_a_command_that_fdhil_does_not_have_is_seen() -> None:
     assert "--colour" in faults("fdhil predict part.ngc --colour red", whole=False)
     assert "rain" in faults("fdhil correct part.ngc --method rain", whole=False)
     assert "missing" in faults("fdhil predict --config machine.toml", whole=True)
+
+
+# blocks that other tests run as they stand
+RUN = {
+    ("an-hour.md", "sh"): "tests/cli/test_tutorial.py",
+    ("an-hour.md", "text"): "tests/cli/test_tutorial.py",
+    ("extend.md", "python"): "tests/test_extend.py",
+    ("test-your-master.md", "python"): "tests/test_pytest_plugin.py",
+    ("rehearse-a-fault.md", "python"): "tests/sim/test_bus_faults.py",
+}
+GENERATED = ("benchmarks.md", "index.md")
+
+
+def untried(page: Path) -> Iterator[str]:
+    """Yield the first line of each block that no test tries and that does not say why."""
+    for before, language, body in re.findall(r"([^\n]*)\n```(\w*)\n(.*?)^```", page.read_text("utf-8"), re.M | re.S):
+        commands = language in ("sh", "bash") and re.search(r"^fdhil(-guard)? ", body, re.MULTILINE)
+        told = re.fullmatch(r"<!-- not run: \S.* -->", before)
+        if not (commands or told or language == "toml" or (page.name, language) in RUN):
+            yield body.partition("\n")[0]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_block_of_a_document_is_tried_or_says_why_not(page: Path) -> None:
+    if page.name not in GENERATED:
+        assert list(untried(page)) == []
+
+
+def test_block_that_is_not_tried_is_found(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(
+        "text\n```text\nnot tried\n```\n<!-- not run: a drawing -->\n```text\nmarked\n```\n```toml\na = 1\n```\n"
+    )
+    assert list(untried(page)) == ["not tried"]
+    assert all((ROOT / test).is_file() and name in (ROOT / test).read_text("utf-8") for (name, _), test in RUN.items())
 
 
 @pytest.fixture

@@ -145,8 +145,8 @@ class ArmingDesk:
 
     def _release(self) -> None:
         if self._armed is not None:
-            cause = "GuardLost" if self.guard.state in GONE else (self.guard.status.get("cause") or {}).get("code", "")
-            self._passes.end(cause, self._armed[0].summary())
+            told = {"code": "GuardLost"} if self.guard.state in GONE else self.guard.status.get("cause") or {}
+            self._passes.end(told.get("code", ""), self._armed[0].summary(), told.get("late", ""))
         self._armed = self._feeder = None
 
     async def _feed_forward(self, token: str) -> Answer:

@@ -83,6 +83,10 @@ class GuardLink:
     def refresh(self) -> list[Notice]:
         """Look at the status (blocking); return what changed since the last call."""
         self.look()
+        return self.take_changes()
+
+    def take_changes(self) -> list[Notice]:
+        """Return what changed since the last call, as far as it was seen."""
         with self._lock:
             told, self._untold = self._untold, []
         return told

@@ -22,7 +22,7 @@ from fdhil.correction.learning import Lesson
 from fdhil.errors import StoreError
 from fdhil.prediction import contour_error_um
 from fdhil.prediction.contour import WINDOW_S
-from fdhil.prediction.gain import plus_minus
+from fdhil.prediction.gain import at_most
 from fdhil.records import AxisSamples, Float, Int, MoveKind, NcState, Notice, Parameters, Reason, table_path
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
@@ -48,6 +48,7 @@ class _Ended(NamedTuple):
     due_s: float
     cause: str
     summary: Mapping[str, Any]
+    late: str
 
 
 class Passes:
@@ -97,11 +98,11 @@ class Passes:
         if self._running is not None:
             self._running.hear_nc(state)
 
-    def end(self, cause: str, summary: Mapping[str, Any]) -> None:
-        """The guard has ended the correction."""
+    def end(self, cause: str, summary: Mapping[str, Any], late: str = "") -> None:
+        """The guard has ended the correction; ``late`` says how late this computer was where that was the cause."""
         if self._running is not None:
             due_s = self._clock.now_s() + LATE_S
-            self._ended.append(_Ended(self._running, self._models, due_s, cause, summary))
+            self._ended.append(_Ended(self._running, self._models, due_s, cause, summary, late))
             self._running = None
 
     def digest(self) -> list[Notice]:
@@ -129,6 +130,7 @@ class Passes:
             "program_digest": digest,
             "pass": self._count[digest],
             "ended_by": ended.cause,
+            "late": ended.late,
             **measured,
             "predicted": {key: summary["after"].get(key) for key in ("rms_um", "uncertainty_um")},
             "predicted_without": {"rms_um": summary["before"]["rms_um"]},
@@ -325,15 +327,18 @@ def _gains(summary: Mapping[str, Any], measured: Mapping[str, Any]) -> dict[str,
 
 def _text(told: Mapping[str, Any]) -> str:
     name, measured, half = Path(told["program"]).name, told["measured"], told["predicted"]["uncertainty_um"]
-    spread = "" if half is None else f" {plus_minus(half, 2)}"
+    predicted = told["predicted"]["rms_um"]
+    shown = f"{predicted:.2f} by the model" if half is None else at_most(predicted, half)
     text = f"pass {told['pass']} of {name}: contour error measured {measured['rms_um']:.2f} um RMS,"
-    text += f" {measured['max_um']:.1f} at most (predicted {told['predicted']['rms_um']:.2f}{spread};"
+    text += f" {measured['max_um']:.1f} at most (predicted {shown};"
     text += f" without correction {told['predicted_without']['rms_um']:.1f} predicted"
     gain = told["gain"]
     if gain["predicted"] is not None and gain["measured"] is not None:
         text += f"; gain {gain['measured']:.3g}, predicted {gain['predicted']:.3g}"
     text += ")"
-    return text if told["ended_by"] == FINISHED else f"{text}; it was ended by {told['ended_by']}"
+    if told["ended_by"] == FINISHED:
+        return text
+    return f"{text}; it ended early: {told['late'] or told['ended_by']}"
 
 
 def _lesson_text(lesson: Lesson) -> str:
@@ -344,6 +349,8 @@ def _lesson_text(lesson: Lesson) -> str:
 def _notice(told: Mapping[str, Any], text: str) -> Notice:
     """Say what was measured, and louder where it is not what was promised."""
     measured, half = told["measured"]["rms_um"], told["predicted"]["uncertainty_um"]
+    if told["late"]:
+        return Notice("PassMeasured", "minor", f"{text}; take load off this PC, then arm again")
     if measured > WORSE * told["predicted_without"]["rms_um"]:
         return Notice("PassMeasured", "MAJOR", f"{text}: worse than without; leave it off and identify again")
     if half is not None and measured > told["predicted"]["rms_um"] + half:

@@ -14,7 +14,9 @@ from fdhil.cli.options import AS_JSON, CONFIG, FILE, OutputFile, Positive, Writi
 @CONFIG
 @click.option("--out", required=True, type=OutputFile(), help="The HTML file to write.")
 @click.option("--pdf", type=OutputFile(".pdf"), help="Also print it as PDF (needs chromium).")
-@click.option("--by", default="", metavar="NAME", help="Who proved it; stands above the signature.")
+@click.option("--by", default="", metavar="NAME", help="The operator who proved it; stands above the signature.")
+@click.option("--customer", default="", metavar="NAME", help="Who receives the machine.")
+@click.option("--site", default="", metavar="PLACE", help="Where the machine stands.")
 @click.option("--program", type=FILE, metavar="PROGRAM", help="An NC program or demand CSV: its contour error is told.")
 @click.option(
     "--radius-mm", type=Positive(0.1, 10_000.0), default=50.0, show_default=True, help="Radius of the circular test."
@@ -35,6 +37,8 @@ def acceptance(
     out: Path,
     pdf: Path | None,
     by: str,
+    customer: str,
+    site: str,
     program: Path | None,
     radius_mm: float,
     feed: float,
@@ -50,14 +54,15 @@ def acceptance(
     commissioned or not identified, or a limit that is not kept.
     """
     from fdhil import config as machine_config
-    from fdhil.cli.acceptance_findings import Asked, document_of, find
+    from fdhil.cli.acceptance_findings import NO_LIMIT, Asked, document_of, find
     from fdhil.cli.acceptance_page import page_of
     from fdhil.report import deliver, require
 
     require()
     machine = machine_config.load(config)
     forewarn("predict", "correct")
-    found = find(machine, config, Asked(by, program, radius_mm, feed, measured_circle, contour_um, circle_um))
+    given = (program, radius_mm, feed, measured_circle, contour_um, circle_um)
+    found = find(machine, config, Asked(by, customer, site, *given))
     document = document_of(found)
     deliver(page_of(found, document), out, pdf)
     if as_json:
@@ -65,6 +70,8 @@ def acceptance(
     else:
         for point in found.open_points:
             click.echo(f"open: {point}")
+        if not found.asked.limits:
+            click.echo(NO_LIMIT)
         state = "accepted" if not found.open_points else f"{len(found.open_points)} points are open"
         click.echo(f"{machine.machine.name}: {state}; SHA-256 of what the report says: {document['sha256']}")
     return 1 if found.open_points else 0

@@ -16,6 +16,7 @@ import click
 import numpy as np
 
 from fdhil import correction
+from fdhil.cli.doctor.latency import read_latency
 from fdhil.cli.prediction import inputs
 from fdhil.commissioning.progress import Progress
 from fdhil.commissioning.record import CommissioningRecord, holds, load_record
@@ -26,9 +27,11 @@ from fdhil.prediction.circular import Circular, circle_program, evaluate
 from fdhil.program import program_digest
 from fdhil.records import PARAMETERS, UNITS, Correction, Float, Prediction
 from fdhil.report.history_course import AxisHistory
-from fdhil.report.history_reading import by_axis, read_history
+from fdhil.report.history_reading import PASS, by_axis, read_history, read_notices, read_passes
 
 SCHEMA = "fdhil-acceptance-1"
+NO_LIMIT = "no limit was set: give --circle-um and --contour-um what the machine must keep"
+NEWEST_PASSES = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,12 +39,19 @@ class Asked:
     """What was asked for: see ``fdhil acceptance --help``."""
 
     by: str
+    customer: str
+    site: str
     program: Path | None
     radius_mm: float
     feed_mm_min: float
     measured_circle: Path | None
     contour_um: float | None
     circle_um: float | None
+
+    @property
+    def limits(self) -> Sequence[float]:
+        """The limits that were set."""
+        return [um for um in (self.contour_um, self.circle_um) if um is not None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +65,11 @@ class AxisProof:
 
 @dataclass(frozen=True, slots=True)
 class Findings:
-    """All that the report says. ``circles`` are by how they were found; ``plane`` is empty where no two axes move."""
+    """All that the report says. ``circles`` are by how they were found; ``plane`` is empty where no two axes move.
+
+    ``passes`` are the last that were cut corrected, ``notices`` those that nobody has acknowledged, both as JSON has
+    notices; ``latency`` is what fdhil doctor --latency measured last.
+    """
 
     machine: MachineConfig
     asked: Asked
@@ -66,14 +80,21 @@ class Findings:
     plane: tuple[str, str] | None
     circles: Mapping[str, Circular]
     path: Correction | None
+    passes: Sequence[Mapping[str, Any]]
+    notices: Sequence[Mapping[str, Any]]
+    latency: Mapping[str, Any] | None
     open_points: Sequence[str]
 
 
 def find(machine: MachineConfig, config: Path, asked: Asked) -> Findings:
     """Gather everything; ConfigError, StoreError, ProgramError, RecordingError where something cannot be read."""
     proofs = {axis: _proof(machine, axis) for axis in machine.axis}
+    passes: Sequence[Mapping[str, Any]] = []
+    notices: Sequence[Mapping[str, Any]] = []
     try:
         histories = by_axis(machine, *read_history(machine, tell=partial(click.echo, err=True)))
+        passes = read_passes(machine)[-NEWEST_PASSES:]
+        notices = [n for n in read_notices(machine) if n["acknowledged"] is None and n["code"] != PASS]
     except StoreError as error:
         if error.code != "NoHistory":
             raise
@@ -91,8 +112,11 @@ def find(machine: MachineConfig, config: Path, asked: Asked) -> Findings:
         if axis not in known
     ]
     points += _beyond(asked, circles, path)
+    if major := sum(notice["severity"] == "MAJOR" for notice in notices):
+        points.append(f"{major} MAJOR notices that nobody has acknowledged; see fdhil status, then fdhil acknowledge")
     made = datetime.now(UTC).isoformat(timespec="seconds")
-    return Findings(machine, asked, made, proofs, histories, identified, plane, circles, path, points)
+    known_by = (machine, asked, made, proofs, histories, identified, plane, circles, path)
+    return Findings(*known_by, passes, notices, read_latency(machine), points)
 
 
 def _proof(machine: MachineConfig, axis: str) -> AxisProof:
@@ -179,6 +203,8 @@ def document_of(found: Findings) -> dict[str, Any]:
         "made_utc": found.made_utc,
         "made_by": f"fdhil {version('fdhil')}",
         "by": asked.by,
+        "customer": asked.customer,
+        "site": asked.site,
         "machine": {
             "name": machine.machine.name,
             "config_digest": machine.digest,
@@ -193,6 +219,10 @@ def document_of(found: Findings) -> dict[str, Any]:
             "found": {label: _circle_document(circle) for label, circle in found.circles.items()},
         },
         "program": _program_document(found),
+        "passes": list(found.passes),
+        "notices": list(found.notices),
+        "latency": found.latency,
+        "limits_set": bool(asked.limits),
         "open": list(found.open_points),
         "accepted": not found.open_points,
     }

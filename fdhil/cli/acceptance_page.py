@@ -3,12 +3,13 @@
 from collections.abc import Mapping
 from typing import Any
 
-from fdhil.cli.acceptance_findings import AxisProof, Findings
+from fdhil.cli.acceptance_findings import NO_LIMIT, AxisProof, Findings
+from fdhil.cli.doctor.latency import latency_text
 from fdhil.prediction.circular import Circular
 from fdhil.report import Page, Section, Table
 from fdhil.report.circular import polar
 from fdhil.report.history_verdict import LATEST_HEAD, latest_rows
-from fdhil.report.parameter_view import MEANING
+from fdhil.report.parameter_view import MEANING, minute
 from fdhil.report.path import correction_page
 
 CIRCLE_ROWS = (
@@ -29,6 +30,7 @@ def page_of(found: Findings, document: Mapping[str, Any]) -> Page:
     sections = [_verdict(found), _proven(found), _parameters(found)]
     if found.plane is not None:
         sections.append(_circular(found))
+    sections.append(_running(found))
     if found.path is not None and found.asked.program is not None:
         page = correction_page(found.asked.program.name, "", found.path)
         sections += [Section(f"Program {found.asked.program.name}: {s.title}", s.text, s.tables, s.figures)
@@ -46,8 +48,13 @@ def page_of(found: Findings, document: Mapping[str, Any]) -> Page:
 
 def _verdict(found: Findings) -> Section:
     machine = found.machine
+    records = [proof.record for proof in found.proofs.values() if proof.record is not None]
     rows = [
+        ["customer", found.asked.customer or "-"],
+        ["site", found.asked.site or "-"],
+        ["operator", found.asked.by or "-"],
         ["machine", machine.machine.name],
+        ["serial numbers of the drives", ", ".join(f"{each.axis} {each.serial}" for each in records) or "-"],
         ["configuration, digest", machine.digest],
         ["cycle", f"{machine.machine.sync_period_s * 1e3:g} ms"],
     ]
@@ -59,7 +66,10 @@ def _verdict(found: Findings) -> Section:
         rows.append([f"axis {axis}", f"{reach}, at most {section.max_acceleration_mm_s2 / 1e3:g} m/s²"])
     points = [[str(number), point] for number, point in enumerate(found.open_points, 1)]
     tables = [Table(("", "open point"), points)] if points else []
-    text = "" if points else "No point is open: every drive is commissioned and identified, and every limit is kept."
+    text = "No point is open: every drive is commissioned and identified"
+    text = "" if points else f"{text}, and every limit that was set is kept." if found.asked.limits else f"{text}."
+    if not found.asked.limits:
+        text = f"{text} {NO_LIMIT.capitalize()}.".lstrip()
     return Section("The machine", text, [*tables, Table(("", "value"), rows)])
 
 
@@ -115,6 +125,22 @@ def _circular(found: Findings) -> Section:
         [Table(("", *found.circles), rows)],
         pictures,
     )
+
+
+def _running(found: Findings) -> Section:
+    """What was measured while it ran: the passes with the correction, what waits for an answer, how late the PC is."""
+    head = ("time", "severity", "what")
+    passes, notices = (
+        [[minute(n["time"]), n["severity"], n["text"]] for n in told] for told in (found.passes, found.notices)
+    )
+    tables = [Table(head, rows, title) for rows, title in
+              ((passes, "Passes with the correction"), (notices, "Open notices")) if rows]  # fmt: skip
+    late = "How late this PC is was not measured: run fdhil doctor --latency 600."
+    if found.latency is not None:
+        late = f"This PC, measured {minute(found.latency['time'])}: {latency_text(found.latency)}."
+    none = [what for what, rows in (("No pass was cut with the correction.", passes), ("No notice is open.", notices))
+            if not rows]  # fmt: skip
+    return Section("In operation", " ".join([*none, late]), tables)
 
 
 def _circle_cells(circle: Circular) -> list[str]:

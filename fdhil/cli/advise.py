@@ -14,7 +14,7 @@ import click
 
 from fdhil.api.compiling import forewarn
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, FILE, OutputFile, Positive, Writing
+from fdhil.cli.options import AS_JSON, CONFIG_OPTION, FILE, OutputFile, Positive, Writing
 from fdhil.cli.prediction import inputs
 
 if TYPE_CHECKING:
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from fdhil.prediction.feeds import Source
     from fdhil.records import Parameters, Trajectory
 
-UNHELD = "; {} of its lines leave the tolerance at every feed that was tried, without the correction"
+UNHELD = "{} lines leave the tolerance at every feed that was tried, without the correction"
 
 
 @click.command(cls=Writing)
 @click.argument("program", type=FILE, metavar="PROGRAM|DEMAND.csv")
-@click.option("--config", "config_path", type=FILE, required=True, help="The machine's configuration (TOML).")
+@CONFIG_OPTION
 @click.option("--model", "model_path", type=FILE, help="Parameters of each axis (JSON).")
 @click.option("--from-history", is_flag=True, help="Use the newest validated parameters of the store.")
 @click.option(
@@ -82,9 +82,8 @@ def advise(
         lines = [entry(a, most) for a in advice]
         written = None if out is None else str(out)
         click.echo(json.dumps(document | {"lines": lines, "written": written}, allow_nan=False))
-    elif out is not None:
-        left = sum(a.plain.share is None for a in advice)
-        click.echo(f"written to {out}{UNHELD.format(left) if left else ''}", err=True)
+    elif out is not None and (left := sum(a.plain.share is None for a in advice)):
+        click.echo(UNHELD.format(left), err=True)
     return int(any(not _held(a, corrected=out is None) for a in advice))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,8 +14,17 @@ import click
 from fdhil import config as machine_config
 from fdhil.cli.audited import audited
 from fdhil.cli.commission_guide import Asked, Guide, confirm, room_of, told
-from fdhil.cli.commission_steps import FEEDFORWARD, HAL_STEPS, STEPS, moves_of, planned, trial_moves
-from fdhil.cli.commission_trial import try_commissioned
+from fdhil.cli.commission_steps import (
+    FEEDFORWARD,
+    HAL_STEPS,
+    STEPS,
+    TRIAL,
+    moves_of,
+    planned,
+    trial_moves,
+    tried_by_moving,
+)
+from fdhil.cli.commission_trial import ask_room, try_commissioned
 from fdhil.cli.failing import verdict
 from fdhil.cli.options import AS_JSON, CONFIG
 from fdhil.errors import ConfigError, ConfigFault, DriveFault
@@ -27,6 +36,13 @@ if TYPE_CHECKING:
     from fdhil.config import MachineConfig
 
 SCHEMA = "fdhil-commission-1"
+NEXT = "next: fdhil run and, in another terminal, fdhil-guard; then switch the NC on and let it make rapids"
+NEXT_UNTRIED = (
+    f"{NEXT}, which identify the drives (or fdhil commission --room BACK FORWARD, which moves the axes itself)"
+)
+NEXT_PDOS = "next: fdhil commission"
+NEXT_STOPPED = "next: run the same command again; it continues with the step that was not finished"
+NEXT_REFUSED = "next: correct that, then run the same command again; completed steps are kept"
 
 
 @click.command()
@@ -84,10 +100,17 @@ def commission(
             except DriveFault as fault_found:
                 refused = str(fault_found)
                 break
+            except (KeyboardInterrupt, click.Abort):
+                asked.say(NEXT_STOPPED)
+                raise
     if as_json:
         click.echo(json.dumps({"schema": SCHEMA, "axes": done, "refused": refused}))
     if refused is not None:
         click.echo(f"refused: {refused}", err=True)
+        asked.say(NEXT_REFUSED)
+    else:
+        tried = set_pdos or all(found["trial"] is not None for found in done.values())
+        asked.say(NEXT_PDOS if set_pdos else NEXT if tried else NEXT_UNTRIED)
     return int(refused is not None)
 
 
@@ -119,11 +142,13 @@ def _progress_of(machine: MachineConfig, axis: str) -> Progress:
 
 def _tell_plan(machine: MachineConfig, axes: list[str], asked: Asked) -> int:
     """Say what would be done; 1 where the room is too small for it."""
+    from fdhil.report.parameter_view import minute
+
     plans: dict[str, list[dict[str, Any]]] = {}
     refused = None
     for axis in axes:
         try:
-            plans[axis] = planned(machine, axis, asked.room, _progress_of(machine, axis))
+            plans[axis] = planned(machine, axis, asked.room, not asked.yes, _progress_of(machine, axis))
         except DriveFault as fault:
             refused = str(fault)
             break
@@ -132,8 +157,8 @@ def _tell_plan(machine: MachineConfig, axes: list[str], asked: Asked) -> int:
     for axis, steps in plans.items():
         asked.say(f"axis {axis}, nothing is sent now:")
         for number, step in enumerate(steps, 1):
-            done = f" Done {step['done_utc']}, kept if the drive is the same." if step["done_utc"] else ""
-            asked.say(f"  {number} {step['step']}: {told(step['does'], step['moves'])}{done}")
+            done = f" Done {minute(step['done_utc'])}, kept if the drive is the same." if step["done_utc"] else ""
+            asked.say(f"  {number} of {len(steps)}, {step['step']}: {told(step['does'], step['moves'])}{done}")
     if refused is not None:
         click.echo(f"refused: {refused}", err=True)
     return int(refused is not None)
@@ -151,29 +176,34 @@ def _commission_axis(machine: MachineConfig, axis: str, asked: Asked) -> dict[st
         click.echo(progress.doubt, err=True)
     if asked.again:
         progress.forget()
+    if asked.room is None and not asked.yes and tried_by_moving(machine, axis):
+        asked = replace(asked, room=ask_room(axis, machine.axis[axis].unit))
     if asked.room is not None and not hal:
-        trial_moves(machine, axis, asked.room)  # a room that is too small is told before anything is sent
+        trial_moves(machine, axis, asked.room)  # a room that is too small is refused before anything is sent
     bus = machine.bus[machine.axis[axis].drive.bus]
     with lock_bus(bus), audited(machine, "commission", axis=axis) as ended:  # the guard reads the record when it starts
-        guide = _commissioning_guide(machine, axis, asked, progress)
+        own = HAL_STEPS if hal else STEPS
+        total = len(own) + (len(TRIAL) if asked.room is not None and not hal else 0)
+        guide = Guide(axis, asked, own, progress, 0, total)
+        report = _asking(machine, axis, asked, guide)
         if hal:
-            record = commission_hal(machine, axis, guide)
+            record = commission_hal(machine, axis, report)
         else:
-            record = steps.commission(machine, axis, guide, progress)
+            record = steps.commission(machine, axis, report, progress, guide.result)
         path = save_record(record, machine.store.directory, machine.store.commissioning_key)
         ended["text"] = f"record {record.digest[:16]}"
         asked.say(
             f"axis {axis} is commissioned: moved {record.sign_test_um:+.1f} um, "
             f"{FEEDFORWARD[record.offset_in_feedforward]}, watchdog {record.watchdog}; record {path}"
         )
-        tried = None if hal else try_commissioned(machine, record, asked, progress)
+        further = Guide(axis, asked, TRIAL, progress, len(own), total)
+        tried = None if hal else try_commissioned(machine, record, asked, progress, further)
     return {**asdict(record), "record": str(path), "digest": record.digest, "trial": tried}
 
 
-def _commissioning_guide(machine: MachineConfig, axis: str, asked: Asked, progress: Progress) -> Callable[[str], None]:
-    """Return the function that tells of each step, and asks before the drive is switched on."""
-    steps = HAL_STEPS if machine.axis[axis].drive.source == "hal" else STEPS
-    guide = Guide(axis, asked, steps, moves_of(machine, axis), progress)
+def _asking(machine: MachineConfig, axis: str, asked: Asked, guide: Guide) -> Callable[[str], None]:
+    """Return the function that reports each step, and asks before the drive is switched on."""
+    guide.moves = moves_of(machine, axis)
 
     def report(step: str) -> None:
         if step in ("enable", "move") and not asked.yes:

@@ -1,21 +1,24 @@
-"""Tells the operator of each step of a commissioning, and asks before anything moves."""
+"""Reports each step of a commissioning and its result to the operator, and asks before anything moves."""
 
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import click
 
-from fdhil.cli.commission_steps import NOTHING
+from fdhil.cli.commission_steps import NOTHING, result_text
 from fdhil.cli.consent import agreed
 from fdhil.errors import DriveFault
 
 if TYPE_CHECKING:
-    from fdhil.commissioning.progress import Progress, Step
+    from fdhil.commissioning.progress import Found, Progress, Step
     from fdhil.commissioning.strokes import Room
+
+POSITION_S = 0.2  # a position is shown so often while an axis moves
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,24 +39,49 @@ class Asked:
 
 
 class Guide:
-    """Tells of each step before it is done, with what it moves, or that it is kept."""
+    """Reports each step before it is done, with what it moves, or that it is kept; then its result.
+
+    Steps are counted over the whole commissioning: ``first`` precede these, of ``total``.
+    """
 
     def __init__(
-        self, axis: str, asked: Asked, steps: Mapping[str, str], moves: Mapping[str, str], progress: Progress
+        self, axis: str, asked: Asked, steps: Mapping[str, str], progress: Progress, first: int, total: int
     ) -> None:
-        self._axis, self._asked, self._steps, self._moves = axis, asked, steps, moves
+        self._axis, self._asked, self._steps, self._first, self._total = axis, asked, steps, first, total
+        self.moves: dict[str, str] = {}
+        self._shown_s: float | None = None
         progress.on_kept = self.kept
 
     def __call__(self, step: str) -> None:
-        """Tell what is done next."""
-        self._asked.say(f"{self._head(step)}: {told(self._steps[step], self._moves[step])}")
+        """Report what is done next."""
+        self._say(f"{self._head(step)}: {told(self._steps[step], self.moves[step])}")
 
     def kept(self, name: str, step: Step) -> None:
-        """Tell that a step need not be done."""
-        self._asked.say(f"{self._head(name)}: kept, it was done {step.done_utc}.")
+        """Report that a step need not be done, and what it found."""
+        from fdhil.report.parameter_view import minute
+
+        self._say(f"{self._head(name)}: kept, it was done {minute(step.done_utc)}; {result_text(name, step.found)}")
+
+    def result(self, step: str, found: Found) -> None:
+        """Report what a step found."""
+        self._say(f"axis {self._axis}: {step}: {result_text(step, found)}")
+
+    def show_position(self, text: str) -> None:
+        """Show where the moving axis is, on a terminal, in a line that is written over."""
+        now_s = time.monotonic()
+        if sys.stderr.isatty() and (self._shown_s is None or now_s - self._shown_s >= POSITION_S):
+            click.echo(f"\raxis {self._axis} at {text:<24}", err=True, nl=False)
+            self._shown_s = now_s
+
+    def _say(self, text: str) -> None:
+        if self._shown_s is not None:
+            click.echo(f"\r{'':<40}\r", err=True, nl=False)
+            self._shown_s = None
+        self._asked.say(text)
 
     def _head(self, step: str) -> str:
-        return f"axis {self._axis}, step {list(self._steps).index(step) + 1} of {len(self._steps)}, {step}"
+        number = self._first + list(self._steps).index(step) + 1
+        return f"axis {self._axis}, step {number} of {self._total}, {step}"
 
 
 def told(does: str, moves: str) -> str:

@@ -49,6 +49,41 @@ TRIAL: Mapping[str, str] = {
 }
 
 
+def result_text(step: str, found: Mapping[str, Any]) -> str:
+    """Return what a step found, in words."""
+    match step:
+        case "compare":
+            return f"{found['points']} points agree with the configuration"
+        case "sign test":
+            return f"the axis moved by {found['moved_um']:+.1f} um"
+        case "feed-forward test":
+            return FEEDFORWARD[found["in_feedforward"]]
+        case "room":
+            return f"it stands at {found['stands']} and may go from {found['from']} to {found['to']}"
+        case "identification":
+            return ", ".join(f"{name} {_figure(name, value)}" for name, value in found.items())
+        case "acceptance":
+            return ", ".join(
+                f"following error {move['measured_rms_um']:.2f} um RMS, predicted to {move['left_rms_um']:.2f}"
+                for move in found["moves"]
+            )
+    return ", ".join(f"{name} {value}" for name, value in found.items())
+
+
+def _figure(name: str, value: Mapping[str, Any]) -> str:
+    from fdhil.records import INTERVAL_95
+    from fdhil.report.parameter_view import DISPLAY, cell
+
+    if value["std"] is None:
+        return f"{value['value']:.4g} {value['unit']} (given, not identified)"
+    return f"{cell(name, value['value'], INTERVAL_95 * value['std'], ' ')} {DISPLAY[name][0]}"
+
+
+def tried_by_moving(machine: MachineConfig, axis: str) -> bool:
+    """Whether an axis can be tried by moving it: not one of HAL pins, nor one drive of a gantry alone."""
+    return machine.axis[axis].drive.source != "hal" and sum(name[0] == axis[0] for name in machine.axis) == 1
+
+
 def moves_of(machine: MachineConfig, axis: str) -> dict[str, str]:
     """Return what each of the ``STEPS`` moves, of an axis of HAL pins each of the ``HAL_STEPS``."""
     if machine.axis[axis].drive.source == "hal":
@@ -65,13 +100,19 @@ def moves_of(machine: MachineConfig, axis: str) -> dict[str, str]:
     }
 
 
-def trial_moves(machine: MachineConfig, axis: str, room: Room) -> dict[str, str]:
-    """Return what each step of the ``TRIAL`` moves; DriveFault where the room is too small."""
+def trial_moves(machine: MachineConfig, axis: str, room: Room | None) -> dict[str, str]:
+    """Return what each step of the ``TRIAL`` moves, without a room in general; DriveFault where it is too small."""
     from fdhil.commissioning.strokes import plan_jog, plan_rapid, require_single_drive
     from fdhil.commissioning.trial import RAPIDS
 
     require_single_drive(machine, axis)
     settings = machine.axis[axis]
+    if room is None:
+        top = settings.shown(settings.rapid_speed_mm_s, "/s", "g")
+        return dict.fromkeys(TRIAL, NOTHING) | {
+            "jog": "a few millimetres within the room that you give, and back",
+            "test rapids": f"within the room that you give at up to {top}, and back, {RAPIDS // 2} times",
+        }
     jog, rapid = plan_jog(axis, settings, room), plan_rapid(axis, settings, room)
     steep = settings.shown(rapid.acceleration_mm_s2, "/s2", "g")
     return dict.fromkeys(TRIAL, NOTHING) | {
@@ -80,12 +121,17 @@ def trial_moves(machine: MachineConfig, axis: str, room: Room) -> dict[str, str]
     }
 
 
-def planned(machine: MachineConfig, axis: str, room: Room | None, progress: Progress) -> list[dict[str, Any]]:
-    """Return all steps of an axis, what each does and moves, and when it was done if it was; nothing is sent."""
+def planned(
+    machine: MachineConfig, axis: str, room: Room | None, asks: bool, progress: Progress
+) -> list[dict[str, Any]]:
+    """Return all steps of an axis, what each does and moves, and when it was done if it was; nothing is sent.
+
+    Without a ``room`` the axis is tried where the operator ``asks`` for it.
+    """
     done = progress.done()
     hal = machine.axis[axis].drive.source == "hal"
     steps = [(HAL_STEPS if hal else STEPS, moves_of(machine, axis))]
-    if room is not None and not hal:
+    if not hal and (room is not None or (asks and tried_by_moving(machine, axis))):
         steps.append((TRIAL, trial_moves(machine, axis, room)))
     return [
         {"step": step, "does": texts[step], "moves": moved, "done_utc": done.get(step)}

@@ -30,6 +30,19 @@ NO_CACHE = (
 )
 
 
+class SuggestingGroup(click.Group):
+    """A group that names the commands whose spelling is close to an unknown one."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Return the command that the arguments begin with; NoSuchCommand."""
+        try:
+            return super().resolve_command(ctx, args)
+        except click.NoSuchCommand as error:
+            raise click.NoSuchCommand(error.command_name, possibilities=self.list_commands(ctx), ctx=ctx) from None
+
+
 def run_safely(command: click.Command) -> int:
     """Run a click command and return the exit code; errors are told on stderr, with ``--json`` on stdout."""
     if broken := next((each for each in sys.argv[1:] if not _is_text(each)), None):
@@ -155,7 +168,7 @@ def _usage(error: click.ClickException) -> str:
     context = getattr(error, "ctx", None) or click.get_current_context(silent=True)
     command = context.command_path if context is not None else "fdhil"
     text = " ".join(error.format_message().split()).rstrip(".")
-    return f"{text}; {command} --help tells how it is called"
+    return f"{text}{'' if text.endswith('?') else ';'} see {command} --help"
 
 
 def _say(text: str) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from fdhil.cli.failing import verdict
+from fdhil.cli.failing import SuggestingGroup, verdict
 from fdhil.cli.options import AS_JSON, CONFIG, FLEET, LINES
 from fdhil.errors import FdhilError
 
@@ -53,7 +53,7 @@ def uplink(config: Path, as_json: bool) -> None:
         run(lambda machine: send(machine, say_ready), machine)
 
 
-class Questions(click.Group):
+class Questions(SuggestingGroup):
     """A group whose larger commands are in files of their own, imported when they are called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:

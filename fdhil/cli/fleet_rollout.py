@@ -71,7 +71,7 @@ def sign(change: Path, key_file: Path, by: str, machines: tuple[str, ...], out: 
         told_json = {"schema": "fdhil-fleet-sign-1", "file": str(out), "offer": offer.model_dump(mode="json")}
         click.echo(json.dumps(told_json))
         return
-    click.echo(f"{offer} is in {out}; at the machine: fdhil offers list machine.toml {out}")
+    click.echo(f"{offer} is signed; at the machine: fdhil offers list machine.toml {out}")
 
 
 @click.command()

@@ -19,12 +19,10 @@ HEAD, FOOT = 0.8, 0.45
 
 
 def figure_of(histories: Sequence[AxisHistory]) -> Figure:
-    """Return a figure with a column for each axis and a row for each parameter; FdhilError without matplotlib."""
-    try:
-        from matplotlib import style
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise FdhilError("a plot needs the extra 'report': pip install 'fdhil[report]'") from None
+    """Return a figure with a column for each axis and a row for each parameter."""
+    from matplotlib import style
+    from matplotlib.figure import Figure
+
     from fdhil.report import chart
 
     names = list(dict.fromkeys(name for history in histories for name in history.names()))

@@ -8,6 +8,7 @@ from rich.markup import escape
 
 from fdhil.cli.status_view import narrow_table, open_console
 from fdhil.report.history_trends import moved, slope_rows
+from fdhil.report.parameter_view import minute
 
 SHOWN_OPEN, SHOWN_DONE = 10, 5
 
@@ -24,7 +25,7 @@ def show_health(told: Mapping[str, Mapping[str, Any]], console: Console | None =
                 table.add_row(*row)
             out.print(table)
         for change in its["changes"]:
-            at = change["time"][:16].replace("T", " ")
+            at = minute(change["time"])
             out.print(f"axis {axis}, window {change['window']} at {at}: {change['cause']}", highlight=False)
             out.print(f"  {moved(change)}", highlight=False)
 
@@ -41,15 +42,11 @@ def show_notices(notices: Sequence[Mapping[str, Any]], console: Console | None =
     for notice in done[-SHOWN_DONE:]:
         given = notice["acknowledged"]
         note = f": {given['note']}" if given["note"] else ""
-        text = f"{_line(notice)}\n    acknowledged by {given['who']} on {_minute(given['time'])}{note}"
+        text = f"{_line(notice)}\n    acknowledged by {given['who']} on {minute(given['time'])}{note}"
         out.print(escape(text), highlight=False)
 
 
 def _line(notice: Mapping[str, Any]) -> str:
     where = f"{notice['axis']}: " if notice["axis"] else ""
     number = "" if notice["number"] is None else f"{notice['number']:>5}  "
-    return f"{number}{_minute(notice['time'])}  {notice['severity']:5}  {where}{notice['code']}: {notice['text']}"
-
-
-def _minute(time: str) -> str:
-    return time[:16].replace("T", " ")
+    return f"{number}{minute(notice['time'])}  {notice['severity']:5}  {where}{notice['code']}: {notice['text']}"

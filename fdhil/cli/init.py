@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import config as machine_config
-from fdhil.cli.options import AS_JSON, FILE, OutputFile, Writing
+from fdhil.cli.options import AS_JSON, DEFAULT_CONFIG, FILE, OutputFile, Writing
 from fdhil.errors import ConfigError, ConfigFault, OutputError
 
 if TYPE_CHECKING:
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from fdhil.commissioning.init.told import Told
 
 SCHEMA = "fdhil-init-1"
-MAX_ANSWER_BYTES = 256 * 1024
 INTERFACES = Path("/sys/class/net")
 CAN_TYPE = "280"  # ARPHRD_CAN of the kernel
 NEXT = (
@@ -35,7 +34,7 @@ NEXT = (
 
 
 @click.command(cls=Writing)
-@click.argument("file", type=OutputFile(".toml"))
+@click.argument("file", type=OutputFile(".toml"), default=DEFAULT_CONFIG)
 @click.option("--answers", type=FILE,
               help="TOML with answers, its keys those of the configuration; then nothing is asked.")  # fmt: skip
 @click.option("--from-linuxcnc", "ini", type=FILE, metavar="INI",

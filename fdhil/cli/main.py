@@ -9,7 +9,7 @@ from importlib import import_module
 import click
 
 from fdhil.cli.citation import cite
-from fdhil.cli.failing import prepare_streams, run_safely
+from fdhil.cli.failing import SuggestingGroup, prepare_streams, run_safely
 
 __all__ = ["COMMANDS", "cli", "main", "run_safely"]
 
@@ -42,6 +42,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "interpret": ("fdhil.cli.program:interpret", "List the motions of an NC program."),
     "predict": ("fdhil.cli.prediction:predict", "Predict the path error of a program before it is cut."),
     "correct": ("fdhil.cli.prediction:correct", "Plan the correction of a program."),
+    "compare": ("fdhil.cli.compare:compare", "Compare two passes, models or recordings, before and after a change."),
     "advise": ("fdhil.cli.advise:advise", "Compute the highest feed per line that keeps a tolerance."),
     "replay": ("fdhil.cli.records:replay", "Repeat the analysis of a recorded window, bit for bit."),
     "history": ("fdhil.cli.records:history", "Show the history of the parameters."),
@@ -52,7 +53,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
 }
 
 
-class LazyGroup(click.Group):
+class LazyGroup(SuggestingGroup):
     """A group that imports a command's module when that command is called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -98,8 +99,9 @@ def leaves(group: click.Group, before: str = "") -> Iterator[tuple[str, click.Co
 def cli() -> None:
     """Identify feed drives during rapid moves, predict path errors, and feed corrections back.
 
-    A fresh installation sends no frame: writing to a drive needs commissioning, then arming. Exit codes: 0 done, 1 the
-    answer is no, 2 wrong option or config, 3 device, file or port trouble.
+    A fresh installation sends no frame: writing to a drive needs commissioning, then arming. CONFIG, where it is left
+    out, is ./machine.toml. Exit codes: 0 done, 1 the answer is no, 2 wrong option or config, 3 device, file or port
+    trouble.
 
     Shell completion: eval "$(_FDHIL_COMPLETE=bash_source fdhil)" (or zsh_source, fish_source).
     """

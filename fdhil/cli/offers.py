@@ -10,9 +10,9 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cli.audited import audited
-from fdhil.cli.failing import verdict
+from fdhil.cli.failing import SuggestingGroup, verdict
 from fdhil.cli.fleet import with_extra
-from fdhil.cli.options import AS_JSON, CONFIG, FILE
+from fdhil.cli.options import AS_JSON, CONFIG, FILE, ConfigFirst
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault
 
@@ -24,7 +24,7 @@ BY = click.option("--by", required=True, help="Who answers: your name, which the
 MOST_BY, MOST_REASON = 64, 200
 
 
-@click.group()
+@click.group(cls=SuggestingGroup)
 def offers() -> None:
     """List, accept or reject proposed configuration changes.
 
@@ -32,7 +32,7 @@ def offers() -> None:
     """
 
 
-@offers.command("list")
+@offers.command("list", cls=ConfigFirst)
 @CONFIG
 @click.argument("files", nargs=-1, type=FILE)
 @AS_JSON
@@ -55,7 +55,7 @@ def list_(config: Path, files: tuple[Path, ...], as_json: bool) -> int:
     return 1 if any(each.wrong for each in found if each.place in files) else 0
 
 
-@offers.command()
+@offers.command(cls=ConfigFirst)
 @CONFIG
 @OFFER
 @BY
@@ -81,7 +81,7 @@ def accept(config: Path, offer: Path, by: str, may_loosen: bool, as_json: bool) 
     offers_view.accepted(done, machine, config, as_json)
 
 
-@offers.command()
+@offers.command(cls=ConfigFirst)
 @CONFIG
 @OFFER
 @BY

@@ -2,17 +2,34 @@
 
 import math
 import os
+import stat
+import sys
 from pathlib import Path
 from typing import Any
 
 import click
 
+from fdhil.cli.failing import wants_json
+from fdhil.errors import ConfigError, ConfigFault
 from fdhil.store.output import check_output
+
+DEFAULT_CONFIG = Path("machine.toml")
+
+
+def _check_default(_ctx: click.Context, _param: click.Parameter, value: Path) -> Path:
+    """ConfigError where no configuration was named and this folder has none."""
+    if value == DEFAULT_CONFIG and not value.exists():
+        fault = ConfigFault("file", "is not in this folder", "name the configuration, or create one with fdhil init")
+        raise ConfigError(str(value), [fault])
+    return value
+
 
 # whether it can be read is seen where it is read: a file that cannot is trouble, not a wrong call
 FILE = click.Path(path_type=Path, readable=False)
 FOLDER = click.Path(path_type=Path, readable=False, file_okay=False)
-CONFIG = click.argument("config", type=FILE)
+CONFIG = click.argument("config", type=FILE, default=DEFAULT_CONFIG, callback=_check_default)
+CONFIG_OPTION = click.option("--config", "config_path", type=FILE, default=DEFAULT_CONFIG, show_default=True,
+                             callback=_check_default, help="The machine's configuration (TOML).")  # fmt: skip
 FLEET = click.argument("fleet", type=FILE)
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout.")
 LINES = click.option("--json", "as_json", is_flag=True, help="Write each log line as a JSON object to stdout.")
@@ -64,18 +81,47 @@ class Picture(OutputFile):
         return Path(value) if str(value) == "-" else super().convert(value, param, ctx)
 
 
+class ConfigFirst(click.Command):
+    """A command whose CONFIG may be left out although other arguments follow it."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Put the default in front where the first argument is no TOML file and the last one would be missing."""
+        given = self.make_parser(ctx).parse_args(list(args))[0]
+        last = [param for param in self.params if isinstance(param, click.Argument)][-1]
+        first, alone = given.get("config"), not isinstance(given.get(last.name or ""), str)
+        if isinstance(first, str) and not first.endswith(".toml") and alone:
+            args = [str(DEFAULT_CONFIG), *args]
+        return super().parse_args(ctx, args)
+
+
 class Writing(click.Command):
-    """A command that writes files: never over one that it reads, and each file once."""
+    """A command that writes files: never over one that it reads, each file once, and it reports each."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Compare what is written with what is read, then run."""
+        """Compare what is written with what is read, run, then report which files are new."""
         given = [(p, path) for p in self.params for path in _paths(ctx.params.get(str(p.name)))]
         for k, (option, path) in enumerate(given):
             for other, there in given[:k] + given[k + 1 :]:
                 if isinstance(option.type, OutputFile) and _same_file(path, there):
                     text = f"{path} is also what {other.human_readable_name} names; choose another name"
                     raise click.BadParameter(text, ctx, option)
-        return super().invoke(ctx)
+        outputs = [path for option, path in given if isinstance(option.type, OutputFile)]
+        before = [_identity(path) for path in outputs]
+        try:
+            return super().invoke(ctx)
+        finally:  # a command whose answer is no writes its file, too
+            for path, old in zip(outputs, before, strict=True):
+                if _identity(path) != old and (not wants_json() or sys.stderr.isatty()):
+                    click.echo(f"wrote {path}", err=True)
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Return what changes when a regular file is written; None where there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return (found.st_ino, found.st_mtime_ns) if stat.S_ISREG(found.st_mode) else None
 
 
 def _same_file(path: Path, there: Path) -> bool:

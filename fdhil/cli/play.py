@@ -18,7 +18,7 @@ from fdhil import config as machine_config
 from fdhil.cli.audited import audited
 from fdhil.cli.consent import agreed, listen_again
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, FILE
+from fdhil.cli.options import AS_JSON, CONFIG_OPTION, FILE
 from fdhil.cli.terminal_text import print_progress
 from fdhil.errors import DeviceError, DriveFault
 from fdhil.guard.protocol import SOCKET_NAME
@@ -41,7 +41,7 @@ SIGNALS: Mapping[int, str] = {
 
 @click.command()
 @click.argument("program", type=FILE)
-@click.option("--config", "config_path", required=True, type=FILE, help="The machine (TOML).")
+@CONFIG_OPTION
 @click.option("--go-to-start", is_flag=True, help="Go to the first set-point slowly, where the axes are not there.")
 @click.option("--hold", is_flag=True, help="Hold the axes at the start until Enter is pressed: arm a correction there.")
 @click.option("--dry-run", is_flag=True, help="Check the program and say what would move; opens no bus.")

@@ -14,7 +14,7 @@ import click
 from fdhil import tables
 from fdhil.api.compiling import forewarn
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, FILE, OutputFile, Positive, Writing
+from fdhil.cli.options import AS_JSON, CONFIG_OPTION, FILE, OutputFile, Positive, Writing
 from fdhil.records import INTERVAL_95
 from fdhil.report.parameter_view import MEANING
 
@@ -47,15 +47,17 @@ def _shared(wanted: Callable[..., int | None]) -> Callable[..., int | None]:
 
     @functools.wraps(wanted)
     def command(**options: Any) -> int | None:
+        if options["report"] or options["pdf"]:
+            from fdhil.report import require
+
+            require()  # before the work
         own = {name: value for name, value in options.items() if name not in Asked.__dataclass_fields__}
         return wanted(Asked(**{name: options[name] for name in Asked.__dataclass_fields__}), **own)
 
     for option in reversed(
         (
             click.argument("program", type=FILE, metavar="PROGRAM|DEMAND.csv"),
-            click.option(
-                "--config", "config_path", type=FILE, required=True, help="The machine's configuration (TOML)."
-            ),
+            CONFIG_OPTION,
             click.option("--model", "model_path", type=FILE, help="Parameters of each axis (JSON)."),
             click.option("--from-history", is_flag=True, help="Use the newest validated parameters of the store."),
             click.option("--out", type=OutputFile(), help="Write a CSV with a row per SYNC period."),
@@ -198,9 +200,7 @@ def _report(asked: Asked, config: MachineConfig, found: Prediction | Correction,
     if asked.report is None and asked.pdf is None:
         return
     from fdhil.records import Prediction
-    from fdhil.report import deliver, require
-
-    require()
+    from fdhil.report import deliver
     from fdhil.report.path import correction_page, prediction_page
 
     name, machine = asked.program.name, config.machine.name

@@ -7,19 +7,19 @@ import click
 
 from fdhil import config as machine_config
 from fdhil import tables
-from fdhil.cli.options import CONFIG, FILE, LINES
+from fdhil.cli.options import CONFIG, LINES, OutputFile, Writing
 from fdhil.config import MachineConfig
 from fdhil.errors import FdhilError
 
 EXTRAS: Mapping[str, str] = {"prometheus": "web", "mtconnect": ""}  # the others are called as their protocol
 
 
-@click.command()
+@click.command(cls=Writing)
 @click.argument("protocol", type=click.Choice(list(tables.PUBLISHERS)))
 @CONFIG
 @click.option(
     "--devices",
-    type=FILE,
+    type=OutputFile(),
     help="With mtconnect: write the Devices.xml that its agent needs to this file, and stop.",
 )
 @LINES
@@ -55,4 +55,4 @@ def _write_devices(machine: MachineConfig, file: Path) -> None:
 
     with open_output(file) as written:
         written.write(devices(machine).encode())
-    click.echo(f"{file}: every data item of {machine.machine.name}; start the agent anew, it reads it once", err=True)
+    click.echo("restart the agent: it reads the file once", err=True)

@@ -59,7 +59,7 @@ def record(config: Path, out: Path, seconds: float | None, rest: float, with_gap
     if as_json:
         click.echo(json.dumps(_document(out, recorded, written)))
     else:
-        _tell(out, recorded, written)
+        _tell(recorded, written)
     if recorded is None or not recorded.complete:
         click.get_current_context().exit(1)
 
@@ -115,12 +115,12 @@ def _document(out: Path, recorded: RecordedDemand | None, written: bool) -> dict
     }
 
 
-def _tell(out: Path, recorded: RecordedDemand | None, written: bool) -> None:
+def _tell(recorded: RecordedDemand | None, written: bool) -> None:
     if recorded is None:
         click.echo(NOTHING_MOVED, err=True)
         return
     rows = recorded.reference.time_s.size
-    click.echo(f"{rows} rows, {recorded.reference.time_s[-1]:.3f} s" + (f", written to {out}" if written else ""))
+    click.echo(f"{rows} rows, {recorded.reference.time_s[-1]:.3f} s")
     for gap in recorded.gaps[:_SHOWN_GAPS]:
         lost, at_s = gap.stop - gap.first, recorded.reference.time_s[gap.first]
         click.echo(f"lost: {lost} rows of axis {gap.axis} at {at_s:.3f} s", err=True)

@@ -119,8 +119,11 @@ def _config_of(window: Window) -> machine_config.MachineConfig:
 def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) -> None:
     """Show the history of CONFIG's machine: revisions, slopes, changes, maintenance dates, notices."""
     machine = machine_config.load(config)
+    from fdhil.report import require
     from fdhil.report.history_reading import by_axis, read_history, read_notices
 
+    if plot is not None:
+        require()
     rows, told = read_history(machine, axis, partial(click.echo, err=True))
     notices = read_notices(machine, axis)
     if axis is not None and axis not in machine.axis and not rows:
@@ -182,6 +185,9 @@ def export(recording: Path, out: Path, format_name: str | None, columns: Path | 
 @AS_JSON
 def report(config: Path, out: Path, pdf: Path | None, as_json: bool) -> None:
     """Write an HTML report of the stored history of CONFIG's machine."""
+    from fdhil.report import require
+
+    require()
     machine = machine_config.load(config)
     from fdhil.cli.history_report import write_report
     from fdhil.report.history_reading import by_axis, read_history, read_notices, read_refusals

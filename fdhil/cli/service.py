@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ from fdhil import tables
 from fdhil.cli.audited import write_after, write_before
 from fdhil.cli.consent import agreed
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, CONFIG, FILE, LINES
+from fdhil.cli.options import AS_JSON, CONFIG, FILE, LINES, ConfigFirst
 from fdhil.cli.terminal_text import without_controls
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, DriveFault
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from fdhil.arming.guard_client import GuardClient
 
 DISARM_S = 15.0  # the daemon waits for the guard's answer and for the ramp
+WATCH_S = 1.0
 UNASKED = "hold the feed and run it again, with --yes where nobody can be asked"
 
 
@@ -63,22 +65,37 @@ def _ask(
 
 @click.command()
 @CONFIG
+@click.option("--watch", is_flag=True, help="Show it again each second until Ctrl-C; with --json, a line each.")
 @AS_JSON
-def status(config: Path, as_json: bool) -> None:
+def status(config: Path, watch: bool, as_json: bool) -> None:
     """Show the status of CONFIG's daemon: parameters, windows, frames, guard, notices."""
+    if not watch:
+        _show_status(config, as_json)
+        return
+    with suppress(KeyboardInterrupt):
+        while True:
+            if not as_json:
+                click.clear()  # of a terminal; elsewhere one status follows the other
+            try:
+                _show_status(config, as_json)
+            except (ConnectError, DeviceTimeout) as error:  # the daemon may be restarted meanwhile
+                click.echo(without_controls(str(error)), err=True)
+            time.sleep(WATCH_S)
+
+
+def _show_status(config: Path, as_json: bool) -> None:
+    from fdhil.cli.status_view import show
     from fdhil.daemon.status import config_difference
 
     answer = _ask(config, {"request": "status"})
     answer["config_difference"] = config_difference(answer, machine_config.load(config).digest)
     if as_json:
         click.echo(json.dumps(answer))
-        return
-    from fdhil.cli.status_view import show
-
-    show(answer)
+    else:
+        show(answer)
 
 
-@click.command()
+@click.command(cls=ConfigFirst)
 @CONFIG
 @click.argument("program", type=FILE, required=False)
 @click.option("--method", type=click.Choice(list(tables.CORRECTIONS)), help="Left out: the best there is.")
@@ -160,7 +177,7 @@ def disarm(config: Path, as_json: bool) -> None:
         _tell(answer, as_json)
 
 
-@click.command()
+@click.command(cls=ConfigFirst)
 @CONFIG
 @click.argument("numbers", type=int, nargs=-1, metavar="NUMBER...")
 @click.option("--all", "everything", is_flag=True, help="All that wait now.")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
+import threading
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +14,7 @@ import click
 from fdhil.cli.options import CONFIG, FILE, OutputFile, Writing
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from fdhil.config import MachineConfig
     from fdhil.records import Trajectory
@@ -20,6 +22,8 @@ if TYPE_CHECKING:
 
 LINGER_S = 10.0
 LOOK_S = 0.1
+SHOW_S = 1.0
+SHOWN_MM = 0.01  # what moves less stands still
 
 
 @click.command(cls=Writing)
@@ -80,14 +84,39 @@ def _serve(path: Path, as_json: bool, script: Path | None, play: Path | None, tr
         signal.signal(number, stop)
     signal.signal(signal.SIGUSR1, lambda *_: _stop_when_left(service, stop))
     sys.setswitchinterval(0.0005)  # the SYNC must not wait 5 ms for the thread that serves the sensors
+    if not as_json and sys.stderr.isatty():
+        shown = Positions(lambda: {axis: unit.drive.table_mm for axis, unit in service.machine.units.items()})
+        threading.Thread(target=_show_positions, args=(shown,), daemon=True).start()
     gc.freeze()  # what is there now stays; the collector need not look at it between two SYNCs
     service.run(play, trace)
+
+
+class Positions:
+    """The line that shows where the tables are while one of them moves."""
+
+    def __init__(self, read_mm: Callable[[], Mapping[str, float]]) -> None:
+        self._read_mm, self._shown_mm = read_mm, read_mm()
+        self._moving = False
+
+    def line(self) -> str | None:
+        """Return the line, once more when all stand again; None while none has moved since it was returned last."""
+        now_mm = self._read_mm()
+        moved = any(abs(mm - self._shown_mm[axis]) > SHOWN_MM for axis, mm in now_mm.items())
+        self._shown_mm, due = now_mm, moved or self._moving
+        self._moving = moved
+        return "  ".join(f"{axis} {mm:.3f} mm" for axis, mm in now_mm.items()) if due else None
+
+
+def _show_positions(shown: Positions) -> None:
+    while True:
+        time.sleep(SHOW_S)
+        if line := shown.line():
+            click.echo(line, err=True)
 
 
 def _stop_when_left(service: SimService, stop: Callable[[], None]) -> None:
     """Serve on until nobody is on the buses any more: who corrects comes to zero first; LINGER_S at the most."""
     import signal
-    import time
 
     end_s = time.monotonic() + LINGER_S
 

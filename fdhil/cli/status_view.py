@@ -54,6 +54,8 @@ def show(status: Mapping[str, Any], console: Console | None = None) -> None:
         out.print(escape(nc_line(nc)))
     loads = "".join(f", {bus} loaded {load:.0f} %" for bus, load in status["bus_load_percent"].items())
     out.print(escape(f"correction: {status['state']}, guard {_guard(guard)}{loads}"))
+    if lateness := guard.get("lateness"):
+        out.print(lateness_line(lateness["recent"]))
     stands = status.get("may_stand", {"nothing": True})
     if guard.get("state") == "lost":
         out.print(f"[red]{escape(guard['text'])}[/red]")
@@ -137,6 +139,14 @@ def _guard(guard: Mapping[str, Any]) -> str:
     return state if heard_s <= GUARD_LIVE_S else f"{state} when it answered last, {_ago(heard_s)} ago"
 
 
+def lateness_line(recent: Mapping[str, Any]) -> str:
+    """Say how late this PC was in the last minute or two, as the guard measured it."""
+    worst = f"the slowest after {recent['worst_us'] / 1e3:.2f} ms"
+    if not recent["late"]:
+        return f"this PC: none of the last {grouped(recent['turns'])} offsets late, {worst}"
+    return f"[red]this PC: {grouped(recent['late'])} of the last {grouped(recent['turns'])} offsets late[/red], {worst}"
+
+
 def nc_line(nc: Mapping[str, Any]) -> str:
     """Say what the NC says of itself."""
     if nc["motion"] == "unknown":
@@ -196,8 +206,8 @@ def believed(axis: Mapping[str, Any]) -> str:
         for name, told in (axis.get("terms") or {}).items()
     )
     left, table = axis.get("unexplained_um"), (axis.get("last_window") or {}).get("at_table")
-    seen = f"the table was {table['error_rms_um']:.3g} um RMS off in the last rapid" if table else ""
-    parts = [terms, "" if left is None else f"{left:.2g} um of a rapid unexplained", seen, *axis.get("warnings", [])]
+    seen = f"the table was {table['error_rms_um']:.2f} um RMS off in the last rapid" if table else ""
+    parts = [terms, "" if left is None else f"{left:.2f} um of a rapid unexplained", seen, *axis.get("warnings", [])]
     return "; ".join(part for part in parts if part)
 
 
@@ -234,7 +244,7 @@ def show_history(rows: Sequence[Mapping[str, Any]], console: Console | None = No
         names = list(of_axis[0]["parameters"])
         first, last = (of_axis[k]["time"][:10] for k in (0, -1))
         table = narrow_table(f"axis {axis}: {len(of_axis)} revisions, {first} to {last}")
-        for text in ("rev", "time", "degC", "win", *map(head, names)):
+        for text in ("rev", "time\nUTC", "degC", "win", *map(head, names)):
             table.add_column(text, no_wrap=True)
         for row in of_axis[-newest:]:
             degrees = "-" if row["temperature_c"] is None else f"{row['temperature_c']:.1f}"

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from fdhil import config as machine_config
-from fdhil.cli.options import AS_JSON, CONFIG
+from fdhil.cli.options import AS_JSON, CONFIG, ConfigFirst
 from fdhil.config.users import Role
 from fdhil.config.web import Web
 from fdhil.errors import ConfigError, ConfigFault
@@ -46,7 +46,7 @@ def placed(web: Web, host: str | None, port: int | None) -> Web:
     return web.model_copy(update=given)
 
 
-@click.command("web-user")
+@click.command("web-user", cls=ConfigFirst)
 @CONFIG
 @click.argument("name")
 @click.option("--role", type=click.Choice(["watch", "operate"]), default="watch", show_default=True)

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from types import FrameType
 
-from fdhil.cia402 import State
+from fdhil.cia402 import State, emcy_text
 from fdhil.commissioning.cycle import Cycle
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.set_points import Bounds, SetPoints
@@ -17,6 +17,7 @@ from fdhil.records import Float
 ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 PATIENCE = 20.0  # times as long as the set-points take
 SILENT_CYCLES = 20
+EMCY_HEARTBEAT = 0x8130
 LAG_CYCLES = 300  # an axis may follow so much later than its last set-point
 
 
@@ -55,7 +56,9 @@ def watch_power(masters: Sequence[Master], path: SetPoints) -> None:
             path.stop(f"axis {master.axis}: nothing was heard of its drive for {SILENT_CYCLES} SYNC")
         if master.state() is not State.OPERATION_ENABLED:
             told = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[-1:]]
-            why = f" (EMCY {told[0]:04X})" if told and told[0] else ""
+            why = f" (EMCY {told[0]:04X}: {emcy_text(told[0])})" if told and told[0] else ""
+            if told and told[0] == EMCY_HEARTBEAT:
+                why += f"; this PC was late by up to {master.loop.lateness.most_us / 1e3:.1f} ms: take load off it"
             path.stop(f"axis {master.axis}: its drive fell from Operation enabled to {master.state().value}{why}")
 
 

@@ -114,7 +114,9 @@ def axis_digest(config: MachineConfig, axis: str) -> str:
     Where sensors are reached, what the motor's data sheet says and what room there is may change without commissioning
     again.
     """
-    settings = config.axis[axis].model_dump(mode="json", exclude={"voltage", "nominal", "regulators", "setpoints"})
+    settings = config.axis[axis].model_dump(
+        mode="json", exclude={"voltage", "nominal", "guessed", "regulators", "setpoints"}
+    )
     if settings["feedforward"] is None:
         del settings["feedforward"]
     settings["drive"] = _described(config.axis[axis].drive)

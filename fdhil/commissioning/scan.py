@@ -9,14 +9,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from fdhil.cia402 import COB_SDO_REQUEST, COB_SDO_RESPONSE, Object
+from fdhil.cia402 import COB_SDO_REQUEST, COB_SDO_RESPONSE, Object, emcy_text
 from fdhil.commissioning.bus_listener import LISTEN_S, BusListener, Traffic
 from fdhil.commissioning.device_type import is_drive
 from fdhil.commissioning.survey import Identity
 from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import CanBus, MachineConfig
 from fdhil.drivers.can.frames import Frames
-from fdhil.drivers.can.node_watch import emcy_text
 from fdhil.drivers.can.sdo import SdoLink
 from fdhil.drivers.cia402.eds import load_eds
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, EdsError, ForeignMaster, ProtocolError

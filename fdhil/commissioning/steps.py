@@ -287,8 +287,11 @@ def commission(
     axis: str,
     report: Callable[[str], None] = lambda _step: None,
     progress: Progress | None = None,
+    result: Callable[[str, Found], None] = lambda _step, _found: None,
 ) -> CommissioningRecord:
     """Commission one axis and return the signed-off record (not saved yet); ``report`` gets each step's name.
+
+    ``result`` gets what a step found, after it.
 
     Nothing moves before ``report`` returns from ``enable``, and nothing is written but the RPDO of the feed-forward,
     which is given back: what ``report`` raises there ends it with no trace. With ``progress`` each step that is done is
@@ -307,7 +310,8 @@ def commission(
             report("compare")
             boots = master.heard.boots
             found = check_axis(master)
-            proven = _proven(master, found, report, progress)
+            result("compare", {"points": len(found.findings)})
+            proven = _proven(master, found, report, progress, result)
             if master.heard.boots != boots:
                 raise DriveFault(master.device, BOOTED)
     return CommissioningRecord(
@@ -331,7 +335,11 @@ def holds_for(config: MachineConfig, axis: str, found: Survey) -> str:
 
 
 def _proven(
-    master: Master, found: Survey, report: Callable[[str], None], progress: Progress | None
+    master: Master,
+    found: Survey,
+    report: Callable[[str], None],
+    progress: Progress | None,
+    result: Callable[[str, Found], None],
 ) -> Mapping[str, Found]:
     """Return what each of the ``PROOFS`` found; the drive is switched on only where one is not kept."""
     now = holds_for(master.config, master.axis, found)
@@ -349,6 +357,7 @@ def _proven(
             proven[name] = PROOFS[name](master)
             if progress is not None:
                 progress.keep(name, now, proven[name])
+            result(name, proven[name])
         report("restore")
     return proven
 

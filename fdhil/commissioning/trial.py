@@ -17,13 +17,13 @@ from fdhil.commissioning.progress import Found, Progress
 from fdhil.commissioning.record import CommissioningRecord
 from fdhil.commissioning.steps import enable, holds_for, prepare, rolled_back
 from fdhil.commissioning.strokes import Room, Stroke, plan_jog, plan_rapid, require_single_drive
-from fdhil.commissioning.stroking import Travel, stroke, travel_of
+from fdhil.commissioning.stroking import Travel, plan_return, position_mm, stroke, travel_of
 from fdhil.commissioning.survey import listen, require, survey
 from fdhil.commissioning.timing import judge_answers, judge_sync, measure
 from fdhil.commissioning.watchdog import watched
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.bus import CanBus
-from fdhil.errors import DeviceError, DriveFault
+from fdhil.errors import DeviceError, DriveFault, StoreError
 from fdhil.pipeline import Known
 from fdhil.records import Outcome, Recording
 
@@ -40,13 +40,17 @@ GIVEN = "room"  # kept beside the steps: where a trial that was stopped may go
 
 @dataclass(frozen=True, slots=True)
 class Operator:
-    """Who is told and asked: ``report`` gets the name of each step before it is done, and what it raises ends all.
+    """Who is informed and asked: ``report`` gets the name of each step before it, and what it raises ends all.
 
-    ``saw`` gets a question and tells what the operator saw, None where nobody was asked.
+    ``saw`` gets a question and returns what the operator saw, None where nobody was asked. ``result`` gets what a step
+    found; before the first move that of ``room``: where the axis stands, where it may go, and by which move it returns
+    to where a stopped trial began. ``at`` gets the position in mm while the axis moves.
     """
 
     report: Callable[[str], None] = lambda _step: None
     saw: Callable[[str], bool | None] = lambda _question: None
+    result: Callable[[str, Found], None] = lambda _step, _found: None
+    at: Callable[[float], None] = lambda _mm: None
 
 
 @dataclass(slots=True)
@@ -84,16 +88,24 @@ def try_axis(
             operator.report("timing")
             prepare(master)
             trial.found["timing"] = time_bus(master)
+            operator.result("timing", trial.found["timing"])
             travel_mm = allowed(master, record, room, progress, now)
-            with guarded(master):
+            back = plan_return(master, travel_mm)
+            operator.result(GIVEN, _shown(master, travel_mm) | {"return": None if back is None else str(back)})
+            with where_stopped(master, progress, now), guarded(master):
+                if back is not None:
+                    operator.report("return")
+                    enable(master)
+                    stroke(master, travel_mm, back, JOG_REST_S, operator.at)
                 if "jog" not in trial.found:
                     operator.report("jog")
                     enable(master)
                     trial.found["jog"] = jog_to_and_fro(master, travel_mm, jog, operator)
                     progress.keep("jog", now, trial.found["jog"])
+                    operator.result("jog", trial.found["jog"])
                 operator.report("test rapids")
                 enable(master)
-                heard = rapids_to_and_fro(master, travel_mm, rapid)
+                heard = rapids_to_and_fro(master, travel_mm, rapid, operator)
                 operator.report("restore")
     trial.outcomes = tuple(identify(config, axis, heard.records, known))
     trial.found |= judged(config, axis, trial.outcomes, heard.recording(), operator)
@@ -108,8 +120,28 @@ def allowed(master: Master, record: CommissioningRecord, room: Room, progress: P
     given = progress.found(GIVEN, now)
     travel_mm = travel_of(master, record, room, Travel(**given) if given else None)
     if given is None:
-        progress.keep(GIVEN, now, travel_mm._asdict())
+        progress.keep(
+            GIVEN, now, {"low_mm": travel_mm.low_mm, "high_mm": travel_mm.high_mm, "start_mm": travel_mm.start_mm}
+        )
     return travel_mm
+
+
+@contextmanager
+def where_stopped(master: Master, progress: Progress, now: str) -> Iterator[None]:
+    """Keep where the axis stands after whatever ends a trial early: from there it may be resumed."""
+    try:
+        yield
+    except BaseException:  # Ctrl-C, too
+        if given := progress.found(GIVEN, now):
+            with suppress(StoreError):  # why it ended is told
+                progress.keep(GIVEN, now, {**given, "stopped_mm": position_mm(master)})
+        raise
+
+
+def _shown(master: Master, travel_mm: Travel) -> dict[str, str]:
+    settings = master.config.axis[master.axis]
+    places = {"stands": position_mm(master), "from": travel_mm.low_mm, "to": travel_mm.high_mm}
+    return {what: settings.shown(mm, form=".3f") for what, mm in places.items()}
 
 
 def judged(
@@ -119,13 +151,17 @@ def judged(
     balance = judge_acceleration(heard)
     if balance.ok is False:
         raise DriveFault(f"drive {axis}", f"{balance.cause}; {balance.advice}")
+    operator.result("test rapids", {balance.point: balance.found})
     operator.report("identification")
     rapids = judge(axis, outcomes)
+    operator.result("identification", rapids.parameters)
     operator.report("acceptance")
+    accepted = accept(config, rapids)
+    operator.result("acceptance", accepted)
     return {
         "test rapids": {balance.point: balance.found, **voltage_late(config, rapids)},
         "identification": rapids.parameters,
-        "acceptance": accept(config, rapids),
+        "acceptance": accepted,
     }
 
 
@@ -166,7 +202,7 @@ def jog_to_and_fro(master: Master, travel_mm: Travel, jog: Stroke, operator: Ope
     """Jog an enabled axis and back: units and signs must be right, also in the eyes of the operator; DriveFault."""
     with Overhearing(master.config, master.axis) as heard:
         for moved in (jog, jog.back()):
-            stroke(master, travel_mm, moved, JOG_REST_S)
+            stroke(master, travel_mm, moved, JOG_REST_S, operator.at)
         wait_heard(master, heard)
     findings = list(judge_jog(heard.recording(), jog.distance_mm, jog.axis))
     require(master, findings)
@@ -192,12 +228,12 @@ def wait_heard(master: Master, heard: Overhearing) -> None:
     master.wait(reached, patience_s, "its TPDOs are not heard any more; check the bus")
 
 
-def rapids_to_and_fro(master: Master, travel_mm: Travel, rapid: Stroke) -> Overhearing:
+def rapids_to_and_fro(master: Master, travel_mm: Travel, rapid: Stroke, operator: Operator) -> Overhearing:
     """Move an enabled axis as fast as G0, to and fro, and return what was heard of it."""
     with Overhearing(master.config, master.axis, rapid.speed_mm_s) as heard:
         master.wait_cycles(round(REST_S / master.period_s))
         for _ in range(RAPIDS // 2):
             for moved in (rapid, rapid.back()):
-                stroke(master, travel_mm, moved, REST_S)
+                stroke(master, travel_mm, moved, REST_S, operator.at)
         wait_heard(master, heard)
     return heard

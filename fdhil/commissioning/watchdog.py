@@ -3,8 +3,9 @@
 import contextlib
 from collections.abc import Callable, Iterator
 
-from fdhil.cia402 import NmtCommand, Object, State
+from fdhil.cia402 import NmtCommand, Object, State, emcy_text
 from fdhil.commissioning.master import Master
+from fdhil.commissioning.moving import EMCY_HEARTBEAT
 from fdhil.commissioning.survey import require_enabled
 from fdhil.drivers.can.sdo import NO_OBJECT, NO_SUB_INDEX
 from fdhil.errors import DeviceError, DriveFault, SdoAbort
@@ -14,7 +15,6 @@ FEEDING_S = 0.3
 STARVE_TIMEOUT_S = 1.0
 HEARTBEATS_MISSED = 3
 ANSWER_CYCLES = 20
-EMCY_HEARTBEAT = 0x8130
 
 
 def watchdog_test(master: Master, enable: Callable[[Master], None]) -> str:
@@ -44,8 +44,9 @@ def watchdog_test(master: Master, enable: Callable[[Master], None]) -> str:
             raise DriveFault(master.device, text)
         codes = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[fed_from:]]
         if EMCY_HEARTBEAT not in codes:
-            shown = ", ".join(f"{code:04X}" for code in codes) or "none"
-            text = f"it stopped with the EMCY {shown} instead of 8130; find out what else stops it"
+            shown = ", ".join(f"{code:04X} ({emcy_text(code)})" for code in codes) or "none"
+            missed = f"8130 ({emcy_text(EMCY_HEARTBEAT)})"
+            text = f"it stopped with the EMCY {shown} instead of {missed}; find out what else stops it"
             raise DriveFault(master.device, text)
     return "proven"
 

@@ -230,6 +230,9 @@ class Axis(Section):
     max_difference_um: Positive | None = Field(
         None, le=1e4, description="of a gantry axis: how far its two drives may be apart; left out: 500"
     )
+    guessed: tuple[Literal["R", "L", "K", "Jt", "ft", "Cd"], ...] = Field(
+        (), description="keys of nominal that nobody knows: no identified value is compared with them"
+    )
     nominal: Nominal
     regulators: Regulators
     correction: CorrectionLimits | None = None

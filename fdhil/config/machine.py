@@ -188,7 +188,9 @@ class MachineConfig(Section):
         files = "".join(axis.drive.files_digest for axis in self.axis.values())
         # of a linear axis as before there were others, so that no record is void
         rotary = {"unit", "radius_mm"}
-        linear = {n: {"max_difference_um", *(rotary if axis.unit == "mm" else ())} for n, axis in self.axis.items()}
+        linear = {
+            n: {"max_difference_um", "guessed", *(rotary if axis.unit == "mm" else ())} for n, axis in self.axis.items()
+        }
         unused: dict[str, Any] = {**dict.fromkeys(BESIDE_THE_MACHINE, True), "axis": linear}
         if not self.nc.wrapped_axes:
             unused["nc"] = {"wrapped_axes"}

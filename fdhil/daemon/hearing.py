@@ -9,6 +9,8 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+import numpy as np
+
 from fdhil.cia402 import state_of
 from fdhil.config import MachineConfig
 from fdhil.daemon.moves import Moves
@@ -21,6 +23,8 @@ SYNC_INTERVALS = 500
 RATE_NS = 1_000_000_000  # of the newest SYNCs, over which their rate is told
 FEW_SYNCS = 32
 PERIOD_TOLERANCE = 0.02
+PERIOD_S = 60.0  # a period is judged by the median of the rates of so long
+STEADY = 0.01  # by which nearly all of them agree, or they tell no period
 PATIENCE_S = 3.0  # until what is wrong, or missing, is told
 START_S = 10.0  # until a drive samples when SYNC runs
 FRAME_BITS = 121  # 8 data bytes, 11 bit identifier, stuffing between none and the worst case
@@ -53,6 +57,7 @@ class Hearing:
         self.load_percent: dict[str, float] = {}
         self._sync: deque[tuple[int, int]] = deque(maxlen=SYNC_INTERVALS + 1)
         self._sync_s: float | None = None
+        self._rates: deque[tuple[float, float]] = deque()
         self._samples_s: dict[str, float] = {}
         self._statuswords: dict[str, int] = {}
         self._since_s: dict[Trouble, float] = {}
@@ -162,16 +167,35 @@ class Hearing:
         return {trouble: text for trouble, text in found.items() if trouble in lasting}
 
     def _found(self, windows: Mapping[str, int], now_s: float) -> Iterator[tuple[Trouble, str]]:
-        rate, expected = self.sync_rate_hz(now_s), 1 / self._config.machine.sync_period_s
-        if self._realtime and rate is not None and abs(rate / expected - 1) > PERIOD_TOLERANCE:
-            text = f"SYNC comes at {rate:.4g} Hz where the config says {expected:.4g}: what is identified is wrong"
-            yield ("SyncPeriodSuspect", ""), f"{text}; set sync_period_s = {1 / rate:.4g}, or correct the NC's"
+        rate = self.sync_rate_hz(now_s)
+        if (suspect := self._suspect_period(rate, now_s)) is not None:
+            yield ("SyncPeriodSuspect", ""), suspect
         for axis, settings in self._config.axis.items():
             missing = self._missing(axis, settings.drive.bus, rate is not None, now_s)
             if missing is not None:
                 yield (missing[0], axis), missing[1]
             elif (unused := self.moves[axis].trouble(windows.get(axis, 0), now_s)) is not None:
                 yield (unused[0], axis), unused[1]
+
+    def _suspect_period(self, rate: float | None, now_s: float) -> str | None:
+        """Return what is wrong with the period of SYNC by the rates of the last minute; None where nothing is."""
+        if not self._realtime or rate is None:
+            self._rates.clear()
+            return None
+        self._rates.append((now_s, rate))
+        while self._rates and now_s - self._rates[0][0] > PERIOD_S:
+            self._rates.popleft()
+        if now_s - self._rates[0][0] < PERIOD_S - LIVE_S:
+            return None
+        least, typical, most = np.quantile([each for _, each in self._rates], (0.05, 0.5, 0.95)).tolist()
+        expected = 1 / self._config.machine.sync_period_s
+        if abs(typical / expected - 1) <= PERIOD_TOLERANCE:
+            return None
+        if most - least > STEADY * typical:
+            text = f"SYNC comes unevenly, at {least:.0f} to {most:.0f} Hz where the config says {expected:.4g}"
+            return f"{text}: no period can be determined; take load off this PC and off whoever sends SYNC"
+        text = f"SYNC comes at {typical:.4g} Hz where the config says {expected:.4g}: what is identified is wrong"
+        return f"{text}; set sync_period_s = {1 / typical:.4g}, or correct the NC's"
 
     def _missing(self, axis: str, bus: str, synced: bool, now_s: float) -> tuple[str, str] | None:
         """Return what is not heard of a drive while its bus is."""

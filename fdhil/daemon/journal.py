@@ -9,7 +9,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Literal, TextIO
 
 from fdhil.records import (
@@ -63,7 +63,7 @@ def lines_dated_by(clock: Clock) -> Iterator[None]:
 
 
 def write_line(text: str, severity: Severity = "info") -> None:
-    """Write one line to stderr with the local time; to the journal, which has the time, with its priority.
+    """Write one line to stderr with its time in UTC; to the journal, which has the time, with its priority.
 
     Nobody waits for who reads it: where nothing is taken now, or a disk is full, the line is dropped, and it is told
     later how many were.
@@ -77,11 +77,11 @@ def write_line(text: str, severity: Severity = "info") -> None:
 
 def _line(text: str, severity: Severity) -> tuple[TextIO, str]:
     """Where a line goes, and how it reads there."""
-    now = datetime.fromtimestamp(_clocks[-1].wall_s()).astimezone()
+    now = datetime.fromtimestamp(_clocks[-1].wall_s(), UTC)
     if _for_programs.is_set():
         line = {"time": now.isoformat(timespec="milliseconds"), "severity": severity, "text": text}
         return sys.stdout, json.dumps(line) + "\n"
-    stamp = f"{now:%Y-%m-%d %H:%M:%S}.{now.microsecond // 1000:03d} "
+    stamp = f"{now:%Y-%m-%d %H:%M:%S}.{now.microsecond // 1000:03d} UTC "
     prefix = f"<{_PRIORITY[severity]}>" if os.environ.get("JOURNAL_STREAM") else stamp
     return sys.stderr, f"{prefix}{printable(text)}\n"
 

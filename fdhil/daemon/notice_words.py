@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
-from fdhil.guard.interlocks import CATALOGUE, EFFECT
+from fdhil.guard.interlocks import CATALOGUE, EFFECT, LATE
 from fdhil.records import Notice
 
 _CLASS = re.compile(r"\b([A-Z][A-Za-z]+): ")
@@ -109,7 +109,8 @@ def words_of(notice: Notice) -> tuple[str, str]:
     if inner is None:
         return (effect, action) if notice.code in WORDS else _of_guard(notice.code)
     sent = EFFECT[CATALOGUE[inner][0]]
-    return sent if sent in notice.text else effect, CATALOGUE[inner][2]
+    cause = "PcLate" if LATE in notice.text else inner
+    return sent if sent in notice.text else effect, CATALOGUE[cause][2]
 
 
 def _of_guard(code: str) -> tuple[str, str]:

@@ -330,7 +330,7 @@ class Service:
             return self._live.begin()
         if request["request"] == "arm":
             answer = await self._desk.arm(request, lambda: self._control.hung_up)
-            self._tell([_told(answer)])
+            self._tell([*await asyncio.to_thread(self._desk.guard.take_changes), _told(answer)])
             difference = self._watch.config_difference(request.get("config_digest", self._config.digest))
             return {**answer, "config_difference": difference} if difference else answer
         if request["request"] == "disarm":

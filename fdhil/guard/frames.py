@@ -20,6 +20,7 @@ from fdhil.cia402 import (
     Nmt,
     NmtCommand,
     Object,
+    emcy_text,
     first_axis_index,
     pdo_length,
     unpack,
@@ -197,7 +198,9 @@ class Listener:
         if code >> 8 == 0 and len(data) >= 2:  # error reset or no error
             return
         self.emergencies += 1
-        self._alarm(Alarm("DriveEmergency", self.settings.axes[axis].name, f"{code:04X}, data {data.hex()}"))
+        self._alarm(
+            Alarm("DriveEmergency", self.settings.axes[axis].name, f"{code:04X}: {emcy_text(code)}; data {data.hex()}")
+        )
 
     def at_sync(self, data: bytes, stamp_s: float, now_s: float) -> tuple[tuple[AxisInput, ...], BusView]:
         """Close the cycle at a SYNC with its frame time ``stamp_s``; the view of the bus and of the axes."""

@@ -26,11 +26,15 @@ EFFECT: Mapping[Reaction, str] = {
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """Something that stops or refuses a correction: its class, the axis it is about, and a detail."""
+    """Something that stops or refuses a correction: its class, the axis it is about, and a detail.
+
+    ``late`` says how late this computer was just before, where that explains what a drive shows.
+    """
 
     code: str
     axis: str = ""
     detail: str = ""
+    late: str = ""
 
     @property
     def reaction(self) -> Reaction:
@@ -41,13 +45,16 @@ class Alarm:
     def cause(self) -> str:
         """The cause as a clause."""
         where = f"axis {self.axis}: " if self.axis else ""
-        return f"{where}{CATALOGUE[self.code][1]}" + (f" ({self.detail})" if self.detail else "")
+        shown = f"{where}{CATALOGUE[self.code][1]}" + (f" ({self.detail})" if self.detail else "")
+        return f"{self.late}: that is why {shown}" if self.late else shown
 
     @property
     def action(self) -> str:
         """What the operator does next."""
         if self.code == "NotOff" and self.detail == "FROZEN":
             return "hold the feed, then run fdhil adopt"
+        if self.late and self.reaction is not Reaction.FREEZE:
+            return CATALOGUE["PcLate"][2]
         return CATALOGUE[self.code][2]
 
     def sentence(self, off: bool = False) -> str:
@@ -57,6 +64,7 @@ class Alarm:
 
 
 Alarms = tuple[Alarm, ...]
+LATE = "this PC was late"
 _R, _H, _F, _N = Reaction.RAMP_DOWN, Reaction.HOLD, Reaction.FREEZE, Reaction.REFUSE
 # class: (reaction while sending, cause, next action)
 CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
@@ -144,6 +152,11 @@ CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
     # the guard itself
     "NotOff": (_N, "what was armed before has not ended", "disarm it first"),
     "NotSettled": (_N, "the interlocks were not all good for 100 SYNC", "wait a moment and arm again"),
+    "PcLate": (
+        _N,
+        "this PC is too late for a correction",
+        "take load off this PC, give the guard a real-time priority, measure with fdhil doctor --latency 60, arm again",
+    ),
     "GuardBusy": (_N, "a request of this connection still waits", "wait for its answer, then ask again"),
     "DisarmedSince": (_N, "it was disarmed after this was asked for", "ask again when it is wanted"),
     "MainLost": (_R, "the daemon is gone or does not answer", "restart the daemon, then arm again"),

@@ -10,6 +10,7 @@ import select
 import socket
 from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from fdhil.guard.requests import Document, parse_request
 from fdhil.guard.settings import Settings
 from fdhil.guard.shadow import Shadow
 from fdhil.guard.state import Inputs, Output, Request, initial
+from fdhil.guard.turn_times import TurnTimes
 
 IDLE_S = 0.05
 REST_S = 0.001
@@ -55,6 +57,7 @@ class Guard:
         self._journal = journal
         self._notifier = notifier
         self._listener = Listener(settings)
+        self._turns = TurnTimes(settings)
         self._entries = [axis.offset.entries for axis in settings.axes]
         self._requests: deque[tuple[Client | None, Document, Request]] = deque()
         self._disarms = 0
@@ -217,6 +220,8 @@ class Guard:
         self._last_sync_s, self._silent, self._put_off = now_s, False, False
         axes, bus = self._listener.at_sync(data, stamp_s, now_s)
         self._advance(Inputs(True, axes, bus), late, now_s)
+        clock, stamped = self._journal.clock, self.settings.transport == "can_raw"  # a hub may have another clock
+        self._turns.add(clock.wall_s() - stamp_s if stamped else clock.now_s() - now_s, late, now_s)
 
     def _local_timer(self) -> None:
         """Without SYNC for too long the core steps on the wall clock: it freezes, or ramps an event-driven RPDO."""
@@ -263,17 +268,25 @@ class Guard:
             self._shadow.follow(self.state, self.intake.path)
         if arming and not output.refused:
             self._own(client)
+            self._turns.begin()
         if output.refused is not None and client is not None:
             self._answer(client, document, output.refused)
         asked = client.peer if client is not None and request is not None and request.kind == "disarm" else None
         by = {"uid": asked.uid, "pid": asked.pid} if asked is not None else {}
         if output.transition is not None and not {*output.transition[:2]} <= {Mode.RAMPING, Mode.ACTIVE}:
-            self._tell(*output.transition, by)
+            self._explain(now_s)
+            self._tell(*output.transition[:2], self.state.cause, by)
         if output.feed_transition is not None:
             self._tell_feed(*output.feed_transition, by)
         for own, was, axis in zip(self.settings.axes, before, self.state.axes, strict=True):
             if axis.record_void and not was.record_void:
                 self._journal.write("record_void", axis=own.name, text=Alarm("RecordVoid", own.name).sentence())
+
+    def _explain(self, now_s: float) -> None:
+        """Note in the cause of a transition that this computer was late, where that explains it."""
+        cause = self.state.cause
+        if cause is not None and not cause.late and (late := self._turns.blame(cause.code, now_s)):
+            self.state = self.state._replace(cause=replace(cause, late=late))
 
     def _alive(self, owner: Client | None, now_s: float) -> bool:
         """Whether the daemon that armed is connected and says so often enough."""
@@ -380,6 +393,9 @@ class Guard:
         elif self._stopping:
             self._answer(client, document, (Alarm("Stopped"),))
             return
+        elif request.kind in ("arm", "feedforward") and (late := self._turns.refusal()):
+            self._answer(client, document, (Alarm("PcLate", detail=late),))
+            return
         for waits in list(self._requests):
             owner, asked, other = waits
             if owner is None:
@@ -433,6 +449,7 @@ class Guard:
             "shadow_um": None if shadow is None else status.in_um(shadow, self.settings),
             "emergencies": self._listener.emergencies,
             "journal_dropped": self._journal.dropped,
+            "lateness": self._turns.document(),
             "disarms": self._disarms,
             "events": list(self._journal.recent),
         }

@@ -18,7 +18,8 @@ FED = "speed and torque offsets may still be applied"
 
 def told(alarm: Alarm) -> dict[str, str]:
     """Return an alarm as it is given to clients."""
-    return {"code": alarm.code, "axis": alarm.axis, "text": alarm.cause, "advice": alarm.action}
+    late = {"late": alarm.late} if alarm.late else {}
+    return {"code": alarm.code, "axis": alarm.axis, "text": alarm.cause, "advice": alarm.action, **late}
 
 
 def in_um(offsets: Sequence[int | None], settings: Settings) -> dict[str, float | None]:

@@ -44,7 +44,16 @@ class Gain(NamedTuple):
     def __str__(self) -> str:
         if self.half_um is None:
             return f"{self.after_um:.2f} um RMS by the model alone, how well it fits this machine is not known here"
-        return f"{self.after_um:.2f} {plus_minus(self.half_um, 2)} um RMS"
+        return at_most(self.after_um, self.half_um)
+
+
+def at_most(model_um: float, half_um: float) -> str:
+    """Return a predicted RMS as text: the end of its 95 % interval first, as it has no symmetric one.
+
+    >>> at_most(0.08, 1.6)
+    'at most 1.68 um RMS (95 %), 0.08 by the model'
+    """
+    return f"at most {model_um + half_um:.2f} um RMS (95 %), {model_um:.2f} by the model"
 
 
 def plus_minus(half: float, decimals: int = 1) -> str:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from fdhil.store.rows import Revision, StoredWindow
 
 NEWEST_NOTICES = 500
+PASS = "PassMeasured"
 
 
 def read_history(
@@ -75,6 +76,16 @@ def read_notices(machine: MachineConfig, axis: str | None = None) -> list[dict[s
     return [notice_document(notice) for notice in asking[-NEWEST_NOTICES:]]
 
 
+def read_passes(machine: MachineConfig) -> list[dict[str, Any]]:
+    """Return the notices of the passes that were cut corrected, oldest first. StoreError."""
+    from fdhil.store.history import RECENT_NOTICES, History
+    from fdhil.store.notice_document import notice_document
+
+    with History.read(machine.store.directory) as stored:
+        known = stored.notices(limit=RECENT_NOTICES)
+    return [notice_document(notice) for notice in known if notice.notice.code == PASS]
+
+
 def _row(revision: Revision) -> dict[str, Any]:
     from fdhil.store.set_document import set_document
 
@@ -97,7 +108,13 @@ def by_axis(
             axis,
             [row for row in rows if row["axis"] == axis],
             told.get(axis),
-            machine.axis[axis].nominal.model_dump() if axis in machine.axis else {},
+            _nominal(machine, axis) if axis in machine.axis else {},
         )
         for axis in axes
     ]
+
+
+def _nominal(machine: MachineConfig, axis: str) -> dict[str, float]:
+    """Return the nominal values that somebody knows: a guess is none."""
+    settings = machine.axis[axis]
+    return settings.nominal.model_dump(exclude=set[str](settings.guessed))

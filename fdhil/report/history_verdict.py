@@ -41,7 +41,7 @@ def refusals_of(windows: Sequence[StoredWindow]) -> Refusals:
     last: dict[str, tuple[str, str]] = {}
     counts: Counter[str] = Counter()
     for window in refused:
-        time = datetime.fromtimestamp(window.stamp.wall_s, UTC).strftime("%Y-%m-%d %H:%M")
+        time = datetime.fromtimestamp(window.stamp.wall_s, UTC).strftime("%Y-%m-%d %H:%M UTC")
         for code, text in {_split(reason) for reason in window.reasons}:
             counts[code] += 1
             last[code] = (text, time)

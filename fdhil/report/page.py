@@ -59,7 +59,7 @@ def _is_word(table: Table, column: int) -> bool:
 def require() -> None:
     """Raise FdhilError where what draws and renders a report is not installed."""
     if any(find_spec(name) is None for name in ("jinja2", "matplotlib")):
-        raise FdhilError("a report needs the extra 'report': pip install 'fdhil[report]'")
+        raise FdhilError("a report needs two libraries (the extra 'report'): pip install jinja2 matplotlib")
 
 
 def write(page: Page, path: Path) -> None:

@@ -29,6 +29,15 @@ MEANINGS: Mapping[str, str] = {
 }
 
 
+def minute(time: str) -> str:
+    """Return a time of JSON (ISO 8601, UTC) to the minute, with its time zone.
+
+    >>> minute("2026-11-28T01:15:09+00:00")
+    '2026-11-28 01:15 UTC'
+    """
+    return f"{time[:16].replace('T', ' ')} UTC"
+
+
 def spoken(name: str) -> str:
     """Return a parameter's symbol, or what has none in words."""
     return MEANINGS[name] if "_" in name else name

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fdhil.prediction.contour import nearest_points_mm
-from fdhil.prediction.gain import Gain, plus_minus
+from fdhil.prediction.gain import Gain
 from fdhil.records import Correction, Float, Prediction, Trajectory, Zone
 from fdhil.report import figures
 from fdhil.report.figures import Curve, Place
@@ -68,7 +68,8 @@ def _promise(after: Prediction, predicted: Gain | None) -> list[tuple[str, str]]
         return [left, largest, ("how well the model fits this machine", "not known here")]
     sure = predicted.at_least
     return [
-        (f"{left[0]}, with its 95 % interval", f"{after.rms_um:.2f} {plus_minus(predicted.half_um, 2)} um"),
+        (f"{left[0]}, at most (95 %)", f"{after.rms_um + predicted.half_um:.2f} um"),
+        (f"{left[0]}, by the model", f"{after.rms_um:.2f} um"),
         largest,
         ("predicted smaller by at least", "not sure" if sure is None else f"{sure:.1f} x"),
     ]

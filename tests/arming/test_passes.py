@@ -115,7 +115,7 @@ async def test_each_pass_is_told_beside_what_was_predicted(
             answer = await shop.arm(program)
             assert answer["ok"], answer
             assert "is predicted to become" in answer["text"]
-            assert " ± " in answer["text"]
+            assert "um RMS (95 %), " in answer["text"]
             assert answer["after"]["uncertainty_um"] > 0.5  # no better than the last moves were predicted
             for block in heard(reference, is_at):
                 shop.desk.hear(block)
@@ -133,7 +133,7 @@ async def test_each_pass_is_told_beside_what_was_predicted(
     assert second["measured"]["rms_um"] == pytest.approx(second["predicted_without"]["rms_um"], rel=1e-3)
     assert "pass 1 of gentle.ngc: contour error measured" in first["text"]
     assert first["gain"]["measured"] > first["gain"]["predicted"] > 1.0
-    assert "ended by StaleData" in third["text"]
+    assert "ended early: StaleData" in third["text"]
     assert any("more than predicted; identify again" in notice.text for notice in shop.told)
     assert any("worse than without; leave it off" in notice.text for notice in shop.told)
 
@@ -198,3 +198,28 @@ def test_a_table_behind_a_known_spring_is_measured_where_it_is(
         told = running.measured()
         assert told is not None
         assert 0.1 * largest_um * (known is None) <= told["measured"]["max_um"] <= largest_um
+
+
+@pytest.mark.parametrize(
+    ("late", "severity", "told"),
+    [
+        ("this PC was late (37 offsets, worst 9.0 ms)", "minor", "take load off this PC, then arm again"),
+        ("", "MAJOR", "worse than without; leave it off and identify again"),
+    ],
+)
+def test_pass_that_a_late_pc_ended_is_not_the_models_fault(late: str, severity: str, told: str) -> None:
+    found: dict[str, Any] = {
+        "program": "part.ngc",
+        "pass": 1,
+        "ended_by": "LimitActive",
+        "late": late,
+        "measured": {"rms_um": 31.0, "max_um": 90.0},
+        "predicted": {"rms_um": 0.08, "uncertainty_um": 1.6},
+        "predicted_without": {"rms_um": 24.2},
+        "gain": {"predicted": 302.0, "measured": 0.8},
+    }
+    text = passes._text(found)
+    assert "predicted at most 1.68 um RMS (95 %), 0.08 by the model" in text
+    assert text.endswith(f"it ended early: {late or 'LimitActive'}")
+    notice = passes._notice(found, text)
+    assert (notice.severity, notice.text.endswith(told)) == (severity, True)

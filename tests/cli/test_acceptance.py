@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fdhil.cli.doctor.latency import keep_latency, measure_latency
 from fdhil.commissioning.record import axis_digest, save_record
 from fdhil.commissioning.void import void_record
 from fdhil.config import MachineConfig
+from fdhil.records import Notice
 from fdhil.store.history import History
 from tests.commissioning.test_record import RECORD
 from tests.daemon.machine import config_of
@@ -55,7 +57,7 @@ def test_a_machine_that_is_proven_is_accepted(proven: MachineConfig, tmp_path: P
     assert hashlib.sha256(text.encode()).hexdigest() == document["sha256"]
     shown = html.unescape(page.read_text("utf-8"))
     assert document["sha256"] in shown
-    for words in ("A. Fitter", "Circular test after ISO 230-4", "No point is open", "1 division"):
+    for words in ("A. Fitter", "Circular test after ISO 230-4", "No point is open", "1 division", "No notice is open"):
         assert words in shown
     before, after = (document["circle"]["found"][f"predicted, {which}"] for which in ("uncorrected", "corrected"))
     assert after["deviation_both_um"] < 0.3 * before["deviation_both_um"]
@@ -107,3 +109,29 @@ def test_a_measured_circle_stands_beside_the_predicted_ones(proven: MachineConfi
     code, _, err = fdhil("acceptance", tmp_path / "machine.toml", "--out", page, *options, capsys=capsys)
     assert code == 3
     assert "a CSV with the columns X_mm, Y_mm" in err
+
+
+def test_report_has_a_header_passes_open_notices_and_lateness(
+    proven: MachineConfig, tmp_path: Path, capsys: Any
+) -> None:
+    with History.open(proven.store.directory) as history:
+        history.add_notice(Notice("PassMeasured", "info", "pass 1 of p.ngc: contour error measured 0.70 um RMS"), STAMP)
+        history.add_notice(Notice("GuardTripped", "MAJOR", "LimitActive: an internal limit is active", "X"), STAMP)
+    measured = measure_latency(proven, 0.02)
+    keep_latency(proven, measured)
+    page = tmp_path / "a.html"
+    options = ("--out", page, "--customer", "Muster AG", "--site", "Hall 3", "--by", "A. Fitter", *CIRCLE)
+    code, out, err = fdhil("acceptance", tmp_path / "machine.toml", *options, capsys=capsys)
+    assert (code, err) == (1, f"wrote {page}\n")
+    assert "open: 1 MAJOR notices that nobody has acknowledged" in out
+    assert "no limit was set" in out
+    shown = html.unescape(page.read_text("utf-8"))
+    for words in (
+        "Muster AG", "Hall 3", f"X {RECORD.serial}, Y {RECORD.serial}", "pass 1 of p.ngc",
+        "LimitActive: an internal limit is active",
+        "No limit was set", f"of {measured['turns']} wake-ups",
+    ):  # fmt: skip
+        assert words in shown, words
+    document = json.loads(fdhil("acceptance", tmp_path / "machine.toml", *options, "--json", capsys=capsys)[1])
+    assert (document["customer"], document["limits_set"], len(document["passes"])) == ("Muster AG", False, 1)
+    assert document["latency"]["turns"] == measured["turns"]

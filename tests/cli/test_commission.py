@@ -85,16 +85,18 @@ def test_a_dry_run_says_what_each_step_moves_and_sends_nothing(bench: Bench) -> 
     assert (code, err) == (0, "")
     for words in (
         "nothing is sent now",
-        "4 sign test: ",
+        "4 of 13, sign test: ",
         "Moves 10 um toward plus and back",
-        "9 jog: ",
+        "9 of 13, jog: ",
         "Moves 1 mm toward plus at 5 mm/s, and back.",
         "Moves 156.8 mm toward plus at 461 mm/s with 4000 mm/s2, and back, 2 times.",
     ):
         assert words in out, words
     code, out, _ = bench.commission("--dry-run", "--json")
     plan = json.loads(out)
-    assert (code, plan["dry_run"], len(plan["axes"]["X"])) == (0, True, 7)
+    assert (code, plan["dry_run"], len(plan["axes"]["X"])) == (0, True, 13)  # it would be asked for the room
+    assert "within the room that you give at up to 500 mm/s" in plan["axes"]["X"][9]["moves"]
+    assert len(json.loads(bench.commission("--dry-run", "--json", "--yes")[1])["axes"]["X"]) == 7
     assert plan["axes"]["X"][0] | {"does": ""} == {"step": "listen", "does": "", "moves": "nothing", "done_utc": None}
     code, _, err = bench.commission("--room", "-10", "60", "--dry-run")
     assert (code, "test rapids, which need 102 mm" in err) == (1, True)
@@ -115,8 +117,10 @@ def test_what_was_stopped_goes_on_where_it_ended(bench: Bench, monkeypatch: pyte
 
     with monkeypatch.context() as stopped:
         stopped.setattr("fdhil.commissioning.steps.watchdog_test", stop)
-        code, _, err = bench.commission("--yes")
+        code, out, err = bench.commission("--yes")
         assert (code, err.strip()) == (130, "fdhil: stopped by the operator")
+        assert out.endswith("next: run the same command again; it continues with the step that was not finished\n")
+        assert "axis X: sign test: the axis moved by +" in out
     assert bench.peer.drive.power.state.name == "SWITCH_ON_DISABLED"
     assert load_record(bench.store, "X") is None
 
@@ -146,8 +150,11 @@ def test_what_was_stopped_goes_on_where_it_ended(bench: Bench, monkeypatch: pyte
 
 
 @pytest.mark.usefixtures("long_computation")
-def test_an_axis_is_tried_where_the_operator_agrees_and_known_to_the_history(bench: Bench) -> None:
-    code, out, err = bench.commission(said="y\n" + "-2 130\n" + 3 * "y\n")
+def test_an_axis_is_tried_where_the_operator_agrees_and_known_to_the_history(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    code, out, err = bench.commission(said="-2 130\n" + 4 * "y\n")
     assert code == 0, err
     for asked in (
         "How far may axis X go from here",
@@ -156,8 +163,13 @@ def test_an_axis_is_tried_where_the_operator_agrees_and_known_to_the_history(ben
         "Now axis X moves 127.4 mm toward plus at 394 mm/s with 4000 mm/s2, and back, 2 times.",
     ):
         assert asked in err, asked
-    assert "step 3 of 6, test rapids: Moving the axis as fast as G0" in out
-    assert "axis X: identification: R 0.5" in out
+    assert "step 10 of 13, test rapids: Moving the axis as fast as G0" in out
+    assert "axis X: identification: R 50" in out or "axis X: identification: R 49" in out
+    assert " mohm, L " in out
+    assert out.index("axis X: jog: ") < out.index("step 10 of 13") < out.index("axis X: acceptance: ")
+    assert out.splitlines()[-1].startswith("next: fdhil run")
+    assert "\raxis X at " in err
+    assert "of 7" not in out
     with History.read(bench.store) as history:
         (newest,) = history.revisions("X", limit=1)
     for name, true in TRUE.items():
@@ -179,14 +191,14 @@ def test_an_axis_is_tried_where_the_operator_agrees_and_known_to_the_history(ben
 
 
 @pytest.mark.usefixtures("long_computation")
-@pytest.mark.parametrize(("said", "code"), [("y\n\n", 0), ("y\n-2 130\nn\n", 1), ("y\nfar\n", 1)])
+@pytest.mark.parametrize(("said", "code"), [("\ny\n", 0), ("-2 130\ny\nn\n", 1), ("far\n", 1)])
 def test_who_does_not_agree_is_not_moved(said: str, code: int, bench: Bench) -> None:
     got, out, err = bench.commission(said=said)
     assert (got, "jog: " in out) == (code, False)
     assert ("is not tried by moving it" in out) is (code == 0)
     assert ("not confirmed; the axis was not moved, its record holds" in err) is ("130" in said)
     assert ("'far' is not two numbers" in err) is ("far" in said)
-    assert load_record(bench.store, "X") is not None
+    assert (load_record(bench.store, "X") is None) is ("far" in said)
     assert bench.peer.drive.power.state.name == "SWITCH_ON_DISABLED"
 
 
@@ -316,8 +328,8 @@ def test_an_nc_that_is_switched_on_in_the_sign_test_leaves_no_record(what: str, 
 @pytest.mark.parametrize(
     ("question", "sync"),
     [
-        (1, 0),  # before the drive is switched on
-        (2, 0),  # how far the axis may go
+        (1, 0),  # how far the axis may go
+        (2, 0),  # before the drive is switched on
         (3, A_FEW),  # before it jogs: our SYNC runs, the drive is off
         (4, A_FEW),  # whether the table moved: the drive is on
     ],
@@ -325,10 +337,10 @@ def test_an_nc_that_is_switched_on_in_the_sign_test_leaves_no_record(what: str, 
 def test_nothing_begins_where_an_nc_came_while_a_question_stood(question: int, sync: int, bench: Bench) -> None:
     config = machine_config.load(bench.file)
     with ForeignNc(config.bus["can0"].channel, FOREIGN["SYNC"], lambda _: False) as nc:
-        code, _, err = bench.commission(said=LateOperator(nc, "y\n-2 130\ny\ny\n", question))
+        code, _, err = bench.commission(said=LateOperator(nc, "-2 130\ny\ny\ny\n", question))
         assert nc.on
         assert nc.count(SYNC) <= sync
         assert nc.count(NMT) == nc.count(SDO) == 0
         assert sync or nc.sent == []
     assert code == 3, err
-    assert (load_record(bench.store, "X") is None) is (question == 1)
+    assert (load_record(bench.store, "X") is None) is (question <= 2)

@@ -302,7 +302,7 @@ def test_what_is_seen_while_drives_are_compared_speaks_against_them(
 def test_nobody_moves_without_a_yes(fdhil: Said, bench: Bench) -> None:
     config = bench.config("asked.toml")
     with overheard(bench) as heard:
-        for said in ("n\n", ""):
+        for said in ("\nn\n", ""):
             code, out, err = fdhil("commission", config, "--axis", "X", said=said)
             assert code == 1
             assert "step 2 of 7, compare" in out
@@ -354,7 +354,7 @@ def overheard(bench: Bench) -> Iterator[list[int]]:
 @pytest.mark.usefixtures("long_computation")
 def test_an_axis_is_commissioned_and_signed_off(fdhil: Said, bench: Bench) -> None:
     config = bench.config("signed.toml")
-    code, out, err = fdhil("commission", config, "--axis", "X", said="y\n")
+    code, out, err = fdhil("commission", config, "--axis", "X", said="\ny\n")
     assert code == 0, err
     for number, step in enumerate(
         ("listen", "compare", "enable", "sign test", "feed-forward", "watchdog", "restore"), 1

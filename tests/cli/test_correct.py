@@ -80,7 +80,9 @@ def test_with_a_history_a_gain_has_its_uncertainty_and_a_spread_below_the_digits
     arguments = ["correct", bench / "demand.csv", "--config", bench / "bench.toml", "--from-history"]
     text = invoke(*arguments).stdout
     assert re.search(
-        r"predicted with the inverse correction: \d\.\d\d ± 0\.57 um RMS; .* at least \d+\.\d times better", text
+        r"predicted with the inverse correction: at most \d\.\d\d um RMS \(95 %\), \d\.\d\d by the model; .*"
+        r" at least \d+\.\d times better",
+        text,
     )
     document = json.loads(invoke(*arguments, "--json").stdout)
     assert document["after"]["uncertainty_um"] == pytest.approx(0.4 * 2**0.5, rel=1e-3)

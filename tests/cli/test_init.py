@@ -19,6 +19,7 @@ from fdhil import config as machine_config
 from fdhil.cli.demo.toml import to_toml
 from fdhil.cli.main import cli, run_safely
 from fdhil.config.template import filled
+from fdhil.report.history_reading import by_axis
 from tests.commissioning.test_linuxcnc_files import HAL_TEXT, INI, ROTARY_AND_GANTRY
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
@@ -85,6 +86,10 @@ def test_linuxcncs_files_and_few_answers_make_a_machine(fdhil: Said, tmp_path: P
     x, y = made.axis["X"], made.axis["Y"]
     assert (made.machine.name.strip(), made.machine.sync_period_s, made.nc.profile) == ("Mill No 3", 0.002, "linuxcnc")
     assert (x.rapid_speed_mm_s, x.drive.increments_per_rev, x.drive.sign) == (400.0, 10000, 1)
+    assert {"Cd", "ft"} <= set(x.guessed)
+    assert "R" not in x.guessed
+    known = [history.nominal for history in by_axis(made, [], {}, ["X"])]
+    assert known == [{name: value for name, value in x.nominal.model_dump().items() if name not in x.guessed}]
     assert (y.drive.increments_per_rev, y.drive.sign) == (8192, -1)
     assert (x.correction is not None, y.correction is not None) == (True, False)
     text = file.read_text()

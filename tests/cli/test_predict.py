@@ -264,7 +264,7 @@ def test_a_date_that_has_passed_is_told_as_such() -> None:
         (["demand.csv", "--config", "bench.toml", "--from-history"], 2, "moves and has no model"),
         (["demand.csv", "--config", "bench.toml", "--from-history", "--model", "x.json"], 2, "exclude each other"),
         (["demand.csv", "--config", "bench.toml", "--out", "no/such/folder.csv"], 3, "cannot be written"),
-        (["demand.csv"], 2, "--config"),
+        (["demand.csv"], 2, "name the configuration"),
     ],
 )
 def test_trouble_is_one_sentence(

@@ -69,7 +69,7 @@ def test_replay_of_what_is_not_validated_exits_1(tmp_path: Path, capsys: Any) ->
 
 def test_an_export_is_a_recording_that_replays(rapid: Path, tmp_path: Path, capsys: Any) -> None:
     out = tmp_path / "out.csv"
-    assert fdhil("export", rapid, "--out", out, capsys=capsys) == (0, "", "")
+    assert fdhil("export", rapid, "--out", out, capsys=capsys) == (0, "", f"wrote {out}\n")
     recording = read_recording(out)
     assert recording.pitch_mm == 20.0
     assert np.isfinite(recording.speed_rad_s).all()
@@ -90,7 +90,7 @@ def test_an_export_keeps_a_slow_sensors_samples_to_the_last_bit(tmp_path: Path, 
     told[70] = np.nan
     made = replace(made, slow_voltage=replace(before, voltage_v=frozen(told)))
     stored.write_bytes(encode_window(made, ""))
-    assert fdhil("export", stored, "--out", out, capsys=capsys) == (0, "", "")
+    assert fdhil("export", stored, "--out", out, capsys=capsys) == (0, "", f"wrote {out}\n")
     (window,) = read_windows(out)
     assert window.voltage_v is None
     slow = window.slow_voltage

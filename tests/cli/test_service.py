@@ -321,3 +321,21 @@ def test_status_tells_what_waits_and_who_acknowledged(machine: Path, tmp_path: P
     assert "notices that wait to be acknowledged: 3, of them MAJOR 1" in out
     assert "41" in out
     assert "(acknowledged by anna)" in " ".join(out.split())
+
+
+def test_status_is_shown_again_each_second_until_ctrl_c(
+    machine: Path, tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits: list[float] = []
+
+    def wait(seconds: float) -> None:
+        waits.append(seconds)
+        if len(waits) == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("fdhil.cli.service.time.sleep", wait)
+    with answering(machine, status_of(tmp_path)):
+        code, out, err = fdhil("status", machine, "--watch", "--json", capsys=capsys)
+    assert (code, len(out.splitlines()), len(waits)) == (0, 1, 2)
+    assert json.loads(out)["axes"]["X"]["parameters"]["K"]["value"] == 0.8
+    assert "daemon" in err  # it answered once only: the second time says so, and the watch goes on

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from fdhil.commissioning.progress import Progress
+from fdhil.commissioning.progress import Found, Progress
 from fdhil.commissioning.record import CommissioningRecord, load_record
 from fdhil.commissioning.strokes import Room
 from fdhil.commissioning.trial import Operator, Trial, try_axis
@@ -90,6 +90,44 @@ def test_a_wrong_sign_and_what_nobody_saw_end_it_before_a_rapid(bench: Bench) ->
     assert Progress(bench.config.store.directory, "X").done().keys() == {"room"}
     with pytest.raises(DriveFault, match=r"may go from -2.05 to 130.05 mm by the room that the trial began"):
         bench.tried(Room(-5.0, 130.0))
+
+
+@pytest.mark.usefixtures("long_computation")
+def test_stopped_trial_goes_on_within_the_room_that_it_began_with(bench: Bench) -> None:
+    bench.saw, positions = True, list[float]()
+    results: dict[str, Found] = {}
+
+    def stop_in_the_rapid(mm: float) -> None:
+        positions.append(mm)
+        if bench.steps[-1] == "test rapids" and mm > 40.0:
+            raise KeyboardInterrupt
+
+    progress = Progress(bench.config.store.directory, "X")
+    operator = Operator(bench.report, bench.look, results.__setitem__, stop_in_the_rapid)
+    with pytest.raises(KeyboardInterrupt):
+        try_axis(bench.config, bench.record, ROOM, operator, progress)
+    stood_mm = bench.stands_mm
+    assert stood_mm > 40.0
+    assert results["room"]["return"] is None
+    kept = progress.found("room", progress._steps["room"].holds_for)
+    assert kept is not None
+    moved = {**kept, "stopped_mm": stood_mm - 5.0}  # as if somebody had moved it since, or the encoder lost its zero
+    progress.keep("room", progress._steps["room"].holds_for, moved)
+    for _ in range(2):
+        with pytest.raises(DriveFault, match=r"by the room that the trial began with, not -2 to \+130 mm from here"):
+            bench.tried()
+    progress.keep("room", progress._steps["room"].holds_for, kept)
+    bench.steps.clear()
+    operator = Operator(bench.report, bench.look, results.__setitem__, positions.append)
+    tried = try_axis(bench.config, bench.record, ROOM, operator, Progress(bench.config.store.directory, "X"))
+    assert bench.steps == ["timing", "return", "test rapids", "restore", "identification", "acceptance"]
+    assert float(results["room"]["stands"].split()[0]) == pytest.approx(stood_mm, abs=0.02)
+    assert (results["room"]["from"], results["room"]["to"]) == ("-2.000 mm", "130.000 mm")
+    assert "toward minus at 20 mm/s" in str(results["room"]["return"])
+    assert min(positions) > -2.0
+    assert max(positions) < 130.0
+    assert tried.found.keys() >= {"jog", "test rapids", "identification", "acceptance"}
+    assert bench.stands_mm == pytest.approx(0.0, abs=0.05)
 
 
 def test_no_room_sends_nothing(bench: Bench) -> None:

@@ -261,7 +261,7 @@ def test_lines_carry_priorities_in_the_journal_and_no_escapes_anywhere(
     journal.write_line("bad \x1b[31m\nforged", "MAJOR")
     monkeypatch.delenv("JOURNAL_STREAM")
     journal.write_line("Öl µm", "info")
-    line = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{3} Öl µm"
+    line = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{3} UTC Öl µm"
     assert re.fullmatch(rf"<3>bad \\x1b\[31m\\nforged\n{line}\n", capsys.readouterr().err)
     assert printable("\u202e") == "\\u202e"
 

@@ -108,9 +108,10 @@ class Opens:
 
 @pytest.mark.usefixtures("long_computation")
 async def test_a_wrong_period_a_node_never_heard_and_a_dead_bus_are_told(
-    line: Line, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    line: Line, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Over the hub: SYNC at half the rate of the config, one drive of two; then nothing more."""
+    monkeypatch.setattr("fdhil.daemon.hearing.PERIOD_S", 3.0)
     bus = {"can0": {"interface": "socketcand", "port": line.port}}
     config = config_of(tmp_path, ("X", "Y"), bus=bus)
     async with serving(config, Opens()) as path:  # type: ignore[arg-type]
@@ -152,6 +153,38 @@ def test_the_rate_is_of_what_is_heard_now(tmp_path: Path) -> None:
     assert hearing.status(2.1)["source"]["buses"] == {"can0": 1.1}
     hearing.source_lost(3.0)
     assert hearing.status(3.0)["source"]["state"] == "reconnecting"
+
+
+@pytest.mark.parametrize(
+    ("periods_us", "told"),
+    [
+        ((1000,), None),
+        ((1200,), "set sync_period_s = 0.0012"),
+        (
+            (1059, 1307, 1509),
+            "comes unevenly, at 663 to 944 Hz where the config says 1000: no period can be determined",
+        ),
+    ],
+)
+def test_period_is_judged_by_a_minute_and_gets_a_number_only_where_it_is_steady(
+    periods_us: tuple[int, ...], told: str | None, tmp_path: Path
+) -> None:
+    hearing = Hearing(config_of(tmp_path), 0.0)
+    hearing.source_opened(0.0)
+    tick, t_ns, first_s = 0, 0, None
+    for k in range(4 * 70):
+        ticks, step_ns = tick + 1 + np.arange(800), periods_us[k // 4 % len(periods_us)] * 1000
+        stamps = t_ns + step_ns * (1 + np.arange(800))
+        tick, t_ns, now_s = int(ticks[-1]), int(stamps[-1]), 0.25 * k
+        hearing.record_came(TickTimes(frozen_ints(ticks), frozen_ints(stamps)), now_s)
+        found = {code: text for (code, _), text in hearing.troubles({}, now_s).items()}
+        if "SyncPeriodSuspect" in found and first_s is None:
+            first_s = now_s
+    assert (first_s is None) is (told is None)
+    if told is not None:
+        assert told in found["SyncPeriodSuspect"]
+        assert first_s is not None
+        assert first_s > 59.0
 
 
 def test_two_buses_that_show_the_same_ticks_twice_are_no_rate(tmp_path: Path) -> None:

@@ -40,6 +40,13 @@ def test_what_the_guard_stopped_has_the_guards_own_words() -> None:
     assert told == (EFFECT[Reaction.RAMP_DOWN], CATALOGUE["EchoMismatch"][2])
 
 
+def test_what_a_late_pc_caused_has_the_action_against_a_late_pc() -> None:
+    alarm = Alarm("LimitActive", "X", late="this PC was late (37 offsets, worst 9.0 ms)")
+    _, action = words_of(Notice("GuardTripped", "MAJOR", f"LimitActive: {alarm.cause}", "X"))
+    assert action == CATALOGUE["PcLate"][2] == alarm.action
+    assert action != CATALOGUE["LimitActive"][2]
+
+
 def test_a_refusal_has_the_action_of_its_cause_and_no_effect_on_a_machine_that_was_not_corrected() -> None:
     effect, action = words_of(Notice("ArmRefused", "minor", "ModelStale: the model is 11 h old"))
     assert (effect, action) == (WORDS["ArmRefused"][0], CATALOGUE["ModelStale"][2])

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fdhil.cia402 import emcy_text
 from fdhil.drivers.can.frames import frames_of
-from fdhil.drivers.can.node_watch import NodeWatch, emcy_text
+from fdhil.drivers.can.node_watch import NodeWatch
 from fdhil.drivers.can.sync_grid import LONGEST_SILENCE_S, SyncGrid
 from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.cia402.bus_decoder import BusDecoder

@@ -18,6 +18,7 @@ from fdhil.guard.journal import Journal, Notifier
 from fdhil.guard.peers import Peer, Role
 from fdhil.guard.process import Guard
 from fdhil.guard.settings import Settings
+from fdhil.guard.turn_times import TurnTimes
 from tests.guard.machine import DIGEST, FACTS_GIVEN, Drive, commissioned, settings, smooth_path
 
 TOKEN = "the operator's"
@@ -83,6 +84,8 @@ class Shop:
         self._journal = self.lines.open("wb")
         journal, self.notifier = Journal(self._journal.fileno()), Notifier(notify)
         self.guard = Guard(self.settings, self.wire, journal, self.notifier, self.wake)
+        # how late this process is decides nothing here
+        self.guard._turns = TurnTimes(replace(self.settings, clock="sync"))
         self.drives = [Drive(axis.node_id) for axis in self.settings.axes]
         for drive, column in zip(self.drives, DEMAND, strict=False):
             drive.queue = [(column[0], 0)] * 2

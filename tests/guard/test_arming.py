@@ -274,7 +274,7 @@ HOLDS = {"SyncJitter", "FeedbackGap", "TargetLost", "Misaligned", "OverrideChang
 REFUSES = {"PdoMapping", "StaleOffset", "SoftwareLimit", "PositionRange", "CorruptFile", "TableBusy", "ProgramMismatch"}
 REFUSES |= {"NotCommissioned", "RecordVoid", "FeedforwardUnknown", "FeedforwardOff", "ModelNotValidated"}
 REFUSES |= {"HarmPredicted", "WatchdogNotArmed", "LimitBeyondWindow", "AuthRequired"}
-REFUSES |= {"NotOff", "NotSettled", "GuardBusy", "DisarmedSince"}
+REFUSES |= {"NotOff", "NotSettled", "GuardBusy", "DisarmedSince", "PcLate"}
 
 
 def test_what_cannot_be_ramped_freezes_what_may_pass_is_held_and_all_else_that_goes_wrong_ramps_down() -> None:

@@ -51,6 +51,8 @@ def test_a_cut_is_corrected_as_predicted_and_measured_by_the_daemon(begin: Begin
     assert last["measured"]["rms_um"] < answer["after"]["rms_um"] + answer["after"]["uncertainty_um"]
     assert judge.status()["state"] == "OFF"
     assert machine.wrong == []
+    told = re.findall(r"OFF -> ARMED|Armed: armed|ARMED -> ACTIVE|PassMeasured: ", machine.log.getvalue())
+    assert told == ["OFF -> ARMED", "Armed: armed", "ARMED -> ACTIVE", "PassMeasured: "]  # as it happened
 
 
 @pytest.mark.usefixtures("long_computation")

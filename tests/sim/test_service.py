@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from fdhil import config
-from fdhil.cli.sim import _lines, _tell_json
+from fdhil.cli.sim import Positions, _lines, _tell_json
 from fdhil.config import MachineConfig
 from fdhil.errors import ProgramError
 from fdhil.records import Trajectory
@@ -158,6 +158,16 @@ def test_events_are_one_line_of_json_each(capsys: pytest.CaptureFixture[str]) ->
 )
 def test_people_get_sentences(event: dict[str, Any], text: str) -> None:
     assert _lines(event) == [text]
+
+
+def test_positions_are_shown_while_an_axis_moves_and_once_at_its_end() -> None:
+    at_mm = {"X": 0.0, "Y": -3.0}
+    shown = Positions(lambda: dict(at_mm))
+    assert shown.line() is None
+    at_mm["X"] = 12.5
+    assert shown.line() == "X 12.500 mm  Y -3.000 mm"
+    assert shown.line() == "X 12.500 mm  Y -3.000 mm"
+    assert shown.line() is None
 
 
 def test_drive_time_follows_sync_in_lockstep_and_the_clock_once_sync_is_missing() -> None:

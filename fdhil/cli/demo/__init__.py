@@ -31,20 +31,22 @@ def demo(out: Path, realtime: bool, pdf: bool, as_json: bool) -> None:
 
     Starts the twin (drives, sensors, NC), the guard and the daemon; commissions the drives; shuttles the axes and
     identifies them; predicts the path of the paper, cuts it, arms, cuts it corrected; warms the slide-ways and cuts
-    again. At the same time it identifies and cuts on a machine with what real ones have.
+    again. At the same time it identifies and cuts on a machine with what real ones have. Needs the extra 'report'.
     """
     from fdhil.cli.demo import realistic_page
     from fdhil.cli.demo.loop import run_loop
     from fdhil.cli.demo.realistic import running_realistic
     from fdhil.cli.demo.report import page
-    from fdhil.report import deliver, find_browser
+    from fdhil.report import deliver, find_browser, require
+
+    require()  # said before the work, not after it
 
     def say(text: str) -> None:
         if not as_json or sys.stderr.isatty():
             click.echo(text, err=as_json)
 
     if pdf:
-        find_browser()  # said before the work, not after it
+        find_browser()
     with stopping_in_order(), running_realistic(out / "realistic", realtime, say) as result:
         loop = run_loop(out, realtime, say)
         realistic = result()
@@ -127,4 +129,5 @@ def _tables(loop: Loop, realistic: Realistic, report: Path) -> None:
         console.print(table)
     before, mirror, after = loop.cuts[:3]
     gains = f"mirror {before.rms_um / mirror.rms_um:.1f}, inverse {before.rms_um / after.rms_um:.1f}"
-    console.print(f"RMS contour error, measured, smaller by a factor of: [bold]{gains}[/]. Report: {report}")
+    console.print(f"RMS contour error, measured, smaller by a factor of: [bold]{gains}[/].")
+    console.print(f"wrote {report}", soft_wrap=True)

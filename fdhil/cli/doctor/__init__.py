@@ -6,14 +6,14 @@ import json
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from fdhil import config as machine_config
 from fdhil.cli.doctor.trouble import Trouble
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, CONFIG
+from fdhil.cli.options import AS_JSON, CONFIG, Positive
 from fdhil.cli.terminal_text import print_progress
 from fdhil.daemon.clock import newest_record_s
 
@@ -28,24 +28,43 @@ SCHEMA = "fdhil-doctor-1"
 @click.command()
 @CONFIG
 @click.option("--offline", is_flag=True, help="Look at this PC alone, and leave buses and sensors in peace.")
+@click.option("--latency", "seconds", type=Positive(1.0, 86_400.0), metavar="SECONDS",
+              help="Measure for so long how late this PC wakes up; the acceptance report lists it.")  # fmt: skip
 @AS_JSON
 @verdict
-def doctor(config: Path, offline: bool, as_json: bool) -> int:
+def doctor(config: Path, offline: bool, seconds: float | None, as_json: bool) -> int:
     """Diagnose the PC, bus, drives, sensors, store, clock and rights; the most urgent problem comes first.
 
-    Only looks: it writes nothing, and sends nothing where an NC runs the bus (with the NC off the drives are read, as
-    by fdhil check). What cannot be examined before something else is mended is left out, so mend, and run it again.
-    Exit codes: 0 nothing grave is wrong, 1 something is, 2 wrong option or
+    It only reads (--latency writes its result into the store), and sends nothing where an NC runs the bus (with the NC
+    off the drives are read, as by fdhil check). What cannot be examined before something else is corrected is left out,
+    so correct the first, and run it again. Exit codes: 0 nothing grave is wrong, 1 something is, 2 wrong option or
     configuration: its faults come before all others.
     """
-    troubles = _in_order(machine_config.load(config), offline)
+    machine = machine_config.load(config)
+    from fdhil.cli.doctor.latency import examine_latency, histogram_lines, latency_text
+
+    latency = _measure(machine, seconds) if seconds is not None else None
+    troubles = [*_in_order(machine, offline), *(examine_latency(latency) if latency is not None else ())]
     found = sorted(troubles, key=lambda trouble: not trouble.grave)  # the order of causes stays, within each half
     if as_json:
         grave = sum(trouble.grave for trouble in found)
-        click.echo(json.dumps({"schema": SCHEMA, "healthy": not grave, "troubles": [asdict(t) for t in found]}))
+        document = {"schema": SCHEMA, "healthy": not grave, "troubles": [asdict(t) for t in found]}
+        click.echo(json.dumps(document if latency is None else document | {"latency": latency}))
     else:
+        if latency is not None:
+            click.echo(f"wrote {latency['file']}", err=True)
+            click.echo(latency_text(latency))
+            click.echo("\n".join(histogram_lines(latency["histogram_us"])))
         _show(found)
     return int(any(trouble.grave for trouble in found))
+
+
+def _measure(machine: MachineConfig, seconds: float) -> dict[str, Any]:
+    from fdhil.cli.doctor.latency import keep_latency, measure_latency
+
+    print_progress(f"measuring for {seconds:g} s how late this PC wakes up")
+    found = measure_latency(machine, seconds)
+    return found | {"file": str(keep_latency(machine, found))}
 
 
 def _in_order(config: MachineConfig, offline: bool) -> Iterator[Trouble]:

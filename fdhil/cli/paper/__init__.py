@@ -93,4 +93,5 @@ def _table(claims: list[Claim], report: Path) -> None:
         table.add_row(*row)
     console.print(table)
     told = ", ".join(f"{number} {verdict}" for verdict, number in counts(claims).items())
-    console.print(f"{told}. Page: {report}")
+    console.print(f"{told}.")
+    console.print(f"wrote {report}", soft_wrap=True)

@@ -16,6 +16,7 @@ from fdhil.config.offset_bounds import limit_faults
 from fdhil.config.reading import checked
 from fdhil.config.template import filled
 from fdhil.errors import ConfigError, ConfigFault
+from fdhil.records import PARAMETERS
 
 Look = Callable[[str, CanBus], FoundBus]
 """Find the drives on a bus; ConnectError."""
@@ -138,6 +139,10 @@ def conclude(draft: Draft, file: Path) -> str:
 
     What can be, but hardly is, is noted.
     """
+    for axis in draft.document.get("axis", {}):
+        nominal = {key: draft.values.get(f"axis.{axis}.nominal.{key}") for key in PARAMETERS}
+        if unknown := [key for key, told in nominal.items() if told is not None and told.guessed]:
+            draft.values[f"axis.{axis}.guessed"] = Told(unknown, "nothing is compared with these guesses")
     while True:
         text = text_of(draft, file)
         try:

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from fdhil.cia402 import COB_EMCY, COB_HEARTBEAT, Nmt
+from fdhil.cia402 import COB_EMCY, COB_HEARTBEAT, Nmt, emcy_text
 from fdhil.drivers.can.frames import Frames
 from fdhil.records import Notice
 
@@ -20,43 +20,6 @@ _BACK_NS = 2_000_000_000  # of regular heartbeats after which an outage is over:
 _OWN_COB_IDS = (0x080, 0x180, 0x280, 0x380, 0x480, 0x580, 0x700)
 _TOGGLE = 0x80  # of an answer to node guarding; in a heartbeat it is always 0
 _NMT_STATES = frozenset(int(state) for state in Nmt)
-
-# error classes of CiA 301, 7.2.7.1
-_EMCY_CLASS = {
-    0x10: "generic error",
-    0x20: "current",
-    0x30: "voltage",
-    0x40: "temperature",
-    0x50: "device hardware",
-    0x60: "device software",
-    0x70: "additional modules",
-    0x80: "monitoring",
-    0x90: "external error",
-    0xF0: "additional functions",
-    0xFF: "device specific",
-}
-_EMCY_TEXT = {
-    0x8110: "CAN overrun",
-    0x8120: "CAN in error passive mode",
-    0x8130: "heartbeat or life guarding lost",
-    0x8140: "recovered from bus-off",
-    0x8150: "COB-ID collision",
-    0x8210: "PDO not processed, too short",
-    0x8220: "PDO too long",
-    0x8611: "following error",
-}
-
-
-def emcy_text(code: int) -> str:
-    """Return what an EMCY code means (CiA 301, table 26).
-
-    >>> emcy_text(0x8611)
-    'following error'
-    """
-    if code in _EMCY_TEXT:
-        return _EMCY_TEXT[code]
-    high = code >> 8
-    return _EMCY_CLASS.get(high, _EMCY_CLASS.get(high & 0xF0, "unknown"))
 
 
 class NodeWatch:

@@ -13,7 +13,7 @@ SHOWN = 30
 _NUMBER = r"([\d.]+)"
 _PASS = re.compile(
     rf"pass (\d+) of (.+?): contour error measured {_NUMBER} um RMS, {_NUMBER} at most "
-    rf"\(predicted {_NUMBER}[^;]*; without correction {_NUMBER} predicted"
+    rf"\(predicted (?:at most {_NUMBER.strip('()')}[^,]*, )?{_NUMBER}[^;]*; without correction {_NUMBER} predicted"
 )
 """How ``fdhil.arming.passes`` reports a pass: its notice is what the history keeps of it."""
 

@@ -1,0 +1,73 @@
+"""fdhil doctor --latency: how late a PC wakes up, as a histogram; too late is a trouble."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fdhil.cli.doctor.latency import examine_latency, histogram_lines, latency_text, measure_latency, read_latency
+from fdhil.config import MachineConfig
+from tests.daemon.machine import config_of
+from tests.daemon.shop import BENCH, fdhil
+
+
+class Pc:
+    """A PC with a clock of its own, which wakes each sleeper late by the next of these times."""
+
+    def __init__(self, *late_s: float) -> None:
+        self._late_s, self._count, self._now_s = late_s, 0, 100.0
+
+    def now_s(self) -> float:
+        return self._now_s
+
+    def sleep(self, seconds: float) -> None:
+        self._now_s += seconds + self._late_s[self._count % len(self._late_s)]
+        self._count += 1
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> MachineConfig:
+    (tmp_path / "machine.toml").write_text(BENCH)
+    return config_of(tmp_path, ("X", "Y"))
+
+
+def measured(machine: MachineConfig, *late_s: float, seconds: float = 1.0) -> dict[str, Any]:
+    pc = Pc(*late_s)
+    return measure_latency(machine, seconds, pc.now_s, pc.sleep)
+
+
+def test_wake_ups_are_counted_by_how_late_they_are(machine: MachineConfig) -> None:
+    found = measured(machine, *[30e-6] * 9, 150e-6)
+    assert (found["turns"], found["late"]) == (pytest.approx(1000, abs=2), 0)
+    assert {top: count for top, count in found["histogram_us"] if count} == {
+        50: pytest.approx(900, abs=2),
+        200: pytest.approx(100, abs=2),
+    }
+    assert found["worst_us"] == pytest.approx(150, abs=2)
+    assert list(examine_latency(found)) == []
+    assert "up to 50 us" in next(histogram_lines(found["histogram_us"]))
+
+
+def test_late_pc_is_a_trouble_with_its_remedy(machine: MachineConfig) -> None:
+    found = measured(machine, *[30e-6] * 99, 9e-3)
+    (trouble,) = examine_latency(found)
+    assert (trouble.code, trouble.grave) == ("PcLate", True)
+    assert "the worst 9000 us" in trouble.what
+    assert found["late"] == pytest.approx(found["turns"] / 100, abs=1)
+    assert latency_text(found) in trouble.what
+
+
+def test_doctor_measures_keeps_and_reports_it(machine: MachineConfig, tmp_path: Path, capsys: Any) -> None:
+    _, out, err = fdhil("doctor", tmp_path / "machine.toml", "--offline", "--latency", "1", capsys=capsys)
+    assert "wake-ups every 1 ms half were at most" in out
+    kept = read_latency(machine)
+    assert kept is not None
+    assert f"of {kept['turns']} wake-ups" in out
+    assert f"wrote {machine.store.directory / 'latency.json'}" in err
+    _, out, _ = fdhil("doctor", tmp_path / "machine.toml", "--offline", "--latency", "1", "--json", capsys=capsys)
+    assert json.loads(out)["latency"]["schema"] == "fdhil-latency-1"
+    (machine.store.directory / "latency.json").write_text("[]")
+    assert read_latency(machine) is None
