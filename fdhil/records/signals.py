@@ -163,7 +163,8 @@ class Window:
     that they do not, None without them. ``start_s`` is the time of row 0 in its recording or since the first tick.
     ``offset_mm`` is the position offset in force, None where it was 0 throughout or is not known.
     ``torque_constant_nm_per_a`` is the K that the recording itself tells. ``nc`` is what the NC said of the move,
-    None where it was not heard. Two windows are equal when they are the same one.
+    None where it was not heard. ``current_off_a`` is one standard deviation (n,) of how far readings of the current may
+    be from its means, None where nothing determines it. Two windows are equal when they are the same one.
     """
 
     axis: str
@@ -192,6 +193,7 @@ class Window:
     table_mm: Float | None = None
     table_m_s2: Float | None = None
     nc: NcMove | None = None
+    current_off_a: Float | None = None
 
     @property
     def n(self) -> int:

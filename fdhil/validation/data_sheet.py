@@ -84,7 +84,7 @@ def scale_convention(estimate: Estimate, nominal: Parameters) -> Reason | None:
         f"K and Jt are {apart['K']:.2f} and {apart['Jt']:.2f} times those of the data sheet, R and L are as there: "
         f"current and voltage are {which}, and K, Jt, ft and Cd are {factor:.3g} times what they are"
     )
-    advice = "predictions hold all the same; set the scales of current and voltage so that their product is the power"
+    advice = "set the scales of current and voltage so that their product is the power"
     return Reason("CalibrationSuspect", text, advice)
 
 
