@@ -44,7 +44,9 @@ def gain_error(estimate: Estimate, nominal: Parameters) -> Reason | None:
     values = np.array([estimate.value(name) for name in told])
     apart = np.log(values / [getattr(nominal, name) for name in told])
     sure = BUDGET["data sheet"].deviations
-    allowed = math.log1p(tolerance) + sure * np.array([estimate.std(name) for name in told]) / values
+    shared = np.zeros(len(rows)) if estimate.systematic is None else np.square(estimate.systematic[rows]).sum(axis=1)
+    chance = np.array([estimate.std(name) for name in told]) ** 2 - shared
+    allowed = math.log1p(tolerance) + (sure * np.sqrt(np.maximum(chance, 0.0)) + np.sqrt(shared)) / values
     if np.count_nonzero(np.abs(apart) > allowed) < LEAST_BEYOND:
         return None
     suspects = [("current",)] if blind else [*((signal,) for signal in GAINS), ("voltage", "current")]

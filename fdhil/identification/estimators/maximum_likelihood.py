@@ -174,7 +174,6 @@ def doubts(result: Fit, inverse: Float) -> Float:
     free = list(result.free)
     columns[free, 0] = inverse @ (result.jacobian.T @ effects[:, 0])
     columns[free, 2:] = inverse @ (result.jacobian.T @ effects[:, 1:])
-    columns = np.column_stack([columns, model_doubts(result), _resembling_terms(result)])
     if result.prior.size:
         columns = np.column_stack([columns, _known_before(result, inverse)])
     if result.delay_doubt_s > 0.0:
@@ -284,4 +283,11 @@ def finish(result: Fit) -> Estimate:
     judged = judge(answer, condition, top_rad_s, abs(float(result.theta[K])) * top_a)
     if judged.names != answer.names:  # nothing is told
         return judged
-    return replace(judged, covariance=judged.covariance + beyond)
+    assert judged.systematic is not None
+    left = np.column_stack([model_doubts(result), _resembling_terms(result)])[: len(PARAMETERS)]
+    left = np.pad(left, ((0, len(judged.names) - len(left)), (0, 0)))
+    return replace(
+        judged,
+        covariance=judged.covariance + beyond + left @ left.T,
+        systematic=np.column_stack([judged.systematic, left]),
+    )
