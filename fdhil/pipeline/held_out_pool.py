@@ -14,7 +14,7 @@ from fdhil.identification.loops import identify_loops
 from fdhil.pipeline.analysis import own
 from fdhil.pipeline.own_loops import better_axis
 from fdhil.pipeline.pooling import pool
-from fdhil.records import Estimate, HeldOut, LoopEstimate, Verdict, Window, WindowOutcome, frozen
+from fdhil.records import Estimate, HeldOut, LoopEstimate, Reason, Verdict, Window, WindowOutcome, frozen
 from fdhil.validation.agreement import WINDING, is_of_winding
 from fdhil.validation.held_out import Move, held_out_reason, is_predicted, predict_held_out, worst_of
 from fdhil.validation.presliding import with_presliding
@@ -23,6 +23,13 @@ from fdhil.validation.weight import LOOPS_DIFFER
 
 OF_ONE_MOVE = frozenset({LOOPS_DIFFER, "ValidationFailed"})
 """Codes of a window whose own model does not explain its replay: moves one way do not separate load and friction."""
+
+
+SCALE_UNPROVEN = Reason(
+    "ScaleUnproven",
+    "no data sheet is known: current and voltage in another scale (peak or RMS of a phase) give K, Jt, ft and Cd in it",
+    "give --config with the motor's nominal K and Jt",
+)
 
 
 class HeldOutPool(NamedTuple):
@@ -55,6 +62,8 @@ def pool_with_held_out(
     """
     estimate, verdict = pool(outcomes, settings)
     mine = own(outcomes[0].window, axis) if outcomes else None
+    if mine is None and verdict.accepted:
+        verdict = replace(verdict, warnings=(*verdict.warnings, SCALE_UNPROVEN))
     if mine is None or sync_period_s is None:
         return HeldOutPool(outcomes, estimate, verdict, None, loops)
     best = better_axis(mine, loops) or mine
