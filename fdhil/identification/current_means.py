@@ -17,6 +17,7 @@ from fdhil.config import Axis, Identification
 from fdhil.identification.demand_lead import with_demand_on_time
 from fdhil.identification.filtering import moving_mean
 from fdhil.identification.signals import mended
+from fdhil.identification.slow_rows import STEPPED_ROW_S
 from fdhil.identification.windows import bridged, carried
 from fdhil.model.closed_loop import simulate
 from fdhil.records import Float, Parameters, Window, read_only, rms
@@ -40,6 +41,8 @@ def with_current_means(
     if axis is None or not windows or windows[0].slow_voltage is not None or windows[0].current_off_a is not None:
         return windows
     plain, stepped = _left_mm(windows[0], settings, axis, sync_period_s)
+    if plain < SURELY * stepped and windows[0].dt_s < STEPPED_ROW_S:
+        return windows  # there is no doubt to take away
     if plain < SURELY * stepped:
         return [replace(w, current_off_a=read_only(np.zeros(w.n))) for w in windows]
     if not stepped < SURELY * plain:
@@ -48,9 +51,7 @@ def with_current_means(
     return [_moved(w, lag) for w in windows]
 
 
-def _left_mm(
-    window: Window, settings: Identification, axis: Axis, sync_period_s: float | None
-) -> tuple[float, float]:
+def _left_mm(window: Window, settings: Identification, axis: Axis, sync_period_s: float | None) -> tuple[float, float]:
     """Return the RMS (mm) that replays without and with steps leave; NaN where nothing can be compared."""
     unknown = (math.nan, math.nan)
     if abs((sync_period_s or window.dt_s) / window.dt_s - 1.0) > SAME_GRID:

@@ -45,13 +45,14 @@ def with_open_course(motion: Motion, theta: Float, off_a: Float | None = None) -
     accelerating = theta[JT] / theta[K] * np.gradient(motion.speed, motion.dt_s)
     still = np.zeros(motion.n)
     if motion.dt_s < LEAST_ROW_S:
-        if off_a is None and motion.dt_s >= STEPPED_ROW_S:
-            off_a = STEPPED * accelerating
-        none = off_a is None or not off_a.any()
-        return motion if none else replace(motion, within=Within(still[None], np.stack([off_a])))
+        if off_a is None:
+            off_a = (STEPPED if motion.dt_s >= STEPPED_ROW_S else 0.0) * accelerating
+        return replace(motion, within=Within(still[None], off_a[None])) if off_a.any() else motion
     slope = np.gradient(motion.current, motion.dt_s)
     rise = theta[R] * np.diff(motion.current, append=motion.current[-1]) + theta[L] * np.diff(slope, append=slope[-1])
-    off = max(STEPPED, OFF_MEAN * (motion.dt_s / ROW_S) ** 2) * accelerating if off_a is None else off_a
+    off = OFF_MEAN * (motion.dt_s / ROW_S) ** 2 * accelerating
+    steps = STEPPED * accelerating if off_a is None else off_a
+    off = np.where(np.abs(steps) > np.abs(off), steps, off)
     return replace(motion, within=Within(np.stack([rise, still]), np.stack([still, off])))
 
 
