@@ -22,6 +22,7 @@ from fdhil.records import PARAMETERS, Estimate, Float, Int, Window, frozen
 # which are the same, and a little on the move
 UNSHARED = 0.2
 JOINS = 3.3  # standard deviations: of a thousand pools of a drive without a load, one is given one
+LEAST_BEYOND = 0.5  # of the range of the windows' values, by which a common one may lie outside of them
 LEAST_SHARE = 1e-6  # of a parameter's size: what is not told more narrowly than rounding
 BY_DIRECTION = {"load": "Cd", "viscous": "ft"}  # what the direction changes, and of which parameter
 
@@ -47,6 +48,10 @@ def pooled(members: Sequence[Member], first: Estimate, apart: Between, *, joinin
     joined: list[str] = []
     told = _Stack.of(members, names, apart)
     answer = _solved(told, joined)
+    if _is_beyond_all(answer, told):
+        members = [replace(m, own=np.diag(np.diag(m.own))) for m in members]
+        told = _Stack.of(members, names, apart)
+        answer = _solved(told, joined)
     while joining:
         trials = {term: _solved(told, [*joined, term]) for term in _open(members, names, joined)}
         surest = max(trials, key=lambda term: trials[term].surety(), default=None)
@@ -55,6 +60,19 @@ def pooled(members: Sequence[Member], first: Estimate, apart: Between, *, joinin
         joined.append(surest)
         answer = trials[surest]
     return _estimate(answer, names, joined, first)
+
+
+def _is_beyond_all(answer: _Solution, told: _Stack) -> bool:
+    """Return whether R, L, K or Jt lies outside of what all windows tell.
+
+    Doubts that tie parameters together more than windows agree drive a common value away from each of them.
+    """
+    for k, name in enumerate(told.names):
+        if name in ("R", "L", "K", "Jt"):
+            own = told.values[told.which == k]
+            if not own.min() - LEAST_BEYOND * np.ptp(own) <= answer.values[k] <= own.max() + LEAST_BEYOND * np.ptp(own):
+                return True
+    return False
 
 
 def _common(members: Sequence[Member]) -> tuple[str, ...]:

@@ -4,7 +4,7 @@
   current's change and by L times the change of its slope, beside the back-EMF's. So it is where set-points are smooth;
   where they have a kink at every row, the current is ahead of that. All of the rise is one standard deviation.
 * Where the speed that is fed forward steps at every SYNC, the current answers after the instant of its reading: its
-  mean is higher while the table accelerates, and inertia seems smaller (15 % in rows of 2 ms).
+  mean is higher while the table accelerates, and inertia seems smaller (5 % in rows of 1 ms, 17 % in rows of 2 ms).
 * Where a drive draws straight lines between set-points, an accelerating table is ahead of the line between two of them,
   by a T^2 / 8 in the middle, and the regulators answer that anew in every row: readings at the rows' ends are off the
   mean of the current by a share of the accelerating one that grows with the square of the row.
@@ -28,31 +28,38 @@ from fdhil.records import PARAMETERS, Float, Parameters, Window, rms
 
 LEAST_ROW_S = 0.003  # in shorter rows the first two are less than a regulator's own doing
 ROW_S, OFF_MEAN = 0.010, 0.08  # at such rows, with a speed loop of 40 Hz; a slower loop answers less
-STEPPED_ROW_S, STEPPED = 0.0015, 0.08  # from such rows on, of the accelerating current, where set-points step
+STEPPED_ROW_S, STEPPED = 0.0015, 0.08  # from such rows on, of the accelerating current, where set-points may step
 
 
 LEFT_OPEN = 0.2  # of what known loops tell: they are known to a tenth or so
 SAME_GRID = 1e-3  # of a row, by which it may differ from the cycle of the set-points
 
 
-def with_open_course(motion: Motion, theta: Float) -> Motion:
-    """Return the motion with what is open within its rows for ``theta`` (k,), where they are long and means."""
-    if motion.dt_s < STEPPED_ROW_S or motion.voltage_sampling != "interval_mean" or motion.slow is not None:
+def with_open_course(motion: Motion, theta: Float, off_a: Float | None = None) -> Motion:
+    """Return the motion with what is open within its rows for ``theta`` (k,), where they are long and means.
+
+    Where set-points step is a doubt, unless ``off_a`` (n,) says how far readings of the current may be from its means.
+    """
+    if motion.voltage_sampling != "interval_mean" or motion.slow is not None:
         return motion
     accelerating = theta[JT] / theta[K] * np.gradient(motion.speed, motion.dt_s)
     still = np.zeros(motion.n)
     if motion.dt_s < LEAST_ROW_S:
-        return replace(motion, within=Within(still[None], STEPPED * accelerating[None]))
+        if off_a is None:
+            off_a = (STEPPED if motion.dt_s >= STEPPED_ROW_S else 0.0) * accelerating
+        return replace(motion, within=Within(still[None], off_a[None])) if off_a.any() else motion
     slope = np.gradient(motion.current, motion.dt_s)
     rise = theta[R] * np.diff(motion.current, append=motion.current[-1]) + theta[L] * np.diff(slope, append=slope[-1])
-    off = max(STEPPED, OFF_MEAN * (motion.dt_s / ROW_S) ** 2) * accelerating
+    off = OFF_MEAN * (motion.dt_s / ROW_S) ** 2 * accelerating
+    steps = STEPPED * accelerating if off_a is None else off_a
+    off = np.where(np.abs(steps) > np.abs(off), steps, off)
     return replace(motion, within=Within(np.stack([rise, still]), np.stack([still, off])))
 
 
 def leaves_steps_open(window: Window) -> bool:
     """Return whether what is open in a window's rows is its set-points' steps alone: the same in all of a drive's."""
     means = window.voltage_sampling == "interval_mean" and window.slow_voltage is None
-    return means and STEPPED_ROW_S <= window.dt_s < LEAST_ROW_S
+    return means and (window.current_off_a is not None or window.dt_s >= STEPPED_ROW_S) and window.dt_s < LEAST_ROW_S
 
 
 def with_known_course(motion: Motion, theta: Float, axis: Axis, demand_mm: Float) -> Motion:

@@ -212,7 +212,7 @@ def _outcome(evidence: Evidence, found: Findings) -> WindowOutcome:
         reasons, weighed = [*reasons, *weighed], []
     if reasons and (lag := _speed_lag(evidence.window)) is not None:
         reasons.append(lag)
-    weighed += _convention(evidence)
+    reasons += _convention(evidence)
     unexplained = weight.unexplained_um if weight is not None and weight.in_um else None
     verdict = Verdict(not reasons, evidence.fit_percent, tuple(reasons), unexplained, tuple(weighed))
     return WindowOutcome(evidence.window, evidence.told, verdict)

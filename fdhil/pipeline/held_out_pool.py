@@ -9,11 +9,12 @@ from typing import NamedTuple
 import numpy as np
 
 from fdhil.config import Axis, Identification
+from fdhil.identification.demand_lead import with_demand_on_time
 from fdhil.identification.loops import identify_loops
 from fdhil.pipeline.analysis import own
 from fdhil.pipeline.own_loops import better_axis
 from fdhil.pipeline.pooling import pool
-from fdhil.records import Estimate, HeldOut, LoopEstimate, Verdict, WindowOutcome, frozen
+from fdhil.records import Estimate, HeldOut, LoopEstimate, Reason, Verdict, Window, WindowOutcome, frozen
 from fdhil.validation.agreement import WINDING, is_of_winding
 from fdhil.validation.held_out import Move, held_out_reason, is_predicted, predict_held_out, worst_of
 from fdhil.validation.presliding import with_presliding
@@ -22,6 +23,13 @@ from fdhil.validation.weight import LOOPS_DIFFER
 
 OF_ONE_MOVE = frozenset({LOOPS_DIFFER, "ValidationFailed"})
 """Codes of a window whose own model does not explain its replay: moves one way do not separate load and friction."""
+
+
+SCALE_UNPROVEN = Reason(
+    "ScaleUnproven",
+    "no data sheet is known: current and voltage in another scale (peak or RMS of a phase) give K, Jt, ft and Cd in it",
+    "give --config with the motor's nominal K and Jt",
+)
 
 
 class HeldOutPool(NamedTuple):
@@ -54,6 +62,8 @@ def pool_with_held_out(
     """
     estimate, verdict = pool(outcomes, settings)
     mine = own(outcomes[0].window, axis) if outcomes else None
+    if mine is None and verdict.accepted:
+        verdict = replace(verdict, warnings=(*verdict.warnings, SCALE_UNPROVEN))
     if mine is None or sync_period_s is None:
         return HeldOutPool(outcomes, estimate, verdict, None, loops)
     best = better_axis(mine, loops) or mine
@@ -61,7 +71,7 @@ def pool_with_held_out(
     if any(map(_is_doubtful, outcomes)) and (all_moves := pool(trial, settings)[0]) is not None:
         predicted = _judged(trial, all_moves, best, sync_period_s)[1]
         if not all(is_predicted(p, settings) for o, p in zip(trial, predicted, strict=True) if o.verdict.accepted):
-            windows = [o.window for o in trial if o.verdict.accepted]
+            windows = [_on_time(o, mine, sync_period_s) for o in trial if o.verdict.accepted]
             plants = [all_moves.parameters()] * len(windows)
             found = identify_loops(windows, plants, mine, settings, sync_period_s)
             if (better := better_axis(mine, found)) is not None:
@@ -96,12 +106,23 @@ def _judged(
     outcomes: Sequence[WindowOutcome], estimate: Estimate | None, axis: Axis, sync_period_s: float
 ) -> tuple[Estimate | None, list[Replay | None]]:
     """Return the pool with its presliding, and of each outcome the replay by the pool of the others, if it is used."""
-    moves: list[Move] = [(o.window, o.estimate) for o in outcomes if o.verdict.accepted and o.estimate is not None]
+    moves: list[Move] = [
+        (_on_time(o, axis, sync_period_s), o.estimate)
+        for o in outcomes
+        if o.verdict.accepted and o.estimate is not None
+    ]
     if estimate is None or not moves:
         return estimate, [None] * len(outcomes)
     estimate = with_presliding(estimate, [window for window, _ in moves], axis, sync_period_s)
     told = iter(predict_held_out(moves, estimate, axis, sync_period_s))
     return estimate, [next(told) if o.verdict.accepted and o.estimate is not None else None for o in outcomes]
+
+
+def _on_time(outcome: WindowOutcome, axis: Axis, sync_period_s: float) -> Window:
+    """Return the window with the demand that the drive follows, where the recorded one is ahead of it."""
+    if all(warning.code != "SampleTiming" for warning in outcome.verdict.warnings):
+        return outcome.window
+    return with_demand_on_time(outcome.window, axis, sync_period_s)[0]
 
 
 def _is_doubtful(outcome: WindowOutcome) -> bool:

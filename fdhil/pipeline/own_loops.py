@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Sequence
 
 from fdhil.config import Axis, Identification
+from fdhil.identification.current_means import with_current_means
 from fdhil.identification.loops import better_loops, changed_regulators, identify_loops, with_loops
 from fdhil.identification.physical_bounds import bounded
 from fdhil.pipeline.analysis import analyse, own
@@ -139,6 +140,9 @@ class OwnLoops:
 
     def analyse(self, window: Window) -> tuple[WindowOutcome, LoopEstimate | None]:
         """Return what a window says of the drive, and its loops where they were sought again."""
+        if self._configured is not None:
+            known = own(window, self._configured)
+            (window,) = with_current_means([window], self._settings, known, self._period_s)
         outcome = analyse(window, self._settings, self.axis, self._period_s)
         if self._configured is None:
             return outcome, None

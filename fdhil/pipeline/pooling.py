@@ -31,6 +31,7 @@ OF_THE_MOVE = (
     "LoadDetected",
     "Timing",
 )
+WARMING = "R"
 _FIGURES = re.compile(r"[-+]?[0-9][-+.0-9e]*")  # in which warnings of one kind differ
 
 Told = list[tuple[Window, Estimate]]
@@ -49,8 +50,20 @@ def pool(
         return None, Verdict(False, None, (Reason("NoWindow", "the recording holds no rapid move", advice),))
     members = [member(o.window, o.estimate, k) for k, o in enumerate(outcomes) if o.verdict.accepted and o.estimate]
     estimate, verdict = together(outcomes, members, members, settings, refit=refit)
+    estimate = estimate and _with_drift(estimate, members)
     refuted = _loops_refuted(outcomes) if verdict.accepted else []
     return estimate, replace(verdict, accepted=False, reasons=tuple(refuted)) if refuted else verdict
+
+
+def _with_drift(estimate: Estimate, members: Sequence[Member]) -> Estimate:
+    """Return the pool with what R drifts by over all windows in its interval: the winding warms."""
+    apart = between(members)
+    if not apart.walk.get(WARMING):
+        return estimate
+    covariance, k = estimate.covariance.copy(), estimate.names.index(WARMING)
+    places = [m.place for m in members]
+    covariance[k, k] += apart.walk[WARMING] * apart.sizes[WARMING] ** 2 * (max(places) - min(places))
+    return replace(estimate, covariance=frozen(covariance))
 
 
 def together(

@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 
 from fdhil.config import Axis, Identification
-from fdhil.pipeline.analysis import analyse
+from fdhil.identification.current_means import with_current_means
+from fdhil.pipeline.analysis import analyse, own
 from fdhil.pipeline.own_loops import explained
 from fdhil.records import LoopEstimate, Window, WindowOutcome
 
@@ -26,6 +27,8 @@ def analyse_windows(
 
     ``spread`` may use further processes, in order; ``done`` is told of each window.
     """
+    if windows:
+        windows = with_current_means(windows, settings, own(windows[0], axis), sync_period_s)
     work = partial(analyse, settings=settings, axis=axis, sync_period_s=sync_period_s)
 
     def told() -> Iterator[WindowOutcome]:
@@ -33,7 +36,7 @@ def analyse_windows(
             done()
             yield outcome
 
-    def again(own: Axis) -> Sequence[WindowOutcome]:
-        return list(spread(partial(work, axis=own), windows))
+    def again(better: Axis) -> Sequence[WindowOutcome]:
+        return list(spread(partial(work, axis=better), windows))
 
     return explained(list(told()), axis, settings, sync_period_s, again)

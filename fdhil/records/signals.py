@@ -164,7 +164,8 @@ class Window:
     ``offset_mm`` is the position offset in force, None where it was 0 throughout or is not known.
     ``torque_constant_nm_per_a`` is the K that the recording itself tells. ``nc`` is what the NC said of the move,
     None where it was not heard. Of a move that is no rapid (``is_rapid``), a whole laboratory recording, ``stages`` and
-    ``direction`` mean little. Two windows are equal when they are the same one.
+    ``direction`` mean little. ``current_off_a`` is one standard deviation (n,) of how far readings of the current may
+    be from its means, None where nothing determines it. Two windows are equal when they are the same one.
     """
 
     axis: str
@@ -194,6 +195,7 @@ class Window:
     table_m_s2: Float | None = None
     nc: NcMove | None = None
     is_rapid: bool = True
+    current_off_a: Float | None = None
 
     @property
     def n(self) -> int:

@@ -38,9 +38,10 @@ COLUMNS: Mapping[str, str] = {
     "offset_mm": "mm",
     "table_mm": "mm",
     "table_m_s2": "m/s2",
+    "current_off_a": "A",
 }
-AT_THE_TABLE = {"table_mm", "table_m_s2"}  # in no window of before there were such sensors: its digest stays
-OPTIONAL = {"voltage_v", "offset_mm", *AT_THE_TABLE}
+ADDED_LATER = {"table_mm", "table_m_s2", "current_off_a"}  # in no window of before they were known: its digest stays
+OPTIONAL = {"voltage_v", "offset_mm", *ADDED_LATER}
 _NAME = re.compile(r"w(\d{8,12})-([A-Z]2?)\.parquet")
 _META = b"fdhil"
 REFUSED = (
@@ -147,7 +148,7 @@ def _digest(window: Window) -> str:
     digest = hashlib.sha256(json.dumps(_head(window), sort_keys=True).encode())
     for name in COLUMNS:
         values = getattr(window, name)
-        if values is None and name in AT_THE_TABLE:
+        if values is None and name in ADDED_LATER:
             continue
         digest.update(name.encode() + (b"-" if values is None else _bits(values).tobytes()))
     if window.slow_voltage is not None:

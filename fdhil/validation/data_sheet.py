@@ -44,7 +44,9 @@ def gain_error(estimate: Estimate, nominal: Parameters) -> Reason | None:
     values = np.array([estimate.value(name) for name in told])
     apart = np.log(values / [getattr(nominal, name) for name in told])
     sure = BUDGET["data sheet"].deviations
-    allowed = math.log1p(tolerance) + sure * np.array([estimate.std(name) for name in told]) / values
+    shared = np.zeros(len(rows)) if estimate.systematic is None else np.square(estimate.systematic[rows]).sum(axis=1)
+    chance = np.array([estimate.std(name) for name in told]) ** 2 - shared
+    allowed = math.log1p(tolerance) + (sure * np.sqrt(np.maximum(chance, 0.0)) + np.sqrt(shared)) / values
     if np.count_nonzero(np.abs(apart) > allowed) < LEAST_BEYOND:
         return None
     suspects = [("current",)] if blind else [*((signal,) for signal in GAINS), ("voltage", "current")]
@@ -84,7 +86,7 @@ def scale_convention(estimate: Estimate, nominal: Parameters) -> Reason | None:
         f"K and Jt are {apart['K']:.2f} and {apart['Jt']:.2f} times those of the data sheet, R and L are as there: "
         f"current and voltage are {which}, and K, Jt, ft and Cd are {factor:.3g} times what they are"
     )
-    advice = "predictions hold all the same; set the scales of current and voltage so that their product is the power"
+    advice = "set the scales of current and voltage so that their product is the power"
     return Reason("CalibrationSuspect", text, advice)
 
 

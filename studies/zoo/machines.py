@@ -1,4 +1,4 @@
-"""Fourteen machines drawn about what practice has, each with two axes, and what an engineer would configure of them."""
+"""Machines drawn about what practice has, each with two axes, and what an engineer would configure of them."""
 
 from __future__ import annotations
 
@@ -147,6 +147,7 @@ KINDS = (
          {"dead_time_v": 0.5, "sag": 0.05, "decoupling": 0.0, "torque_filter_s": 3e-4,
          "late_voltage": 1.0, "inertia_feedforward": 0.9},
          told=("torque_feedforward", "current_delay_cycles")),
+    Kind("1 ms SYNC, stepping feed-forward", SCREW, {"stepping": 1.0}),
 )  # fmt: skip
 
 

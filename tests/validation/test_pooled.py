@@ -103,7 +103,7 @@ def test_friction_that_differs_by_direction_is_a_load_and_no_jump(refit: bool) -
     assert estimate.terms == ("load",)
     assert abs(estimate.value("load") - 0.5) < 3 * estimate.std("load")
     assert abs(estimate.value("Cd") - 5.0) < 3 * estimate.std("Cd")
-    assert estimate.std("load") < 0.01
+    assert estimate.std("load") < 0.05
 
 
 def test_a_counterweight_that_is_off_by_three_times_the_friction_is_told() -> None:

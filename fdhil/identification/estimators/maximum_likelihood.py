@@ -16,12 +16,14 @@ from functools import lru_cache
 import numpy as np
 
 from fdhil.config import Axis, Identification
+from fdhil.identification.courses import FIRST_COURSE
 from fdhil.identification.covariance import TESTED_LAGS, aliasing, robust, suspicious
 from fdhil.identification.delay import MOST_DELAY, coarse_delay, delay_direction, with_delay_doubt
 from fdhil.identification.estimators import least_squares
 from fdhil.identification.fit import Fit, but_delay, descend, fit, jacobian, pose, typical, with_delay
 from fdhil.identification.identifiability import admissible, judge
-from fdhil.identification.kalman import DELAY, JT, K, L, R
+from fdhil.identification.kalman import DELAY, JT, VOLTAGE, K, L, R
+from fdhil.identification.model_doubts import model_doubts
 from fdhil.identification.motion import UNKNOWN, Motion, prepare
 from fdhil.identification.normal import inverse_of, solve
 from fdhil.identification.selection import add_terms
@@ -36,7 +38,7 @@ from fdhil.records import PARAMETERS, Estimate, Float, Result, Window
 __all__ = ["Fit", "descend", "estimate", "fit", "fit_windows", "jacobian", "pose", "typical"]
 NAME = "maximum_likelihood"
 INSTANT_DELAY = 0.5  # of a row
-RESEMBLING = 0.5  # of a delay that was found may be something else: dead time, axes d and q that are not parted
+RESEMBLING = 0.5  # of a delay or a lost voltage that was found may be something else: axes d and q that are not parted
 TURNS = 2  # in which what loops do within rows follows the parameters
 FLOORS = np.array([1e-4, 1e-4, 1e-9])  # of R, K and Jt
 LEAST_TIME_CONSTANT_S = 1e-4  # of the winding: noise may drive the starting L below 0
@@ -66,7 +68,7 @@ def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | No
     start = starting_point(least_squares.raw_values(signals, [w.dt_s for w in usable]))
     if start is None:
         return None
-    motions = [with_open_course(prepare(w), start) for w in usable]
+    motions = [with_open_course(prepare(w), start, w.current_off_a) for w in usable]
     delays = [coarse_delay(s, w.dt_s) for s, w in zip(signals, usable, strict=True)]
     command = settings.voltage_source != "terminals"
     if any(w.voltage_delay_s is not None for w in usable):
@@ -182,6 +184,19 @@ def doubts(result: Fit, inverse: Float) -> Float:
     return columns
 
 
+def _resembling_terms(result: Fit) -> Float:
+    """Return (k, q) by how much entries of theta move if a voltage that joined is partly something else."""
+    courses, columns = result.problem.motions[0].courses, []
+    for k, j in enumerate(result.free):
+        if j < FIRST_COURSE or courses[j - FIRST_COURSE].kind != VOLTAGE:
+            continue
+        others = [m for m in range(len(result.free)) if m != k]
+        column = np.zeros(result.theta.size)
+        column[[result.free[m] for m in others]] = solve(result.jacobian[:, others], result.jacobian[:, k])[0]
+        columns.append(RESEMBLING * result.theta[j] * column)
+    return np.stack(columns, axis=1) if columns else np.zeros((result.theta.size, 0))
+
+
 def _resembled_s(result: Fit) -> float:
     """Return how much of a delay may be something else that resembles it; of one that shows in whole rows, nothing."""
     delay_s, first = abs(float(result.theta[DELAY])), result.problem.motions[0]
@@ -268,4 +283,11 @@ def finish(result: Fit) -> Estimate:
     judged = judge(answer, condition, top_rad_s, abs(float(result.theta[K])) * top_a)
     if judged.names != answer.names:  # nothing is told
         return judged
-    return replace(judged, covariance=judged.covariance + beyond)
+    assert judged.systematic is not None
+    left = np.column_stack([model_doubts(result), _resembling_terms(result)])[: len(PARAMETERS)]
+    left = np.pad(left, ((0, len(judged.names) - len(left)), (0, 0)))
+    return replace(
+        judged,
+        covariance=judged.covariance + beyond + left @ left.T,
+        systematic=np.column_stack([judged.systematic, left]),
+    )

@@ -1,0 +1,112 @@
+"""Moves readings of the current to its means where a drive feeds forward a speed that steps at every SYNC.
+
+Such a drive differentiates the set-points that it gets: its speed set-point is a stair half a cycle behind the one
+between straight lines, which the measured position shows behind known loops. The current answers each step after the
+instant of its reading. By how much follows from the speed loop that runs along the stair of a constant acceleration.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from fdhil.config import Axis, Identification
+from fdhil.identification.demand_lead import with_demand_on_time
+from fdhil.identification.filtering import moving_mean
+from fdhil.identification.signals import mended
+from fdhil.identification.slow_rows import STEPPED_ROW_S
+from fdhil.identification.windows import bridged, carried
+from fdhil.model.closed_loop import simulate
+from fdhil.records import Float, Parameters, Window, read_only, rms
+
+SURELY = 0.6  # of what the other replay leaves, at most, for one to be right
+SAME_GRID = 1e-3  # of a row, by which it may differ from the cycle of the set-points
+LEAST_ROWS = 50
+LEFT_OPEN = 0.2  # of what known loops determine: they are known to a tenth or so
+SMOOTHING_S = 0.005
+SETTLED, LEAST_CYCLES = 8.0, 16  # time constants of the speed loop, and cycles, until all cycles are alike
+
+
+def with_current_means(
+    windows: Sequence[Window], settings: Identification, axis: Axis | None, sync_period_s: float | None
+) -> Sequence[Window]:
+    """Return the windows of one drive with their current's means, where the ``axis``' loops show that its speed steps.
+
+    The first window decides for all: where its replay is far better without steps, readings are as good as means.
+    Where no loops are known, or the replay does not decide, all is left as it is.
+    """
+    if axis is None or not windows or windows[0].slow_voltage is not None or windows[0].current_off_a is not None:
+        return windows
+    plain, stepped = _left_mm(windows[0], settings, axis, sync_period_s)
+    if plain < SURELY * stepped and windows[0].dt_s < STEPPED_ROW_S:
+        return windows  # there is no doubt to take away
+    if plain < SURELY * stepped:
+        return [replace(w, current_off_a=read_only(np.zeros(w.n))) for w in windows]
+    if not stepped < SURELY * plain:
+        return windows
+    lag = reading_lag(axis, windows[0].dt_s)
+    return [_moved(w, lag) for w in windows]
+
+
+def _left_mm(window: Window, settings: Identification, axis: Axis, sync_period_s: float | None) -> tuple[float, float]:
+    """Return the RMS (mm) that replays without and with steps leave; NaN where nothing can be compared."""
+    unknown = (math.nan, math.nan)
+    if abs((sync_period_s or window.dt_s) / window.dt_s - 1.0) > SAME_GRID:
+        return unknown
+    window = with_demand_on_time(mended(window, settings.speed_source), axis, sync_period_s)[0]
+    known = np.isfinite(window.demand_mm) & np.isfinite(window.position_mm)
+    if np.count_nonzero(known) < LEAST_ROWS or not np.ptp(window.demand_mm[known]) > 0.0:
+        return unknown
+    demand, position = bridged(window.demand_mm), bridged(window.position_mm)
+    offset = None if window.offset_mm is None else np.nan_to_num(window.offset_mm)
+    model = Parameters(**axis.nominal.model_dump())
+    rate = np.gradient(demand, window.dt_s) * (2 * math.pi / axis.screw_pitch_mm)
+    late = -axis.regulators.speed_feedforward * window.dt_s / 2 * np.gradient(rate, window.dt_s)
+
+    def left(speed_offset: Float | None) -> float:
+        moved = simulate(model, axis, window.dt_s, demand, offset, speed_offset_rad_s=speed_offset).position_mm
+        return rms((moved - moved[0] - position + position[0])[known])
+
+    return left(None), left(late)
+
+
+def _moved(window: Window, lag: float) -> Window:
+    """Return the window with ``lag`` (A per rad/s^2) times its acceleration added to its readings of the current."""
+    width = 2 * round(SMOOTHING_S / window.dt_s / 2) + 1
+    beyond = lag * np.gradient(moving_mean(carried(window.speed_rad_s), width), window.dt_s)
+    return replace(
+        window,
+        current_a=read_only(window.current_a + beyond),
+        current_off_a=read_only(LEFT_OPEN * np.abs(lag) * beyond / lag),
+    )
+
+
+def reading_lag(axis: Axis, sync_period_s: float) -> float:
+    """Return by how much readings at SYNC are below the mean current, A per rad/s^2 of acceleration.
+
+    The regulators of speed and current run along a stair of one unit until every cycle is as the one before. The speed
+    loop takes the mean speed of its last period; the current loop is a lag of L over its gain.
+    """
+    g, p = axis.regulators, axis.nominal
+    every = max(1, round(g.speed_period_s / g.current_period_s))
+    steps = max(1, round(sync_period_s / g.speed_period_s)) * every
+    h, accelerating = sync_period_s / steps, p.Jt / p.K
+    cycles = max(LEAST_CYCLES, math.ceil(SETTLED * accelerating / (g.speed_kp * sync_period_s)))
+    share = -math.expm1(-h * g.current_kp / p.L)
+    current = wanted = accelerating
+    speed = turned = turned_before = 0.0
+    for cycle in range(cycles):
+        reading, mean = current, 0.0
+        for step in range(steps):
+            if step % every == 0:
+                seen, turned_before = (turned - turned_before) / (every * h), turned
+                wanted = accelerating + g.speed_kp * (g.speed_feedforward * cycle * sync_period_s - seen)
+            before, current = current, current + share * (wanted - current)
+            rise = h * (before + current) / 2 / accelerating
+            turned += h * (speed + rise / 2)
+            speed += rise
+            mean += (before + current) / 2 / steps
+    return mean - reading

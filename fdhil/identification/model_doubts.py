@@ -1,0 +1,31 @@
+"""Bounds what a model that is nearly right leaves open, however many samples there are.
+
+Axes d and q of a motor are not quite parted, windings and magnets saturate a little, and friction is no straight line
+over speed. Where such a remainder has the shape of a parameter's own regressor, no residual shows it: it is one
+standard deviation of the parameter, the same in all windows of a drive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from fdhil.identification.fit import Fit
+from fdhil.identification.kalman import CD, FT, K, L, R
+from fdhil.records import Float
+
+SHARES: Mapping[int, float] = {R: 0.008, L: 0.03, K: 0.0003}
+CURVE_SHARE = 0.004  # of the friction at top speed, by which a straight line over speed misses it
+CROSSING = 1.5  # top speed over the one at which the straight line meets the curve again
+
+
+def model_doubts(result: Fit) -> Float:
+    """Return (k, 4) one standard deviation of the entries of theta for a remainder shaped as R, L, K or friction."""
+    theta, top = result.theta, max(float(np.abs(m.speed).max()) for m in result.problem.motions)
+    doubts = np.zeros((theta.size, 4))
+    for column, (entry, share) in enumerate(SHARES.items()):
+        doubts[entry, column] = share * abs(float(theta[entry]))
+    curve = CURVE_SHARE * (abs(float(theta[CD])) + abs(float(theta[FT])) * top)
+    doubts[CD, 3], doubts[FT, 3] = curve, -CROSSING * curve / top if top > 0.0 else 0.0
+    return doubts
