@@ -19,10 +19,10 @@ unexport PYTHONDONTWRITEBYTECODE
 # folders that make test and make test-processes leave out, as .ci/run does for the guard's, which make guard tests
 EXCEPT  ?=
 
-.PHONY: help setup foreign docs demo test test-system test-linuxcnc test-processes test-full test-vcan near nightly swarm faults fuzz guard mutants audit loaded lint bench study lock clean
+.PHONY: help environment setup foreign docs demo test test-system test-linuxcnc test-processes test-full test-vcan near nightly swarm faults fuzz guard mutants audit loaded lint bench study lock clean
 
 help:            ## list the targets
-	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-14s %s\n", $$1, $$2}'
 
 $(VENV)/.ok: pyproject.toml requirements.lock
 	@$(PYTHON) -c 'import ensurepip, sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
@@ -45,7 +45,9 @@ $(VENV)/.kernels: $(VENV)/.ok $(KERNELS)
 	@$(BIN)/python -m studies.kernels
 	@touch $@
 
-setup: $(VENV)/.kernels ## make .venv with everything in it, kernels compiled
+environment: $(VENV)/.ok ## make .venv with everything in it
+
+setup: $(VENV)/.kernels ## the same, kernels compiled
 
 foreign: setup   ## the CANopen stack of node.js that some tests talk to
 	@command -v npm >/dev/null || { echo "make test-system needs npm: apt-get install nodejs npm" >&2; exit 1; }
@@ -109,13 +111,13 @@ guard: setup     ## the guard's own tests, in its processes too; a branch of it 
 mutants: setup   ## what the guard's tests notice of mistakes put into it, one at a time (hours); the page is docs/studies/mutants.md
 	@$(BIN)/python -m studies mutants
 
-audit: setup     ## the bill of materials in out/sbom.json, and what is known against the packages of requirements.lock
+audit: environment ## the bill of materials in out/sbom.json, and what is known against the packages of requirements.lock
 	@$(BIN)/python .ci/audit out/sbom.json
 
 loaded: setup    ## both tiers and the demonstration again and again, idle and next to four busy loops
 	@.ci/loaded --run 15 5 "$(MAKE) -s test" --run 5 5 "$(MAKE) -s test-system" --run 0 5 "$(MAKE) -s demo"
 
-lint: setup      ## ruff, mypy, import-linter, deptry, codespell, and the house rules
+lint: environment ## ruff, mypy, import-linter, deptry, codespell, and the house rules
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
@@ -124,7 +126,7 @@ lint: setup      ## ruff, mypy, import-linter, deptry, codespell, and the house 
 	@$(BIN)/codespell
 	@! grep -n '://' requirements.lock || { echo "requirements.lock names an address" >&2; exit 1; }
 
-docs: setup      ## the site of the documents, in out/site; a broken link is an error
+docs: environment ## the site of the documents, in out/site; a broken link is an error
 	@$(BIN)/python -m sphinx -W --keep-going -q -b html docs out/site
 
 bench: setup     ## the benchmarks; results go to docs/benchmarks.md
