@@ -13,9 +13,14 @@ import sys
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from _pytest.mark import ParameterSet
+
+if TYPE_CHECKING:
+    from xdist.remote import Producer  # type: ignore[import-untyped]
+    from xdist.scheduler import LoadFileScheduling  # type: ignore[import-untyped]
 
 SYSTEM_FIXTURES = frozenset({"processes", "long_computation", "real_time"})
 SYSTEM_MARKS = ("debian", "socketcan")
@@ -83,6 +88,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         requested = SYSTEM_FIXTURES.intersection(getattr(item, "fixturenames", ()))
         if requested or any(item.get_closest_marker(mark) for mark in SYSTEM_MARKS):
             item.add_marker("system")
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LoadFileScheduling:
+    """Distribute tests by files as ``--dist loadfile`` does, those of the browser together.
+
+    They share one machine of many processes, which every worker would start again for each of their files.
+    """
+    from xdist.scheduler import LoadFileScheduling
+
+    class FileScheduling(LoadFileScheduling):  # type: ignore[misc]
+        def _split_scope(self, nodeid: str) -> str:
+            return "browser" if nodeid.startswith("tests/web/test_browser") else super()._split_scope(nodeid)
+
+    return FileScheduling(config, log)
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
