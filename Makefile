@@ -19,6 +19,9 @@ unexport PYTHONDONTWRITEBYTECODE
 # folders that make test and make test-processes leave out, as .ci/run does for the guard's, which make guard tests
 EXCEPT  ?=
 
+# worker processes of make test-processes, as .ci/run sets them: its tests wait for other processes half of the time
+WORKERS ?= 2
+
 .PHONY: help environment setup foreign docs demo test test-system test-linuxcnc test-processes test-full test-vcan near nightly swarm faults fuzz guard mutants audit loaded lint bench study lock clean
 
 help:            ## list the targets
@@ -71,7 +74,7 @@ test-processes: foreign ## the other ones
 	@command -v promtool >/dev/null || { echo "make test-system needs promtool: apt-get install prometheus" >&2; exit 1; }
 	@command -v strace >/dev/null && command -v faketime >/dev/null || { echo "make test-system needs strace and faketime: apt-get install strace faketime" >&2; exit 1; }
 	@PATH="$$PATH:/usr/sbin"; command -v nats-server >/dev/null && ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 || { echo "make test-system needs nats-server and PostgreSQL: apt-get install nats-server postgresql" >&2; exit 1; }
-	@$(BIN)/python -m pytest -q -m "system and not socketcan" $(LINUXCNC:%=--ignore %) $(EXCEPT:%=--ignore %) -n 2 --dist loadfile
+	@$(BIN)/python -m pytest -q -m "system and not socketcan" $(LINUXCNC:%=--ignore %) $(EXCEPT:%=--ignore %) -n $(WORKERS) --dist loadfile
 
 test-full: test test-system ## both tiers
 
