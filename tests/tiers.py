@@ -44,17 +44,17 @@ def sampled(cases: Iterable[object], every: int) -> list[ParameterSet]:
 
 
 class AuditTrail:
-    """What Python's audit events report of the test that runs: processes started, seconds slept."""
+    """What Python's audit events report of the test that runs, fixtures included: processes started, seconds slept."""
 
     def __init__(self) -> None:
         self.processes: list[str] = []
-        self.slept_s = 0.0
+        self.slept_s = self.start_s = 0.0
         sys.addaudithook(self._record)
 
     def clear(self) -> None:
         """Forget the test before."""
         self.processes.clear()
-        self.slept_s = 0.0
+        self.slept_s, self.start_s = 0.0, time.process_time()
 
     def _record(self, event: str, arguments: tuple[object, ...]) -> None:
         if event in STARTS_PROCESS and not LISTS_FONTS.intersection(arguments[:1]):
@@ -112,15 +112,19 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return True if WHOLE_MODULE.search(collection_path.read_text("utf-8")) else None
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """Begin to observe before the first fixture: those of a module and of the session are of the test that needs them."""
+    TRAIL.clear()
+
+
 @pytest.fixture(autouse=True)
 def within_tier(request: pytest.FixtureRequest) -> Iterator[None]:
     """Fail a test of the fast tier that starts a process, sleeps, or computes for long."""
-    TRAIL.clear()
-    start_s = time.process_time()
     yield
     if request.node.get_closest_marker("system"):
         return
-    used_s = time.process_time() - start_s
+    used_s = time.process_time() - TRAIL.start_s
     if TRAIL.processes and (reading := sys.modules.get("fdhil.store.reading_process")) is not None:
         reading._end()  # or it would serve the next test, which starts none then
     fast = "a test of the fast tier"
