@@ -19,8 +19,7 @@ from fdhil.program import load_trajectory
 from fdhil.records import Float, Parameters, rms, table_path
 from fdhil.store.history import History
 from tests.bench import rotary_axis
-
-pytestmark = pytest.mark.usefixtures("processes")
+from tests.machine.whole_machine import Machine
 
 
 @dataclass(frozen=True)
@@ -35,13 +34,18 @@ class Whole:
     notices: tuple[str, ...]
 
 
+def program_of(lines: str) -> str:
+    """Return a program of these lines."""
+    return lines.replace("|", "\n") + "\nM2\n"
+
+
 @contextmanager
 def shuttled(out: Path, document: dict[str, Any], path: str, shuttle: str) -> Iterator[loop.Stage]:
     """Have the demonstration's stage of a machine that has made the rapids of ``shuttle``, with a program ``path``."""
     with loop.running(out, False, lambda _: None, document) as stage:
         stage.programs = {"10 m/min": out / "path.ngc", "shuttle": out / "shuttle.ngc"}
         for program, text in zip(stage.programs.values(), (path, shuttle), strict=True):
-            program.write_text(text.replace("|", "\n") + "\nM2\n")
+            program.write_text(program_of(text))
         loop.play_shuttle(stage)
         yield stage
 
@@ -87,6 +91,7 @@ def check(whole: Whole) -> None:
     assert not any("apart" in text for text in whole.notices)
 
 
+@pytest.mark.usefixtures("processes")
 def test_rotary_table_is_a_feed_drive_like_any_other(tmp_path: Path) -> None:
     document = machine("X")
     document["axis"]["A"] = rotary_axis()
@@ -108,20 +113,30 @@ def gantry(**second: Any) -> dict[str, Any]:
     return document
 
 
+@pytest.mark.usefixtures("processes")
 def test_both_drives_of_a_gantry_are_identified_and_corrected_each_by_its_own_model(tmp_path: Path) -> None:
     whole = run(tmp_path, gantry(), GANTRY, GANTRY_SHUTTLE)
     check(whole)
     assert np.abs(whole.found["Y"].Jt - whole.found["Y2"].Jt) > 0.008
 
 
+@pytest.mark.usefixtures("long_computation")
 def test_skewed_gantry_ends_the_correction(tmp_path: Path) -> None:
     """A correction makes both drives alike until the slide-way of one of them warms: then 2 um are too few."""
-    with shuttled(tmp_path, gantry(max_difference_um=2.0), GANTRY, GANTRY_SHUTTLE) as stage:
-        assert any("the drives Y and Y2 are" in notice["text"] for notice in stage.ask("status")["notices"])
-        program, token = stage.programs["10 m/min"], (stage.run / "token").read_text("utf-8").strip()
-        stage.ask("arm", program=str(program), method="inverse", token=token)
-        stage.twin.command("temperature", celsius=26.0)
-        stage.twin.play(program, tmp_path / "trace.csv")
-        status = stage.ask("status")
+    document = gantry(max_difference_um=2.0) | {"bus": {"can0": {"interface": "virtual", "channel": "memory"}}}
+    with Machine(config=document, folder=tmp_path) as machine:
+        machine.start("guard")
+        machine.start("daemon")
+        machine.nc(on=True)
+        machine.play(program_of(GANTRY_SHUTTLE), "shuttle.ngc")
+        machine.run(1.0)
+        assert any("the drives Y and Y2 are" in notice["text"] for notice in machine.ask("status")["notices"])
+        answer = machine.arm(machine.write(program_of(GANTRY), "path.ngc"), method="inverse")
+        assert answer["ok"], answer
+        for unit in machine.plant.units.values():
+            unit.warm(26.0)
+        machine.play(program_of(GANTRY), "path.ngc")
+        status = machine.ask("status")
         assert status["state"] == "OFF"
         assert status["guard"]["cause"]["code"] != "Finished"
+        assert machine.wrong == []
