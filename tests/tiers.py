@@ -114,7 +114,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup() -> None:
-    """Begin to observe before the first fixture: those of a module and of the session are of the test that needs them."""
+    """Begin to observe before the first fixture: one of a module or the session is of the test that needs it first."""
     TRAIL.clear()
 
 

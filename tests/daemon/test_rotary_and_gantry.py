@@ -19,6 +19,7 @@ from fdhil.program import load_trajectory
 from fdhil.records import Float, Parameters, rms, table_path
 from fdhil.store.history import History
 from tests.bench import rotary_axis
+from tests.daemon.shop import patient
 from tests.machine.whole_machine import Machine
 
 
@@ -42,7 +43,7 @@ def program_of(lines: str) -> str:
 @contextmanager
 def shuttled(out: Path, document: dict[str, Any], path: str, shuttle: str) -> Iterator[loop.Stage]:
     """Have the demonstration's stage of a machine that has made the rapids of ``shuttle``, with a program ``path``."""
-    with loop.running(out, False, lambda _: None, document) as stage:
+    with patient(), loop.running(out, False, lambda _: None, document) as stage:
         stage.programs = {"10 m/min": out / "path.ngc", "shuttle": out / "shuttle.ngc"}
         for program, text in zip(stage.programs.values(), (path, shuttle), strict=True):
             program.write_text(program_of(text))
