@@ -135,10 +135,12 @@ async def test_what_there_is_not_is_said_to_be_missing(client: httpx.AsyncClient
 
 
 @pytest.mark.usefixtures("processes")
-@pytest.mark.parametrize("number", [1, 13, 31, 36])
-async def test_the_model_that_is_laid_over_is_the_one_that_the_daemon_judged(
-    client: httpx.AsyncClient, number: int
-) -> None:
+async def test_the_model_that_is_laid_over_is_the_one_that_the_daemon_judged(client: httpx.AsyncClient) -> None:
+    for number in (1, 13, 31, 36):  # one process replays them all
+        await _check_overlay(client, number)
+
+
+async def _check_overlay(client: httpx.AsyncClient, number: int) -> None:
     axis = "X" if number % 2 else "Y"
     rapid = (await _get(client, f"/{axis}/{number}"))["rapid"]
     told = await _get(client, f"/{axis}/{number}/signals")
