@@ -25,6 +25,8 @@ from tests.drivers.peer import DrivePeer
 from tests.machine.whole_machine import Machine
 from tests.short_waits import shorten_waits
 
+pytestmark = pytest.mark.usefixtures("long_computation")
+
 
 @dataclass(frozen=True)
 class Whole:
@@ -117,7 +119,6 @@ def rotary() -> dict[str, Any]:
     return document
 
 
-@pytest.mark.usefixtures("long_computation")
 def test_rotary_table_is_a_feed_drive_like_any_other(tmp_path: Path) -> None:
     shuttle = "|G4 P0.25|".join(["G0 X400 A224", "G0 X0 A0", "G0 X300 A168", "G0 X0 A0", ""])
     check(run(tmp_path, rotary(), "F1500|G1 X30 A40|X60 A0|X80 A60|X0 A0", shuttle))
@@ -135,14 +136,12 @@ def gantry(**second: Any) -> dict[str, Any]:
     return document
 
 
-@pytest.mark.usefixtures("long_computation")
 def test_both_drives_of_a_gantry_are_identified_and_corrected_each_by_its_own_model(tmp_path: Path) -> None:
     whole = run(tmp_path, gantry(), GANTRY, GANTRY_SHUTTLE)
     check(whole)
     assert np.abs(whole.found["Y"].Jt - whole.found["Y2"].Jt) > 0.008
 
 
-@pytest.mark.usefixtures("long_computation")
 def test_skewed_gantry_ends_the_correction(tmp_path: Path) -> None:
     """A correction makes both drives alike until the slide-way of one of them warms: then 2 um are too few."""
     with shuttled(tmp_path, gantry(max_difference_um=2.0), GANTRY_SHUTTLE) as machine:
@@ -158,7 +157,6 @@ def test_skewed_gantry_ends_the_correction(tmp_path: Path) -> None:
         assert machine.wrong == []
 
 
-@pytest.mark.usefixtures("real_time")
 @pytest.mark.parametrize("document", [rotary(), gantry()], ids=["rotary", "gantry"])
 def test_each_drive_is_commissioned(document: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     shorten_waits(monkeypatch)
