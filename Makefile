@@ -19,10 +19,13 @@ unexport PYTHONDONTWRITEBYTECODE
 # folders that make test and make test-processes leave out, as .ci/run does for the guard's, which make guard tests
 EXCEPT  ?=
 
-.PHONY: help setup foreign docs demo test test-system test-linuxcnc test-processes test-full test-vcan near nightly swarm faults fuzz guard proof mutants audit loaded lint bench study lock clean
+# worker processes of make test-processes, as .ci/run sets them: its tests wait for other processes half of the time
+WORKERS ?= 2
+
+.PHONY: help environment setup foreign docs demo test test-system test-linuxcnc test-processes test-full test-vcan near nightly swarm faults fuzz guard proof mutants audit loaded lint bench study lock clean
 
 help:            ## list the targets
-	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-14s %s\n", $$1, $$2}'
 
 $(VENV)/.ok: pyproject.toml requirements.lock
 	@$(PYTHON) -c 'import ensurepip, sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
@@ -45,7 +48,9 @@ $(VENV)/.kernels: $(VENV)/.ok $(KERNELS)
 	@$(BIN)/python -m studies.kernels
 	@touch $@
 
-setup: $(VENV)/.kernels ## make .venv with everything in it, kernels compiled
+environment: $(VENV)/.ok ## make .venv with everything in it
+
+setup: $(VENV)/.kernels ## the same, kernels compiled
 
 foreign: setup   ## the CANopen stack of node.js that some tests talk to
 	@command -v npm >/dev/null || { echo "make test-system needs npm: apt-get install nodejs npm" >&2; exit 1; }
@@ -69,7 +74,7 @@ test-processes: foreign ## the other ones
 	@command -v promtool >/dev/null || { echo "make test-system needs promtool: apt-get install prometheus" >&2; exit 1; }
 	@command -v strace >/dev/null && command -v faketime >/dev/null || { echo "make test-system needs strace and faketime: apt-get install strace faketime" >&2; exit 1; }
 	@PATH="$$PATH:/usr/sbin"; command -v nats-server >/dev/null && ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 || { echo "make test-system needs nats-server and PostgreSQL: apt-get install nats-server postgresql" >&2; exit 1; }
-	@$(BIN)/python -m pytest -q -m "system and not socketcan" $(LINUXCNC:%=--ignore %) $(EXCEPT:%=--ignore %) -n 2 --dist loadfile
+	@$(BIN)/python -m pytest -q -m "system and not socketcan" $(LINUXCNC:%=--ignore %) $(EXCEPT:%=--ignore %) -n $(WORKERS) --dist loadfile
 
 test-full: test test-system ## both tiers
 
@@ -111,13 +116,13 @@ proof: setup     ## the proof that the guard keeps its limits and comes to zero;
 mutants: setup   ## what the guard's tests notice of mistakes put into it, one at a time (hours); the page is docs/studies/mutants.md
 	@$(BIN)/python -m studies mutants
 
-audit: setup     ## the bill of materials in out/sbom.json, and what is known against the packages of requirements.lock
+audit: environment ## the bill of materials in out/sbom.json, and what is known against the packages of requirements.lock
 	@$(BIN)/python .ci/audit out/sbom.json
 
 loaded: setup    ## both tiers and the demonstration again and again, idle and next to four busy loops
 	@.ci/loaded --run 15 5 "$(MAKE) -s test" --run 5 5 "$(MAKE) -s test-system" --run 0 5 "$(MAKE) -s demo"
 
-lint: setup      ## ruff, mypy, import-linter, deptry, codespell, and the house rules
+lint: environment ## ruff, mypy, import-linter, deptry, codespell, and the house rules
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
@@ -126,7 +131,7 @@ lint: setup      ## ruff, mypy, import-linter, deptry, codespell, and the house 
 	@$(BIN)/codespell
 	@! grep -n '://' requirements.lock || { echo "requirements.lock names an address" >&2; exit 1; }
 
-docs: setup      ## the site of the documents, in out/site; a broken link is an error
+docs: environment ## the site of the documents, in out/site; a broken link is an error
 	@$(BIN)/python -m sphinx -W --keep-going -q -b html docs out/site
 
 bench: setup     ## the benchmarks; results go to docs/benchmarks.md

@@ -13,9 +13,14 @@ import sys
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from _pytest.mark import ParameterSet
+
+if TYPE_CHECKING:
+    from xdist.remote import Producer  # type: ignore[import-untyped]
+    from xdist.scheduler import LoadFileScheduling  # type: ignore[import-untyped]
 
 SYSTEM_FIXTURES = frozenset({"processes", "long_computation", "real_time"})
 SYSTEM_MARKS = ("debian", "socketcan")
@@ -39,17 +44,17 @@ def sampled(cases: Iterable[object], every: int) -> list[ParameterSet]:
 
 
 class AuditTrail:
-    """What Python's audit events report of the test that runs: processes started, seconds slept."""
+    """What Python's audit events report of the test that runs, fixtures included: processes started, seconds slept."""
 
     def __init__(self) -> None:
         self.processes: list[str] = []
-        self.slept_s = 0.0
+        self.slept_s = self.start_s = 0.0
         sys.addaudithook(self._record)
 
     def clear(self) -> None:
         """Forget the test before."""
         self.processes.clear()
-        self.slept_s = 0.0
+        self.slept_s, self.start_s = 0.0, time.process_time()
 
     def _record(self, event: str, arguments: tuple[object, ...]) -> None:
         if event in STARTS_PROCESS and not LISTS_FONTS.intersection(arguments[:1]):
@@ -85,6 +90,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("system")
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LoadFileScheduling:
+    """Distribute tests by files as ``--dist loadfile`` does, those of the browser together.
+
+    They share one machine of many processes, which every worker would start again for each of their files.
+    """
+    from xdist.scheduler import LoadFileScheduling
+
+    class FileScheduling(LoadFileScheduling):  # type: ignore[misc]
+        def _split_scope(self, nodeid: str) -> str:
+            return "browser" if nodeid.startswith("tests/web/test_browser") else super()._split_scope(nodeid)
+
+    return FileScheduling(config, log)
+
+
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Leave modules unread that are of the system tier as a whole, where that tier is not wanted: imports cost."""
     if config.option.markexpr != "not system" or collection_path.suffix != ".py":
@@ -92,15 +112,19 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return True if WHOLE_MODULE.search(collection_path.read_text("utf-8")) else None
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """Begin to observe before the first fixture: one of a module or the session is of the test that needs it first."""
+    TRAIL.clear()
+
+
 @pytest.fixture(autouse=True)
 def within_tier(request: pytest.FixtureRequest) -> Iterator[None]:
     """Fail a test of the fast tier that starts a process, sleeps, or computes for long."""
-    TRAIL.clear()
-    start_s = time.process_time()
     yield
     if request.node.get_closest_marker("system"):
         return
-    used_s = time.process_time() - start_s
+    used_s = time.process_time() - TRAIL.start_s
     if TRAIL.processes and (reading := sys.modules.get("fdhil.store.reading_process")) is not None:
         reading._end()  # or it would serve the next test, which starts none then
     fast = "a test of the fast tier"

@@ -36,10 +36,10 @@ from tests.bench import bench_config
 from tests.daemon.machine import config_of
 from tests.store.made import published
 
-NEAR_S = 20.0  # instead of AHEAD_S where a process really checks: the same, in a third of the processor time
+NEAR_S = 12.0  # instead of AHEAD_S where a process really checks: the same, in a fifth of the processor time
 ENDLESS = HEAD + SQUARE * 4000 + "M2\n"
-HARD_LINE = 2 + 4 * 45 + 1  # some 70 s into the program
-HARD = HEAD + SQUARE * 45 + "G1 X40 F30000\nG1 X0\nF6000\n" + SQUARE * 2 + "M2\n"
+HARD_LINE = 2 + 4 * 28 + 1  # some 40 s into the program
+HARD = HEAD + SQUARE * 28 + "G1 X40 F30000\nG1 X0\nF6000\n" + SQUARE * 2 + "M2\n"
 PATIENCE_S = 500.0  # another process computes, on a host that may be busy
 
 
@@ -266,7 +266,7 @@ async def test_a_whole_check_is_waited_for_when_it_is_asked_for(
     config: MachineConfig, mill: Mill, tmp_path: Path
 ) -> None:
     async with opened(config, mill) as shop:
-        answer = await shop.arm(written(tmp_path, HEAD + SQUARE * 15 + "M2\n"), whole=True)
+        answer = await shop.arm(written(tmp_path, HEAD + SQUARE * 10 + "M2\n"), whole=True)
         assert answer["ok"], answer
         assert answer["check"] == {"checked_s": answer["rows"] / 1000, "whole": True, "refused": []}
         assert answer["rows"] > 1000 * NEAR_S

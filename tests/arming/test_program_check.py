@@ -23,7 +23,7 @@ from fdhil.arming.background_check import FOLDER, BackgroundCheck
 from fdhil.arming.checked_program import CheckedProgram, Piece, RowStream
 from fdhil.arming.code_digest import code_digest
 from fdhil.arming.preparing import ArmRequest, prepare, prepare_armament
-from fdhil.arming.program_check import KEPT, SCHEMA, check, encoded, keep
+from fdhil.arming.program_check import KEPT, SCHEMA, answer_request, check, encoded, keep
 from fdhil.config import MachineConfig
 from fdhil.errors import ProgramError, StoreError
 from fdhil.prediction.models import nominal_models, with_loops
@@ -376,20 +376,18 @@ def test_a_store_that_refuses_is_told(tmp_path: Path) -> None:
         made(tmp_path / "file" / "folder", "a")
 
 
-@pytest.mark.usefixtures("processes")
-async def test_rows_of_other_terms_or_loops_are_other_rows(config: MachineConfig, tmp_path: Path) -> None:
-    """A check is known by all that its rows depend on, and its process is told all of it."""
+def test_rows_of_other_terms_or_loops_are_other_rows(config: MachineConfig, tmp_path: Path) -> None:
+    """A check is known by all that its rows depend on, and the request to its process has all of it."""
     program = written(tmp_path, HEAD + SQUARE + "G4 P0.3\nM2\n")
     digest, six = program_digest(program), nominal_models(config)
     rich = {axis: model.changed(stribeck=2.0, stribeck_speed=10.0) for axis, model in six.items()}
     filtered = with_loops(config, {axis: {"speed_filter_s": 5e-4} for axis in config.axis}, "test")
-    check = BackgroundCheck(config)
-    found = [
-        await check.run(program, digest, models, whole, known)
-        for models, known in ((six, None), (rich, None), (six, filtered), (rich, config))
-    ]
-    assert all(isinstance(one, CheckedProgram) for one in found)
-    bodies = [b"".join(one.content(k) for k in range(len(one.blocks))) for one in found]  # type: ignore[union-attr]
-    assert len(set(bodies)) == 3
-    assert bodies[1] == bodies[3]
-    assert len(list((config.store.directory / FOLDER).glob("*.rows"))) == 3
+    background, bodies = BackgroundCheck(config), dict[str, bytes]()
+    for models, machine in ((six, config), (rich, config), (six, filtered)):
+        key = background._key(digest, models, machine)
+        request = json.dumps(background._request(program, digest, models, key, machine))
+        answer_request(json.loads(request), lambda _told: None)
+        found = CheckedProgram.find(config.store.directory / FOLDER, key, tmp_path)
+        assert found is not None
+        bodies[key] = b"".join(found.content(k) for k in range(len(found.blocks)))
+    assert len(set(bodies.values())) == len(bodies) == 3

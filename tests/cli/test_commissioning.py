@@ -127,7 +127,7 @@ def points(checked: dict[str, Any], state: str) -> dict[str, dict[str, str]]:
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+def bench(tmp_path_factory: pytest.TempPathFactory, processes: None) -> Iterator[Bench]:
     folder = tmp_path_factory.mktemp("bench")
     with TwinProcess(write_config(folder)) as twin:
         yield Bench(twin, folder)

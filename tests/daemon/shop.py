@@ -37,12 +37,21 @@ AXIS = axis_toml("X") + "[sim.axis.X]\nJt = 0.085\n"
 BENCH = HEAD + AXIS + AXIS.replace(".X", ".Y")
 
 
+WAITS = {
+    "drivers.can.sdo.RESPONSE_TIMEOUT_S": 20.0,
+    "drivers.can.sdo.DEADLINE_S": 20.0,
+    "commissioning.survey.LISTEN_S": 0.3,
+    "commissioning.steps.SETTLE_CYCLES": 100,
+    "commissioning.steps.AVERAGE_CYCLES": 60,
+}
+
+
 @contextmanager
 def patient() -> Iterator[None]:
-    """Wait long for a drive's answer by SDO."""
+    """Wait long for a drive's answer by SDO, but not for a simulated drive to settle as a real one does."""
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("RESPONSE_TIMEOUT_S", "DEADLINE_S"):
-            patch.setattr(f"fdhil.drivers.can.sdo.{name}", 20.0)
+        for name, value in WAITS.items():
+            patch.setattr(f"fdhil.{name}", value)
         yield
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import uuid
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,16 +12,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fdhil.cli.demo import loop
+from fdhil import config as machine_config
+from fdhil.cli.demo.loop import read_trace, true_plants
 from fdhil.cli.demo.machines import machine_document
-from fdhil.cli.demo.report import Cut
+from fdhil.commissioning.steps import commission
 from fdhil.prediction import contour_error_um, predict
 from fdhil.program import load_trajectory
-from fdhil.records import Float, Parameters, rms, table_path
+from fdhil.records import Parameters, rms, table_path
 from fdhil.store.history import History
 from tests.bench import rotary_axis
+from tests.drivers.peer import DrivePeer
+from tests.machine.whole_machine import Machine
+from tests.short_waits import shorten_waits
 
-pytestmark = pytest.mark.usefixtures("processes")
+pytestmark = pytest.mark.usefixtures("long_computation")
 
 
 @dataclass(frozen=True)
@@ -35,36 +40,55 @@ class Whole:
     notices: tuple[str, ...]
 
 
+def program_of(lines: str) -> str:
+    """Return a program of these lines."""
+    return lines.replace("|", "\n") + "\nM2\n"
+
+
 @contextmanager
-def shuttled(out: Path, document: dict[str, Any], path: str, shuttle: str) -> Iterator[loop.Stage]:
-    """Have the demonstration's stage of a machine that has made the rapids of ``shuttle``, with a program ``path``."""
-    with loop.running(out, False, lambda _: None, document) as stage:
-        stage.programs = {"10 m/min": out / "path.ngc", "shuttle": out / "shuttle.ngc"}
-        for program, text in zip(stage.programs.values(), (path, shuttle), strict=True):
-            program.write_text(text.replace("|", "\n") + "\nM2\n")
-        loop.play_shuttle(stage)
-        yield stage
+def shuttled(folder: Path, document: dict[str, Any], shuttle: str) -> Iterator[Machine]:
+    """Have a machine on virtual time that has made the rapids of ``shuttle``."""
+    with Machine(config=document | on_a_bus("memory"), folder=folder) as machine:
+        machine.start("guard")
+        machine.start("daemon")
+        machine.nc(on=True)
+        machine.play(program_of(shuttle), "shuttle.ngc")
+        machine.run(1.0)
+        yield machine
 
 
-def run(out: Path, document: dict[str, Any], path: str, shuttle: str) -> Whole:
+def on_a_bus(channel: str) -> dict[str, Any]:
+    """Return the part of a configuration that names the bus."""
+    return {"bus": {"can0": {"interface": "virtual", "channel": channel}}}
+
+
+def run(folder: Path, document: dict[str, Any], path: str, shuttle: str) -> Whole:
     """Identify, predict, cut, correct and cut again."""
-    with shuttled(out, document, path, shuttle) as stage:
-        axes = tuple(stage.config.axis)
-        with History.read(stage.config.store.directory) as history:
-            found = {axis: history.revisions(axis, limit=1)[0].set.parameters for axis in axes}
-        predicted = predict(load_trajectory(stage.programs["10 m/min"], stage.config), found, stage.config)
-        loop.cut(stage, "uncorrected", 20.0)
-        loop.cut(stage, "corrected", 20.0, "inverse")
-        measured = [_contour_um(cut, axes) for cut in stage.cuts]
-        notices = tuple(notice["text"] for notice in stage.ask("status")["notices"])
-        return Whole(
-            found, loop.true_plants(stage.config), predicted.rms_um, rms(measured[0]), rms(measured[1]), notices
-        )
+    with shuttled(folder, document, shuttle) as machine:
+        config, program = machine.config, machine.write(program_of(path), "path.ngc")
+        with History.read(config.store.directory) as history:
+            found = {axis: history.revisions(axis, limit=1)[0].set.parameters for axis in config.axis}
+        predicted = predict(load_trajectory(program, config), found, config)
+        measured_um = cut(machine, path)
+        answer = machine.arm(program, method="inverse")
+        assert answer["ok"], answer
+        corrected_um = cut(machine, path)
+        machine.run(1.0)
+        status = machine.ask("status")
+        assert status["guard"]["cause"]["code"] == "Finished"
+        assert machine.wrong == []
+        notices = tuple(notice["text"] for notice in status["notices"])
+        return Whole(found, true_plants(config), predicted.rms_um, measured_um, corrected_um, notices)
 
 
-def _contour_um(cut: Cut, axes: tuple[str, ...]) -> Float:
-    reference, table = (table_path(axes, rows) for rows in (cut.reference_mm, cut.table_mm))
-    return contour_error_um(reference, table, 0.001)
+def cut(machine: Machine, path: str) -> float:
+    """Let the NC cut the path; return the RMS of the contour error at the table, um."""
+    trace = machine.folder / "trace.csv"
+    machine.plant.trace(trace)
+    machine.play(program_of(path), "path.ngc")
+    axes = tuple(machine.config.axis)
+    reference, table = (table_path(axes, rows) for rows in read_trace(trace, axes))
+    return rms(contour_error_um(reference, table, 0.001))
 
 
 def machine(*axes: str) -> dict[str, Any]:
@@ -87,13 +111,17 @@ def check(whole: Whole) -> None:
     assert not any("apart" in text for text in whole.notices)
 
 
-def test_rotary_table_is_a_feed_drive_like_any_other(tmp_path: Path) -> None:
+def rotary() -> dict[str, Any]:
+    """Return the machine with a rotary table."""
     document = machine("X")
     document["axis"]["A"] = rotary_axis()
     document["sim"]["axis"]["A"] = {"Jt": 0.082, "Cd": 5.5, "start_deg": 0.0}
-    rests = "|G4 P0.25|"
-    shuttle = rests.join(["G0 X400 A224", "G0 X0 A0", "G0 X300 A168", "G0 X0 A0", ""])
-    check(run(tmp_path, document, "F1500|G1 X30 A40|X60 A0|X80 A60|X0 A0", shuttle))
+    return document
+
+
+def test_rotary_table_is_a_feed_drive_like_any_other(tmp_path: Path) -> None:
+    shuttle = "|G4 P0.25|".join(["G0 X400 A224", "G0 X0 A0", "G0 X300 A168", "G0 X0 A0", ""])
+    check(run(tmp_path, rotary(), "F1500|G1 X30 A40|X60 A0|X80 A60|X0 A0", shuttle))
 
 
 GANTRY = "F10000|G1 Y55|X100|G3 X200 I50|G1 X250|Y0"
@@ -116,12 +144,29 @@ def test_both_drives_of_a_gantry_are_identified_and_corrected_each_by_its_own_mo
 
 def test_skewed_gantry_ends_the_correction(tmp_path: Path) -> None:
     """A correction makes both drives alike until the slide-way of one of them warms: then 2 um are too few."""
-    with shuttled(tmp_path, gantry(max_difference_um=2.0), GANTRY, GANTRY_SHUTTLE) as stage:
-        assert any("the drives Y and Y2 are" in notice["text"] for notice in stage.ask("status")["notices"])
-        program, token = stage.programs["10 m/min"], (stage.run / "token").read_text("utf-8").strip()
-        stage.ask("arm", program=str(program), method="inverse", token=token)
-        stage.twin.command("temperature", celsius=26.0)
-        stage.twin.play(program, tmp_path / "trace.csv")
-        status = stage.ask("status")
+    with shuttled(tmp_path, gantry(max_difference_um=2.0), GANTRY_SHUTTLE) as machine:
+        assert any("the drives Y and Y2 are" in notice["text"] for notice in machine.ask("status")["notices"])
+        answer = machine.arm(machine.write(program_of(GANTRY), "path.ngc"), method="inverse")
+        assert answer["ok"], answer
+        for unit in machine.plant.units.values():
+            unit.warm(26.0)
+        machine.play(program_of(GANTRY), "path.ngc")
+        status = machine.ask("status")
         assert status["state"] == "OFF"
         assert status["guard"]["cause"]["code"] != "Finished"
+        assert machine.wrong == []
+
+
+@pytest.mark.parametrize("document", [rotary(), gantry()], ids=["rotary", "gantry"])
+def test_each_drive_is_commissioned(document: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    shorten_waits(monkeypatch)
+    config = machine_config.parse(document | on_a_bus(uuid.uuid4().hex))
+    with ExitStack() as peers:
+        for axis in config.axis:
+            peers.enter_context(DrivePeer(config, axis))
+        for axis in config.axis:
+            record = commission(config, axis)
+            assert record.readback_ok
+            assert record.offset_in_feedforward
+            assert record.watchdog == "proven"
+            assert record.sign_test_um == pytest.approx(10.0, rel=0.2)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,8 +19,6 @@ from fdhil.store.windows import list_windows
 from tests.daemon.shop import CORNER, REAL, SHUTTLE, Shop, fdhil, opened, patient
 
 Capture = pytest.CaptureFixture[str]
-ROUND = "G1 X60 F8000\nG1 Y40\nG1 X0\nG1 Y0\n"
-LONG = "G21 G90 G94\nG4 P0.3\n" + ROUND * 7 + "G4 P0.2\nM2\n"
 pytestmark = [pytest.mark.timeout(1500), pytest.mark.usefixtures("processes")]
 
 
@@ -46,7 +43,6 @@ def test_from_the_bus_to_the_history_to_a_corrected_cut_and_back(shop: Shop, cap
         _knows_the_drives(told)
         _refuses_a_second_daemon(shop)
         _cuts_corrected(shop, capsys)
-        _disarms_what_is_refused_before_it_begins(shop, capsys)
         _refuses_a_drive_that_was_written_to_until_it_is_compared(shop, capsys)
         code, out, err = fdhil("arm", shop.path, shop.folder / "corner.ngc", capsys=capsys)
         assert code == 0, (out, err)
@@ -106,26 +102,6 @@ def _cuts_corrected(shop: Shop, capsys: Capture) -> None:
     corrected = _cut(shop, "corrected")
     assert corrected < 0.2 * plain, (corrected, plain)
     shop.told("-> OFF: Finished")
-
-
-def _disarms_what_is_refused_before_it_begins(shop: Shop, capsys: Capture) -> None:
-    """Its first minute passes and is armed; the check, which goes on, meets a feed that no drive can hold."""
-    body = LONG.splitlines()[2:-2]
-    hard = ["G1 Y400 F60000", "G1 X-400", "G1 X0 Y0 F8000"]
-    lines = [*LONG.splitlines()[:2], *body * 14, *hard, *ROUND.splitlines(), "M2"]
-    program = shop.folder / "later.ngc"
-    program.write_text("\n".join(lines) + "\n")
-    code, out, err = fdhil("arm", shop.path, program, "--json", capsys=capsys)
-    assert code == 0, (out, err)
-    assert json.loads(out)["check"]["whole"] is False
-    told = shop.status_when(lambda s: any(notice["code"] == "DemandTooHigh" for notice in s["notices"]))
-    refused = next(notice for notice in told["notices"] if notice["code"] == "DemandTooHigh")
-    assert refused["severity"] == "MAJOR"
-    line = re.match(r"line (\d+), at \d+\.\d+ s: axis [XY] has", refused["text"])
-    assert line, refused
-    assert 0 <= int(line[1]) - (3 + 14 * len(body)) <= 1  # its first or its second move
-    assert "it had not begun and is disarmed" in refused["text"]
-    shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None and s["checking"] is None)
 
 
 def _refuses_a_drive_that_was_written_to_until_it_is_compared(shop: Shop, capsys: Capture) -> None:

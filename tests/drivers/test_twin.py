@@ -67,7 +67,7 @@ class Twin:
 
 
 @pytest.fixture(scope="module")
-def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Twin]:
+def twin(tmp_path_factory: pytest.TempPathFactory, processes: None) -> Iterator[Twin]:
     running = Twin(tmp_path_factory.mktemp("twin"))
     yield running
     running.close()

@@ -201,11 +201,11 @@ def server(tmp_path: Path) -> Iterator[NatsServer]:
         yield running
 
 
-async def look(config: MachineConfig, letterbox: Letterbox | None = None) -> list[str]:
+async def look(config: MachineConfig, letterbox: Letterbox | None = None, timeout_s: float = 60.0) -> list[str]:
     """Have a machine's letterbox look, and return which offers lie there then."""
     assert config.uplink is not None
     async with connected(config.uplink, f"fdhil-{config.works_name}", "uplink") as client:
-        await (letterbox or Letterbox(config)).look(client.jetstream(timeout=60.0), "5" * 32)
+        await (letterbox or Letterbox(config)).look(client.jetstream(timeout=timeout_s), "5" * 32)
     return sorted(path.name for path in lying(config.offers_directory))
 
 
@@ -259,5 +259,5 @@ async def test_without_the_right_or_the_stream_what_lies_there_stays(
     letterbox = Letterbox(config)
     for _ in range(2):
         letterbox._next_s = 0.0
-        assert await look(config, letterbox) == ["friction-3.offer"]
+        assert await look(config, letterbox, timeout_s=1.0) == ["friction-3.offer"]  # it is never answered
     assert capfd.readouterr().err.count("no offers can be fetched") == 1

@@ -12,6 +12,7 @@ import pytest
 from tests.guard.machine import ramp_cycles
 from tests.machine.invariants import TABLES, Judge
 from tests.machine.whole_machine import Machine
+from tests.tiers import sampled
 
 ROUND = "G1 X30 F6000\nG1 Y20\nG1 X0\nG1 Y0\n"
 PART = f"G21 G90 G94\nG4 P0.2\n{ROUND * 2}G4 P0.2\nM2\n"
@@ -85,7 +86,7 @@ def test_another_seed_gives_other_frames(tmp_path: Path) -> None:
 
 
 @pytest.mark.fault("F15")
-@pytest.mark.parametrize("seconds", [0.0, 0.8, 1.3])
+@pytest.mark.parametrize("seconds", sampled([0.0, 0.8, 1.3], every=3))
 def test_offsets_ramp_to_zero_when_the_daemon_is_killed(begin: Begin, seconds: float) -> None:
     machine = begin()
     judge = Judge(machine)
@@ -161,15 +162,15 @@ def test_a_restarted_guard_ramps_to_zero_before_it_ends(begin: Begin) -> None:
 
 @pytest.mark.parametrize(
     ("kind", "fields"),
-    [
+    sampled([
         ("drop_tpdo", {"axis": "X", "value": 3}),
         ("bus_mutate", {"can_id": 0x381, "value": 3, "percent": 50}),
         ("sync_lost", {}),
         ("ignore_offset", {"axis": "Y"}),
         ("trip", {"axis": "X", "value": 0x3210}),
         ("bus_down", {}),
-    ],
-)
+    ], every=3),
+)  # fmt: skip
 def test_a_fault_in_the_cut_ends_at_zero(begin: Begin, kind: str, fields: dict[str, object]) -> None:
     machine = begin()
     judge = Judge(machine)

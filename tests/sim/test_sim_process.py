@@ -38,7 +38,7 @@ def write_demand(path: Path, rows_mm: np.ndarray) -> Path:
 
 
 @pytest.fixture(scope="module")
-def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TwinProcess]:
+def twin(tmp_path_factory: pytest.TempPathFactory, processes: None) -> Iterator[TwinProcess]:
     """One process without NC; tests leave its drives in pre-operational."""
     with TwinProcess(write_config(tmp_path_factory.mktemp("twin"))) as process:
         yield process

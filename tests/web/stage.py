@@ -17,8 +17,6 @@ from pathlib import Path
 from typing import Any
 from urllib.request import Request, urlopen
 
-import pytest
-
 from fdhil import config as machine_config
 from fdhil.arming.token import read_token
 from fdhil.cli.demo.processes import Process, Twin
@@ -219,7 +217,7 @@ def _joined(asked: dict[str, Any], twin: Twin, acting: bool) -> dict[str, Any]:
 
 def _prepare(stage: Stage, rapids: int) -> None:
     """Commission the drives, leave weeks of history, a program and its lesson, and the users."""
-    with soon():
+    with patient():
         for axis in stage.config.axis:
             save_record(commission(stage.config, axis), stage.config.store.directory)
     stage.program.parent.mkdir()
@@ -230,13 +228,3 @@ def _prepare(stage: Stage, rapids: int) -> None:
     for name, role in ROLES.items():
         command = [sys.executable, "-m", "fdhil", "web-user", str(stage.config_path), name, "--role", role]
         subprocess.run(command, input=f"{PASSWORDS[name]}\n", text=True, check=True, capture_output=True)
-
-
-@contextmanager
-def soon() -> Iterator[None]:
-    """Wait long for a drive's answer, but not for a simulated drive to settle as a real one does."""
-    shorter = {"survey.LISTEN_S": 0.3, "steps.SETTLE_CYCLES": 100, "steps.AVERAGE_CYCLES": 60}
-    with patient(), pytest.MonkeyPatch.context() as patch:
-        for name, value in shorter.items():
-            patch.setattr(f"fdhil.commissioning.{name}", value)
-        yield

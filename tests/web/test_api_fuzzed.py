@@ -90,6 +90,13 @@ def test_whatever_is_sent_is_answered_as_described(label: str, app: FastAPI, ses
         case.validate_response(answer, checks=CONFORMANCE)
 
     sent()
+    _end_forecasts(session, own(app, "operator"))
+
+
+def _end_forecasts(session: Any, headers: dict[str, str]) -> None:
+    """End the processes that forecast what was sent as a program, and return when they have ended."""
+    for program in session.get("http://localhost/api/program", headers=headers).json()["programs"]:
+        session.post(f"http://localhost/api/program/{program['digest']}/cancel", headers=headers)
 
 
 @pytest.mark.parametrize("label", [label for label in OPERATIONS if "/api/session" not in label])

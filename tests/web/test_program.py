@@ -100,7 +100,7 @@ def over(client: Client, digest: str, part: str = "") -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def judged(client: Client) -> dict[str, Any]:
+def judged(client: Client, processes: None) -> dict[str, Any]:
     told = over(client, drop(client, "../shop\\bench.ngc", PROGRAM.read_bytes()))
     assert told["state"] == "done", told
     return told

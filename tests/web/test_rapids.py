@@ -7,7 +7,7 @@ import json
 import math
 import os
 import sqlite3
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -38,6 +38,14 @@ from tests.store.made import STAMP, outcome
 from tests.web import weeks
 
 RAPIDS = 18  # of each axis; those of 6 and 15 are refused
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _busy_host() -> Iterator[None]:
+    """The bound on a replay ends what hangs, not what a busy host has not come to yet."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(replayer, "LONGEST_S", 500.0)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -135,10 +143,12 @@ async def test_what_there_is_not_is_said_to_be_missing(client: httpx.AsyncClient
 
 
 @pytest.mark.usefixtures("processes")
-@pytest.mark.parametrize("number", [1, 13, 31, 36])
-async def test_the_model_that_is_laid_over_is_the_one_that_the_daemon_judged(
-    client: httpx.AsyncClient, number: int
-) -> None:
+async def test_the_model_that_is_laid_over_is_the_one_that_the_daemon_judged(client: httpx.AsyncClient) -> None:
+    for number in (1, 13, 31, 36):  # one process replays them all
+        await _check_overlay(client, number)
+
+
+async def _check_overlay(client: httpx.AsyncClient, number: int) -> None:
     axis = "X" if number % 2 else "Y"
     rapid = (await _get(client, f"/{axis}/{number}"))["rapid"]
     told = await _get(client, f"/{axis}/{number}/signals")

@@ -94,6 +94,7 @@ async def test_a_node_that_lacks_is_named_and_an_optional_one_is_not_missed(tmp_
             await once(config_of(**peer.settings))
 
 
+@pytest.mark.usefixtures("long_computation")
 async def test_nodes_are_found_by_their_names_in_whichever_namespace() -> None:
     """The profile of the companion specification, and its channel below two others that lack what is asked for."""
     async with OpcUaPeer() as peer:
