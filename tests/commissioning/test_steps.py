@@ -19,6 +19,7 @@ from fdhil.commissioning import steps, survey
 from fdhil.commissioning import watchdog as watchdog_module
 from fdhil.commissioning.cycle import Cycle
 from fdhil.commissioning.master import Master
+from fdhil.commissioning.moving import EMCY_HEARTBEAT
 from fdhil.commissioning.steps import (
     check_axis,
     commission,
@@ -361,7 +362,7 @@ def test_a_heartbeat_that_is_late_right_after_the_feeding_proves_as_much(
 
     def fed_and_late(master: Master, sub: int, entry: int, enable: Callable[[Master], None]) -> int:
         before = feed(master, sub, entry, enable)
-        peer[0].drive.trip(watchdog_module.EMCY_HEARTBEAT)
+        peer[0].drive.trip(EMCY_HEARTBEAT)
         master.wait_cycles(20)
         return before
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdhil.cli.batch import FileResult, analyse_file
+from fdhil.api.analysis import FileResult
+from fdhil.cli.batch import analyse_file
 from fdhil.config import Identification
 from fdhil.config.reading import load
 from fdhil.identification.current_means import reading_lag
