@@ -177,7 +177,8 @@ class Result:
 
     def _notes(self) -> Iterator[str]:
         for reason in dict.fromkeys((*self.reasons, *self.warnings)):
-            yield f"{reason}; {reason.advice}" if reason.advice else str(reason)
+            text = f"{reason}; {reason.advice}" if reason.advice else str(reason)
+            yield text if reason in self.reasons else f"warning: {text}"
 
     @property
     def _estimate(self) -> Estimate | None:

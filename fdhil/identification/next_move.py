@@ -15,7 +15,7 @@ from fdhil.identification.motion import Noise, noise_levels
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.windows import carried
 from fdhil.model.feed_drive import simulate_plant
-from fdhil.records import PARAMETERS, Float, Parameters, Window
+from fdhil.records import PARAMETERS, Estimate, Float, Parameters, Window
 
 MOVES: Mapping[str, Callable[[Float], Float]] = {  # share (n,) of the voltage over the share (n,) of the time
     "steps of voltage in both directions": lambda t: np.array([0.0, 0.5, 1.0, -1.0, -0.5, 0.0])[(t * 6).astype(int)],
@@ -27,27 +27,34 @@ MOVES: Mapping[str, Callable[[Float], Float]] = {  # share (n,) of the voltage o
 
 @dataclass(frozen=True)
 class NextMove:
-    """A further move: the share of its present interval that it leaves to each parameter."""
+    """A further move: the least share of its present interval that it leaves to each parameter."""
 
     name: str
     shares: Mapping[str, float]
 
 
-def predict_next_moves(window: Window, parameters: Parameters) -> list[NextMove]:
-    """Return for each move, as long as the window, what it leaves of the intervals, the same recording again first."""
+def predict_next_moves(window: Window, estimate: Estimate) -> list[NextMove]:
+    """Return for each move, as long as the window, what it leaves of the intervals, the same recording again first.
+
+    What the sensors' noise does not explain of the intervals of the ``estimate`` stays, whatever is recorded.
+    """
     if window.voltage_v is None:
         return []
-    noise = noise_levels(window)
-    now = information(parameters, noise, window.dt_s, carried(window.current_a), carried(window.speed_rad_s))
-    before = np.sqrt(np.diag(inverse_of(now)[0]))
-    again = NextMove("the same recording again", dict.fromkeys(PARAMETERS, float(np.sqrt(0.5))))
+    parameters, noise = estimate.parameters(), noise_levels(window)
+    current, speed = carried(window.current_a), carried(window.speed_rad_s)
+    now = information(parameters, noise, window.dt_s, current, speed)
+    known = np.diag(inverse_of(now)[0])
+    stays = np.maximum(np.square([estimate.std(name) for name in PARAMETERS]) - known, 0.0)
+
+    def left(variances: Float) -> Mapping[str, float]:
+        return dict(zip(PARAMETERS, np.sqrt((variances + stays) / (known + stays)).tolist(), strict=True))
+
+    moves = [NextMove("the same recording again", left(0.5 * known))]
     top_v, share = float(np.nanmax(np.abs(window.voltage_v))), np.arange(window.n) / window.n
-    moves = [again]
     for name, course in MOVES.items():
         current, speed = simulate_plant(parameters, top_v * course(share), window.dt_s, "interval_mean")
         after = inverse_of(now + information(parameters, noise, window.dt_s, current, speed))[0]
-        shares = np.sqrt(np.diag(after)) / before
-        moves.append(NextMove(name, dict(zip(PARAMETERS, shares.tolist(), strict=True))))
+        moves.append(NextMove(name, left(np.diag(after))))
     return moves
 
 

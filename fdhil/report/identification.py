@@ -19,7 +19,6 @@ from fdhil.validation.simulation import Simulated, simulated
 
 MOST_WINDOWS = 6
 LAGS = 40
-HALF = 0.5  # of an interval
 INCHES = 6.4, 6.8
 
 
@@ -191,15 +190,15 @@ def _next(found: Identified) -> Iterator[Section]:
     if min(p.R, p.L, p.K, p.Jt) <= 0.0:
         return
     widest = max(PARAMETERS, key=lambda name: estimate.std(name) / max(abs(estimate.value(name)), 1e-300))
-    moves = predict_next_moves(window, p)
+    moves = predict_next_moves(window, estimate)
     rows = [(move.name, *(f"{move.shares[name]:.2f}" for name in PARAMETERS)) for move in moves]
     best = min(moves, key=lambda move: move.shares[widest], default=None)
     if best is None:
         return
-    halves = "would halve it" if best.shares[widest] <= HALF else f"would leave {best.shares[widest]:.0%} of it"
+    left = f"leaves {best.shares[widest]:.0%} of it at best"
     text = (
-        f"{widest} has the widest interval of its size. One more recording as long, {best.name}, {halves}. The same "
-        "recording four times halves all. The table has the share of each interval that is left, by the model."
+        f"{widest} has the widest interval of its size. One more recording as long, {best.name}, {left}. What "
+        "the model itself leaves open stays. The table has the least share of each interval that is left."
     )
     yield Section("What would tell more", text, [Table(("further move", *PARAMETERS), rows)])
 
