@@ -109,6 +109,7 @@ def test_a_command_that_fdhil_does_not_have_is_seen() -> None:
 
 # blocks that other tests run as they stand
 RUN = {
+    ("README.md", "python"): "tests/api/test_command_line.py",
     ("an-hour.md", "sh"): "tests/cli/test_tutorial.py",
     ("an-hour.md", "text"): "tests/cli/test_tutorial.py",
     ("extend.md", "python"): "tests/test_extend.py",

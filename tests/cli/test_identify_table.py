@@ -108,7 +108,7 @@ def test_status_says_what_the_table_did_and_how_it_swings() -> None:
     }
     text = believed({"terms": {"resonance": figures}, "last_window": {"at_table": seen}, "warnings": []})
     assert "resonance 60" in text
-    assert "the table was 46.2 um RMS off in the last rapid" in text
+    assert "the table was 46.20 um RMS off in the last rapid" in text
     assert "table" not in believed({"terms": {}, "last_window": {"at_table": None}})
 
 

@@ -26,7 +26,7 @@ WITH_CONFIG = {
     "scan": ["{config}"],
     "check": ["{config}"],
     "doctor": ["{config}"],
-    "commission": ["{config}"],
+    "commission": ["{config}", "--yes"],
     "run": ["{config}"],
     "status": ["{config}"],
     "arm": ["{config}", "part.ngc"],
@@ -60,6 +60,7 @@ WITHOUT_CONFIG = {
     "eds": ["drive.eds"],
     "interpret": ["part.ngc"],
     "export": ["w.parquet", "--out", "out.csv"],
+    "compare": ["before.json", "after.json"],
     # whose configuration is another
     "fleet collect": ["fleet.toml"],
     "fleet status": ["fleet.toml"],

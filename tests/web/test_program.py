@@ -348,6 +348,7 @@ PASS = {
     "program": "/srv/part 1.ngc",
     "pass": 3,
     "ended_by": "Finished",
+    "late": "",
     "measured": {"rms_um": 0.92, "max_um": 2.1},
     "predicted": {"rms_um": 0.6, "uncertainty_um": 0.4},
     "predicted_without": {"rms_um": 41.2},

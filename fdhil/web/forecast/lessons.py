@@ -56,6 +56,6 @@ def jobs(notices: Iterable[StoredNotice]) -> Iterator[dict[str, Any]]:
                     ("measured_um", "max_um", "predicted_um", "without_um"), map(float, found.groups()[2:]), strict=True
                 )
             )
-            ended = re.search(r"; it was ended by (\w+)", stored.notice.text)
+            ended = re.search(r"; it (?:was ended by|ended early:) ([^;:]+)", stored.notice.text)
             about = {"number": stored.number, "time": date_of(stored.stamp), "pass": int(found[1]), "program": found[2]}
             yield {**about, **figures, "severity": stored.notice.severity, "ended_by": ended[1] if ended else None}
