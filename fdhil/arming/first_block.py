@@ -188,7 +188,7 @@ def rest_state(rest: AtRest, start_mm: float, parameters: Parameters, axis: Axis
     off_mm = rest.position_mm - rest.demand_mm
     if abs(off_mm) * axis.scaling.increments_per_mm < 1.0:  # the drive itself sees none
         off_mm = 0.0
-    return closed_loop.standing(parameters, axis, start_mm + off_mm, rest.current_a)
+    return closed_loop.standing(parameters, axis, start_mm + off_mm, rest.current_a, start_mm)
 
 
 def _share(rows: int, period_s: float) -> Float:

@@ -139,13 +139,23 @@ def start(position_mm: float) -> State:
     return state
 
 
-def standing(parameters: Parameters, axis: Axis, position_mm: float, current_a: float | None = None) -> State:
+def standing(
+    parameters: Parameters,
+    axis: Axis,
+    position_mm: float,
+    current_a: float | None = None,
+    set_point_mm: float | None = None,
+) -> State:
     """Return the state of an axis that stands at ``position_mm``, its regulators holding ``current_a`` for long.
+
+    Friction may hold it away from its set-point ``set_point_mm`` (left out: there), which has stood as long.
 
     That current is on the bus at standstill; left out it is what load and ripples need, in the middle of the dry
     friction's band. The integral that a drive has tells it to the current loop, whose own holds the voltage.
     """
     g, state = axis.regulators, start(position_mm)
+    if set_point_mm is not None:
+        state[[kernels.SET_POINT_BEFORE, kernels.FILTERED, kernels.FILTERED + 3]] = set_point_mm
     angle = np.array([position_mm * terms.rad_per_mm(axis)])
     pull_nm = float(terms.torque(parameters, np.zeros(1), angle)[0]) if parameters.terms else 0.0
     held_a = pull_nm / parameters.K if current_a is None else current_a

@@ -78,7 +78,8 @@ def replay(
     parameters = with_resonance(parameters, axis)
     demand = _filled(demand_mm, "demand")
     offset = None if offset_mm is None else np.nan_to_num(offset_mm)
-    start = closed_loop.standing(parameters, axis, float(_filled(position_mm, "position")[0]), standstill_a)
+    position = float(_filled(position_mm, "position")[0])
+    start = closed_loop.standing(parameters, axis, position, standstill_a, float(demand[0]))
     response = closed_loop.simulate(parameters, axis, sync_period_s, demand, offset, state=start)
     rows = np.flatnonzero(np.isfinite(demand_mm) & np.isfinite(position_mm))
     rows = rows[(rows >= _EDGE) & (rows < demand.size - _EDGE)]

@@ -98,7 +98,8 @@ def test_the_date_of_a_limit_comes_with_its_interval(worn: Path, capsys: Any) ->
 
 @pytest.mark.usefixtures("long_computation")
 def test_the_plot_and_the_report_show_it(worn: Path, tmp_path: Path, capsys: Any) -> None:
-    assert fdhil("history", worn, "--plot", tmp_path / "plot.png", capsys=capsys)[::2] == (0, "")
+    plot = tmp_path / "plot.png"
+    assert fdhil("history", worn, "--plot", plot, capsys=capsys)[::2] == (0, f"wrote {plot}\n")
     assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "plot.png").stat().st_size > 50_000
     assert fdhil("report", worn, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0

@@ -147,7 +147,7 @@ def test_history_as_json_has_intervals_and_every_bit(machine: Path, capsys: Any)
 @pytest.mark.usefixtures("long_computation")
 def test_history_as_a_table_and_a_plot(machine: Path, tmp_path: Path, capsys: Any) -> None:
     code, out, err = fdhil("history", machine, "--plot", tmp_path / "plot.SVG", capsys=capsys)
-    assert (code, err) == (0, "")
+    assert (code, err) == (0, f"wrote {tmp_path / 'plot.SVG'}\n")
     assert "axis X: 2 revisions" in out
     assert "▁" in out
     assert b"<svg" in (tmp_path / "plot.SVG").read_bytes()
@@ -190,7 +190,7 @@ def test_history_of_nothing_is_told(tmp_path: Path, capsys: Any) -> None:
 def test_a_report_is_one_page_without_anything_from_elsewhere(machine: Path, tmp_path: Path, capsys: Any) -> None:
     out = tmp_path / "report.html"
     code, _, err = fdhil("report", machine, "--out", out, capsys=capsys)
-    assert (code, err) == (0, "")
+    assert (code, err) == (0, f"wrote {out}\n")
     page = out.read_text()
     assert "Axis X" in page
     assert "<svg" in page

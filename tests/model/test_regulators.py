@@ -157,6 +157,22 @@ def test_linuxcncs_pid_agrees_with_independent_physics(regulators: dict[str, Any
     assert np.abs(response.position_mm - slow).max() < 0.05e-3
 
 
+@pytest.mark.parametrize(
+    ("structure", "regulators"),
+    [
+        ("linuxcnc_pid", {"pid_output": "current", "position_derivative": 1.0, "position_ki_per_s2": 0.0}),
+        ("p_pi_pi", {"speed_feedforward": 0.95, "setpoint_filter_s": 0.001}),
+    ],
+)
+def test_axis_that_friction_holds_off_its_set_point_stays_there(structure: str, regulators: dict[str, Any]) -> None:
+    """The set-point has stood there for long: no derivative, feed-forward or filter kicks."""
+    axis = bench(structure, **regulators, speed_ki=0.0).axis["X"]
+    parameters, off_mm = Parameters(**axis.nominal.model_dump()), 0.002
+    state = closed_loop.standing(parameters, axis, off_mm, 0.0, 0.0)
+    response = closed_loop.simulate(parameters, axis, PERIOD, np.zeros(200), state=state)
+    assert np.abs(response.position_mm - off_mm).max() < 1e-6
+
+
 def test_the_pid_that_is_a_cascade() -> None:
     """With full feed-forward a P and PI cascade is a PID, but for when the speed of the demand comes in."""
     demand = bench_demand(10)[:, 0]
