@@ -22,7 +22,7 @@ EXCEPT  ?=
 # worker processes of make test-processes, as .ci/run sets them: its tests wait for other processes half of the time
 WORKERS ?= 2
 
-.PHONY: help environment setup foreign docs demo test test-system test-linuxcnc test-processes test-full test-vcan near nightly swarm faults fuzz guard proof mutants audit loaded lint bench study lock clean
+.PHONY: help environment setup foreign docs demo test test-system test-linuxcnc test-processes test-full test-vcan near nightly swarm faults fuzz guard proof mutants audit loaded dist lint bench study lock clean
 
 help:            ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-14s %s\n", $$1, $$2}'
@@ -121,6 +121,9 @@ audit: environment ## the bill of materials in out/sbom.json, and what is known 
 
 loaded: setup    ## both tiers and the demonstration again and again, idle and next to four busy loops
 	@.ci/loaded --run 15 5 "$(MAKE) -s test" --run 5 5 "$(MAKE) -s test-system" --run 0 5 "$(MAKE) -s demo"
+
+dist: environment ## sdist and wheel, to out/dist; twine upload out/dist/* publishes them
+	@$(BIN)/python -m hatchling build -d out/dist >/dev/null
 
 lint: environment ## ruff, mypy, import-linter, deptry, codespell, and the house rules
 	@$(BIN)/ruff check .
