@@ -19,6 +19,7 @@ OFF_GRID = 1e-3  # of a cycle, by which a row may differ from it
 SHARES_OF_LOAD = (0.0, -0.5, -0.25, -0.75, 0.5, 1.0, 2.0)  # of the friction in this direction, the likeliest first
 ENOUGH = 0.02  # of the following error: left with less, no better share is looked for
 STANDSTILL_S = 0.015  # over which the current before a move is taken
+REST_MM, REST_STEPS = 5e-3, 3.0  # a position that changes by no more, or by no more of its own steps, stands
 _EDGE = 8  # rows at either end that a shifted comparison leaves out
 
 
@@ -119,8 +120,11 @@ def replay_window(window: Window, parameters: Parameters, axis: Axis, sync_perio
 
 
 def replay_setpoints(window: Window, parameters: Parameters, axis: Axis, sync_period_s: float) -> Replay | None:
-    """Return the replay of a window as :func:`replay_window`, by this very model: nothing is fitted to it."""
-    if not _rows_are_setpoints(window, sync_period_s):
+    """Return the replay of a window as :func:`replay_window`, by this very model: nothing is fitted to it.
+
+    None too where the axis had not come to rest before: what its regulators held then is not recorded.
+    """
+    if not _rows_are_setpoints(window, sync_period_s) or not _begins_at_rest(window):
         return None
     parameters = completed(parameters, Parameters(**axis.nominal.model_dump()))
     signals, held_a = (window.demand_mm, window.position_mm), _standstill_a(window)
@@ -168,10 +172,20 @@ def _parted(p: Parameters, direction: int, current_a: float, share: float) -> tu
     return p.changed(Cd=p.Cd + helping, load=p.term("load") - direction * helping), current
 
 
+def _begins_at_rest(window: Window) -> bool:
+    """Return whether the position stands in the first rows of a window, but for its steps and what noise makes."""
+    position = window.position_mm[: _standstill_rows(window)]
+    position = position[np.isfinite(position)]
+    return not position.size or float(np.ptp(position)) <= max(REST_MM, REST_STEPS * resolution(window.position_mm))
+
+
+def _standstill_rows(window: Window) -> int:
+    return min(max(1, round(STANDSTILL_S / window.dt_s)), moving_range(window)[0])
+
+
 def _standstill_a(window: Window) -> float:
     """Return the current that the drive holds in the first rows of a window, which begins at rest."""
-    rows = min(max(1, round(STANDSTILL_S / window.dt_s)), moving_range(window)[0])
-    held = window.current_a[:rows]
+    held = window.current_a[: _standstill_rows(window)]
     held = held[np.isfinite(held)]
     return float(held.mean()) if held.size else 0.0
 

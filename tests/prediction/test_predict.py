@@ -156,6 +156,13 @@ def test_skill_leaves_out_lost_rows_and_is_not_known_without_a_position() -> Non
     assert skill_of(rapid(position_mm=np.full(window.n, np.nan))) is None
 
 
+def test_skill_is_not_known_of_a_move_that_begins_while_the_axis_still_settles() -> None:
+    window = rapid()
+    settling = 20e-3 * np.exp(-np.arange(window.n) / 20.0)
+    assert skill_of(rapid(position_mm=window.position_mm + settling)) is None
+    assert skill_of(rapid(position_mm=window.position_mm + 0.01 * settling)) is not None
+
+
 def test_one_axis_alone() -> None:
     """With a single axis the contour error is what overshoots the ends of the path."""
     demand = bench_trajectory(10).position_mm["Y"][:, None]
