@@ -168,7 +168,8 @@ def restart(live: LiveGuard, stale: str, found: Found) -> None:
     mute = live.sent == before
     good = mute == (stale in ("beyond", "zero") or not any(holds)) and (stale == "beyond") == any(live.held())
     if not good:
-        found.wrong.append(f"{stale}: {holds} became {live.held()} by {live.sent - before} frames")
+        told = [(event["state"], event.get("text", "")) for event in live.events[seen:] if "state" in event]
+        found.wrong.append(f"{stale}: {holds} became {live.held()} by {live.sent - before} frames, {told}")
     found.counts[stale] += 1
     found.counts["good"] += good
     frozen = live.was("FROZEN", seen)

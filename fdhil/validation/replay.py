@@ -173,10 +173,12 @@ def _parted(p: Parameters, direction: int, current_a: float, share: float) -> tu
 
 
 def _begins_at_rest(window: Window) -> bool:
-    """Return whether the position stands in the first rows of a window, but for its steps and what noise makes."""
-    position = window.position_mm[: _standstill_rows(window)]
+    """Return whether the axis rests for a while before it moves, its position standing but for steps and noise."""
+    rows = _standstill_rows(window)
+    position = window.position_mm[:rows]
     position = position[np.isfinite(position)]
-    return not position.size or float(np.ptp(position)) <= max(REST_MM, REST_STEPS * resolution(window.position_mm))
+    still = not position.size or float(np.ptp(position)) <= max(REST_MM, REST_STEPS * resolution(window.position_mm))
+    return still and rows >= max(1, round(STANDSTILL_S / window.dt_s))
 
 
 def _standstill_rows(window: Window) -> int:

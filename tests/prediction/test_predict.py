@@ -161,6 +161,10 @@ def test_skill_is_not_known_of_a_move_that_begins_while_the_axis_still_settles()
     settling = 20e-3 * np.exp(-np.arange(window.n) / 20.0)
     assert skill_of(rapid(position_mm=window.position_mm + settling)) is None
     assert skill_of(rapid(position_mm=window.position_mm + 0.01 * settling)) is not None
+    moves = np.flatnonzero(np.abs(window.speed_rad_s) > 0.5)[0]
+    rest = slice(max(0, moves - 5), None)
+    cut = {name: getattr(window, name)[rest] for name in ("demand_mm", "position_mm", "speed_rad_s", "current_a")}
+    assert skill_of(rapid(**cut, voltage_v=None)) is None
 
 
 def test_one_axis_alone() -> None:
