@@ -42,7 +42,8 @@ DIGEST = "program-1"
 ROWS, RESTING = 280, 20
 WAYS_MM = (8.0, 3.0)
 PERIOD_S = 0.001
-IDLE_S = 0.005
+IDLE_S = {"socketcand": 0.005, "socketcan": 0.02}
+ADOPTING = 150  # SYNC after a guard's start, until it has looked at what the drives hold and sends, or sends nothing
 ALIVE_S = 0.5  # on a busy host SYNC is slower than the clock; more often, and words would wait in front of the end
 PATIENCE_S = 300.0
 QUIET_S = {"socketcand": 0.02, "socketcan": 0.3}  # a kernel with CAN is often an emulated machine
@@ -157,7 +158,7 @@ class LiveGuard:
 
     def __init__(self, folder: Path, seed: int = 1, interface: str = "socketcand") -> None:
         self.folder, self.rng = folder, np.random.default_rng(seed)
-        self._quiet_s = QUIET_S[interface]
+        self._quiet_s, self._idle_s = QUIET_S[interface], IDLE_S[interface]
         bus = {"interface": interface} | ({"channel": "vcan0"} if interface == "socketcan" else {})
         document = bench_document(AXES) | {
             "sim": {"pace": "lockstep", "modbus": False, "seed": seed},
@@ -229,7 +230,7 @@ class LiveGuard:
         """
         begin_s = time.monotonic()
         due_s = max(self._next_s, begin_s)
-        self._next_s = due_s + (IDLE_S if self.idle else PERIOD_S)
+        self._next_s = due_s + (self._idle_s if self.idle else PERIOD_S)
         while (now_s := time.monotonic()) - begin_s < LATE_S:
             if self.heard and not before:
                 due_s = max(due_s, self._heard_s + self._quiet_s)
@@ -352,6 +353,7 @@ class LiveGuard:
         if self.guard == 0:
             self._become_guard()
         self.until(lambda: any(e["event"] == "ready" for e in self.events[seen:]), "the guard is ready")
+        self.run(ADOPTING)
         self.idle = False
 
     def _become_guard(self) -> None:
