@@ -19,7 +19,8 @@ OFF_GRID = 1e-3  # of a cycle, by which a row may differ from it
 SHARES_OF_LOAD = (0.0, -0.5, -0.25, -0.75, 0.5, 1.0, 2.0)  # of the friction in this direction, the likeliest first
 ENOUGH = 0.02  # of the following error: left with less, no better share is looked for
 STANDSTILL_S = 0.015  # over which the current before a move is taken
-REST_MM, REST_STEPS = 5e-3, 3.0  # a position that changes by no more, or by no more of its own steps, stands
+REST_S = 0.05  # an axis at rest has stood for so long: within it a deviation that still decays shows as motion
+REST_MM, REST_STEPS = 3e-3, 3.0  # a position that changes by no more, or by no more of its own steps, stands
 _EDGE = 8  # rows at either end that a shifted comparison leaves out
 
 
@@ -173,12 +174,14 @@ def _parted(p: Parameters, direction: int, current_a: float, share: float) -> tu
 
 
 def _begins_at_rest(window: Window) -> bool:
-    """Return whether the axis rests for a while before it moves, its position standing but for steps and noise."""
-    rows = _standstill_rows(window)
-    position = window.position_mm[:rows]
+    """Return whether the axis has stood for ``REST_S`` before it moves, but for steps and noise of its position."""
+    begin, rows = moving_range(window)[0], math.ceil(REST_S / window.dt_s)
+    if begin < rows:
+        return False
+    position = window.position_mm[begin - rows : begin]
     position = position[np.isfinite(position)]
-    still = not position.size or float(np.ptp(position)) <= max(REST_MM, REST_STEPS * resolution(window.position_mm))
-    return still and rows >= max(1, round(STANDSTILL_S / window.dt_s))
+    limit_mm = max(REST_MM, REST_STEPS * resolution(window.position_mm))
+    return position.size > 0 and float(np.ptp(position)) <= limit_mm
 
 
 def _standstill_rows(window: Window) -> int:

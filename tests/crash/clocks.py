@@ -49,7 +49,9 @@ def ramp(folder: Path, clock: tuple[str, str, str]) -> list[tuple[int, ...]]:
         peer.wait(lambda: rig.state() in ("OFF", "FROZEN"), "the end of the ramp")
         first = next(k for k, row in peer.rows_at.items() if row == FIRST_ROW)
         sent = [dict(peer.offsets_sent(node)) for node in (1, 2)]
-        frames = [(k - first, *(offsets[k] for offsets in sent)) for k in sorted(sent[0]) if k >= first]
+        # the last SYNC may have seen the frame of the first drive alone
+        complete = sorted(sent[0].keys() & sent[1].keys())
+        frames = [(k - first, *(offsets[k] for offsets in sent)) for k in complete if k >= first]
         rest = next(place for place, frame in enumerate(frames) if not any(frame[1:]))
         return frames[: rest + 1]
     finally:

@@ -13,6 +13,7 @@ from fdhil.model import closed_loop
 from fdhil.records import PARAMETERS, Estimate, Float, Parameters, Result, Window, frozen
 from fdhil.validation.held_out import held_out_reason, is_predicted, predict_held_out, worst_of
 from fdhil.validation.presliding import TERM, with_presliding
+from fdhil.validation.replay import replay_setpoints
 from studies.bench import shuttle
 from tests.bench import bench_config
 from tests.validation.test_at_the_table import AXIS, PERIOD_S, rapids
@@ -48,6 +49,14 @@ def test_presliding_is_identified_within_its_interval_and_only_where_there_is_so
     found = with_presliding(estimate(), moves(8.0), AXIS, PERIOD_S)
     assert found.value(TERM) == pytest.approx(8.0, abs=max(0.4, 3 * found.std(TERM)))
     assert with_presliding(estimate(), moves(0.0), AXIS, PERIOD_S).names == PARAMETERS
+
+
+def test_move_is_not_replayed_while_its_axis_still_settles() -> None:
+    window = moves(0.0)[0]
+    decaying_mm = 20e-3 * np.exp(-np.arange(window.n) * PERIOD_S / 0.035)
+    settling = replace(window, position_mm=frozen(window.position_mm + decaying_mm))
+    assert replay_setpoints(window, TRUE, AXIS, PERIOD_S) is not None
+    assert replay_setpoints(settling, TRUE, AXIS, PERIOD_S) is None
 
 
 @pytest.mark.usefixtures("long_computation")
