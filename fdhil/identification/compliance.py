@@ -1,7 +1,7 @@
-"""Finds how a table swings on its screw's spring, from sensors at the table beside the motor's own signals.
+"""Identifies the spring between motor and table from sensors at the table and the motor's own signals.
 
-An encoder tells how the table follows the motor's place, and how the torque bends the screw: resonance and damping with
-the motor held, and the table's share of the inertia. An accelerometer tells how the torque moves the table.
+An encoder shows how the table follows the motor and how the torque bends the screw: resonance and damping with the
+motor held, and the table's share of the inertia. An accelerometer shows how the torque accelerates the table.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ Left = Callable[[Float], Float]
 
 @dataclass(frozen=True, slots=True)
 class Compliance:
-    """The spring between motor and table as one window shows it: ``values`` (3,) of ``TERMS``, their covariance.
+    """The spring between motor and table from one window: ``values`` (3,) of ``TERMS`` and their covariance.
 
-    ``doubts`` (3, 2), in the covariance, are those that all windows of an axis share, one deviation a column.
-    ``late_s`` is by how much the table's sensor is late against the drive's signals.
+    ``doubts`` (3, 2), part of the covariance, are common to all windows of an axis, one standard deviation a column.
+    ``late_s`` is the lag of the table's sensor against the drive's signals.
     """
 
     values: Float
@@ -51,15 +51,15 @@ class Compliance:
     late_s: float
 
     def keys(self) -> dict[str, float]:
-        """Return resonance and damping by the keys of the axis' section."""
+        """Return resonance and damping by their keys in the axis' section of the configuration."""
         return {"resonance_hz": float(self.values[0]), "resonance_damping": float(self.values[1])}
 
 
 def compliance(window: Window, parameters: Parameters) -> Compliance | None:
-    """Return the spring that a window's sensors at the table show; None without any, or where none is surely seen.
+    """Estimate the spring from the sensors at the table; None without a sensor or without a significant resonance.
 
-    ``parameters`` are the drive's, as the window tells them: their K / Jt makes a torque of the current. The window's
-    speed must be at the instants of its rows.
+    ``parameters`` are those identified from the window: K / Jt converts current to acceleration. The window's speed
+    must be aligned to its samples.
     """
     motor = Motor.of(window, parameters)
     if motor is None:
@@ -80,8 +80,6 @@ def compliance(window: Window, parameters: Parameters) -> Compliance | None:
 
 
 def _seen(window: Window, motor: Motor) -> tuple[Encoder | None, Accelerometer | None]:
-    """Return the sensors at the table that tell enough of the move."""
-
     def rows_of(values: Float | None) -> np.ndarray[tuple[int], np.dtype[np.bool_]] | None:
         rows = motor.rows & np.isfinite(values) if values is not None else np.zeros(1, np.bool_)
         return rows if np.count_nonzero(rows) >= max(LEAST_ROWS, WHOLE * np.count_nonzero(motor.rows)) else None
@@ -96,7 +94,6 @@ def _seen(window: Window, motor: Motor) -> tuple[Encoder | None, Accelerometer |
 
 
 def _fitted(eye: Encoder | Accelerometer, dt: float) -> tuple[Float, Float] | None:
-    """Return log w, log z and the lateness that a sensor shows, with their covariance; None without evidence."""
     late = _late(eye)
     trials = 2 * math.pi * np.geomspace(*BAND_HZ, TRIALS)
     shown = [_evidence(eye, w, DAMPING[0], late) for w in trials]
@@ -124,26 +121,25 @@ def _fitted(eye: Encoder | Accelerometer, dt: float) -> tuple[Float, Float] | No
 
 
 def _late(eye: Encoder | Accelerometer) -> float:
-    """Return by how much a sensor is late, as a stiff screw would show it, s."""
+    """Return the lag of a sensor, s, found with a stiff screw."""
     tried = np.linspace(-2.0, 6.0, 17) * 1e-3 if isinstance(eye, Accelerometer) else np.zeros(1)
     return float(min(tried, key=lambda late: float(np.square(eye.stiff(late)).sum())))
 
 
 def _evidence(eye: Encoder | Accelerometer, w: float, z: float, late_s: float) -> float:
-    """Return by how much a spring raises twice the log likelihood, of rows of their own: both in the same noise."""
+    """Return the rise of twice the log likelihood by a spring, counted in independent samples and with equal noise."""
     sprung, stiff = eye.follows(w, z, late_s), eye.stiff(late_s, eye.power(w, z))
     return _own(sprung) * math.log(max(float(stiff @ stiff), NIL) / max(float(sprung @ sprung), NIL))
 
 
 def _own(rest: Float) -> float:
-    """Return how many rows of their own (m,) rows are worth that are alike from one to the next."""
+    """Return the number of independent samples among residuals (m,), from their correlation at lag 1."""
     power = float(rest @ rest)
     alike = max(0.0, float(rest[1:] @ rest[:-1]) / power) if power else 0.0
     return rest.size * (1.0 - alike) / (1.0 + alike)
 
 
 def _share(unexplained: Callable[[float], Float], dt: float) -> tuple[float, float]:
-    """Return the table's share of the inertia and its standard deviation."""
     tried = np.linspace(0.2, 0.8, 7)
     parts = [unexplained(q) for q in tried]
     costs = [float(e @ e) for e in parts]
@@ -159,7 +155,6 @@ def _share(unexplained: Callable[[float], Float], dt: float) -> tuple[float, flo
 
 
 def _told(w: float, z: float, q: float, std: float, spread: Float, late_s: float, *, held: bool) -> Compliance:
-    """Return what is known with its chance and doubts; ``held``: w and z are those with the motor held."""
     free = 1.0 / math.sqrt(1.0 - q) if held else 1.0
     hertz, damping = w * free / (2 * math.pi), z * free
     lever = np.diag([hertz, damping, 1.0])
@@ -174,7 +169,7 @@ def _told(w: float, z: float, q: float, std: float, spread: Float, late_s: float
 
 
 def _least(unexplained: Left, start: Float, steps: Float) -> tuple[Float, Float, Float]:
-    """Return where the squares are least (Levenberg, Marquardt), what is left there (m,), and its slopes (m, k)."""
+    """Minimise the squares (Levenberg, Marquardt); return the values (k,), residuals (m,) and their slopes (m, k)."""
     values, rest, damped = start, unexplained(start), 1e-3
     slopes = _slopes(unexplained, values, steps)
     for _ in range(STEPS):
@@ -195,7 +190,6 @@ def _least(unexplained: Left, start: Float, steps: Float) -> tuple[Float, Float,
 
 
 def _slopes(unexplained: Left, x: Float, steps: Float) -> Float:
-    """Return the derivatives (m, k) by differences."""
     columns = []
     for k, step in enumerate(steps):
         up, down = x.copy(), x.copy()
@@ -205,7 +199,9 @@ def _slopes(unexplained: Left, x: Float, steps: Float) -> Float:
 
 
 def _spread(slopes: Float, rest: Float, size: int, reach: int) -> Float:
-    """Return the covariance of least squares whose ``size`` first rows are alike over ``reach`` (Newey, West 1987)."""
+    """Return the covariance of least squares whose ``size`` first residuals correlate over ``reach`` (Newey, West
+    1987).
+    """
     bread = np.linalg.inv(slopes.T @ slopes)
     scores = slopes * rest[:, None]
     part, own = scores[:size], slopes[size:]  # what was expected counts with its own deviation
@@ -217,7 +213,9 @@ def _spread(slopes: Float, rest: Float, size: int, reach: int) -> Float:
 
 
 def joined(estimate: Estimate, found: Compliance) -> Estimate:
-    """Return the estimate with the resonance that the table's sensors show; it replaces one from the motor's side."""
+    """Return the estimate with the resonance from the table's sensors; it replaces one identified from the motor's
+    side.
+    """
     kept = [k for k, name in enumerate(estimate.names) if name not in TERMS]
     before = np.zeros((len(estimate.names), 0))
     if estimate.systematic is not None:  # told of the first names
@@ -232,13 +230,12 @@ def joined(estimate: Estimate, found: Compliance) -> Estimate:
 
 
 def _apart(one: Float, other: Float) -> Float:
-    """Return both blocks in one matrix that have nothing to do with each other."""
     below, beside = np.zeros((len(other), one.shape[1])), np.zeros((len(one), other.shape[1]))
     return np.block([[one, beside], [below, other]])
 
 
 def beside_the_config(found: Compliance, axis: Axis | None) -> list[Reason]:
-    """Return the warning of a table that surely swings at another frequency than the one in use."""
+    """Return a warning where the table's resonance differs significantly from the one in use."""
     if axis is None or axis.resonance_hz is None:
         return []
     hertz, half = float(found.values[0]), INTERVAL_95 * math.sqrt(found.covariance[0, 0])

@@ -1,4 +1,4 @@
-"""Finds the delay of the voltage against current and speed: whole rows from [1], less from innovations."""
+"""Estimates the delay of the voltage against current and speed: whole samples from [1], fractions from innovations."""
 
 from __future__ import annotations
 
@@ -24,10 +24,11 @@ CHANCE = 2.0  # standard deviations of a delay that are chance, not doubt
 
 
 def coarse_delay(signals: Signals, dt_s: float) -> float:
-    """Return by how many seconds, in whole samples, the voltage is late (early: negative); 0 unless it surely is.
+    """Return the delay of the voltage in s, in whole samples (negative: early); 0 unless it is significant.
 
-    [5], with what an inverter's dead time takes, is fitted with the voltage moved by each number of samples; the best
-    fit tells. Up to ``MOST_DELAY`` a delay is the business of the maximum-likelihood fit: other things resemble it.
+    [5], with a term for the inverter's dead time, is fitted with the voltage shifted by each number of samples; the
+    best fit wins. Delays up to ``MOST_DELAY`` are left to the maximum-likelihood fit, because other effects resemble
+    them.
     """
     reach = min(max(3, round(SPAN_S / dt_s)), signals.speed.size // 8)
     slope = derivative(signals.current, dt_s)
@@ -50,7 +51,7 @@ def coarse_delay(signals: Signals, dt_s: float) -> float:
 
 
 def delay_score(plain: Fit) -> tuple[float, float]:
-    """Return the delay (s) that one Newton step from a fit without delay would add, and its standard deviation."""
+    """Return the delay (s) that one Newton step would add to a fit without delay, and its standard deviation."""
     d = delay_direction(plain)
     rest = d - plain.but_delay @ solve(plain.but_delay, d)[0]
     weight = float(rest @ rest)
@@ -68,8 +69,9 @@ def delay_direction(result: Fit) -> Float:
 def with_delay_doubt(made: Fit) -> Fit:
     """Return the fit with its doubt about a delay of the voltage.
 
-    Regulators act several times within a row, which looks like a delay of a few per cent of it, but moves L
-    otherwise. So a small delay is not taken out: what it would change is a doubt, and so it is about a larger one.
+    Regulators act several times within a sample. That resembles a delay of a few per cent of it, but shifts L
+    differently. A small delay is therefore not corrected: its effect counts as a doubt, and likewise the uncertainty of
+    a larger one.
     """
     if DELAY in made.free:
         return replace(made, delay_doubt_s=LEAST_DELAY / 2 * min(m.dt_s for m in made.problem.motions))

@@ -1,7 +1,7 @@
-"""Finds by how many whole cycles a recorded set-point is ahead of the one that the drive follows.
+"""Estimates by how many whole cycles a recorded set-point leads the one that the drive follows.
 
-What an NC's trace shows is its own set-point, some cycles before the drive's. Taken for the drive's, it gives wrong
-gains and filters that are not there.
+An NC's trace shows the NC's own set-point, some cycles before the drive's. Taken for the drive's, it yields wrong gains
+and filters that do not exist.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ LEAST_ROWS, SAME_GRID = 50, 1e-3
 
 
 def with_demand_on_time(window: Window, axis: Axis | None, sync_period_s: float | None) -> tuple[Window, int]:
-    """Return the window with the demand that the drive follows, and by how many cycles the recorded one is ahead.
+    """Return the window with the demand that the drive follows, and the lead of the recorded one in cycles.
 
-    The closed loop of the ``axis``' section tells it; the window itself and 0 where there is no lead.
+    The lead is estimated with the closed loop of the ``axis``' section; without a lead the window is returned with 0.
     """
     if axis is None or axis.regulators.speed_feedforward < LEAST_FEEDFORWARD:
         return window, 0
@@ -41,7 +41,7 @@ def with_demand_on_time(window: Window, axis: Axis | None, sync_period_s: float 
 
 
 def _lead(window: Window, axis: Axis, sync_period_s: float | None) -> tuple[float, float]:
-    """Return by how many cycles the demand is ahead, and the RMS (mm) that the closed loop leaves; 0 where unknown."""
+    """Return the lead of the demand in cycles and the RMS residual (mm) of the closed loop; 0 where unknown."""
     known = np.isfinite(window.demand_mm) & np.isfinite(window.position_mm)
     off_grid = abs((sync_period_s or window.dt_s) / window.dt_s - 1.0) > SAME_GRID
     if off_grid or np.count_nonzero(known) < LEAST_ROWS or not np.ptp(window.demand_mm[known]) > 0.0:

@@ -14,7 +14,7 @@ _ROOT = math.sqrt(73.0)
 
 @dataclass(frozen=True, slots=True)
 class Operator:
-    """A derivative stencil: ``offsets`` in samples (rising) and ``weights``, before division by the sampling period."""
+    """A derivative stencil: ascending ``offsets`` in samples, and ``weights`` before division by the period."""
 
     name: str
     offsets: tuple[int, ...]
@@ -22,12 +22,12 @@ class Operator:
 
     @property
     def before(self) -> int:
-        """Rows that the stencil needs before its own."""
+        """Samples needed before the current one."""
         return max(0, -self.offsets[0])
 
     @property
     def after(self) -> int:
-        """Rows that the stencil needs after its own."""
+        """Samples needed after the current one."""
         return max(0, self.offsets[-1])
 
 

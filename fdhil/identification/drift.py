@@ -1,9 +1,8 @@
-"""Follows the parameters from rapid to rapid: jumps held back, a changed load, maintenance alarms.
+"""Tracks the parameters from rapid to rapid: holds back jumps, reports a changed load, raises maintenance alarms.
 
-One rapid tells the friction of its own direction, with a constant load in it: friction is compared in either direction
-by itself.
+One rapid yields the friction of its own direction, including a constant load; friction is compared per direction.
 
-Pure: the same estimates in the same order give the same notices. Nothing here reads a clock.
+Pure: the same estimates in the same order give the same notices, without a clock.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ class Point:
 
 @dataclass(slots=True)
 class DriftTracker:
-    """The history of one axis' parameters: says what an operator should know after each validated window or pool."""
+    """The parameter history of one axis; turns each validated window or pool into notices for the operator."""
 
     maintenance: Maintenance
     axis: str = ""
@@ -53,10 +52,11 @@ class DriftTracker:
     _held: list[Point] = field(default_factory=list)
 
     def update(self, values: Parameters, covariance: Float, tick: int = 0, direction: int = 1) -> list[Notice]:
-        """Take a validated estimate of a move in a ``direction``, with its covariance; return what is to be said.
+        """Add a validated estimate of a move in one ``direction`` with its covariance; return the notices.
 
-        ``ParameterJump`` holds the estimate back for ``HELD_EPISODES`` further ones; a step of Jt alone is
-        ``LoadChanged``: the correction must be withdrawn at once, and the new Jt is used from the second agreeing one.
+        ``ParameterJump`` holds the estimate back for ``HELD_EPISODES`` further ones. A step of Jt alone is
+        ``LoadChanged``: the correction must be withdrawn at once, and the new Jt is used after the second estimate that
+        agrees.
         """
         stds = np.sqrt(np.clip(np.diag(covariance)[: len(PARAMETERS)], 0.0, None))
         point = Point(np.array(list(values.as_dict().values())), stds, tick, direction)
@@ -69,9 +69,9 @@ class DriftTracker:
         return self._hold(point, moved)
 
     def resume(self, first: Mapping[int, Parameters], points: Iterable[Point]) -> None:
-        """Go on where an earlier run left off: an alarm that its ``points`` raised is not raised again.
+        """Continue after a restart without repeating alarms that the stored ``points`` had raised.
 
-        ``first`` are the first values in either direction, against which changes count.
+        ``first`` are the first values of either direction, the reference for changes.
         """
         self.references = dict(first)
         for point in points:
@@ -81,17 +81,16 @@ class DriftTracker:
 
     @property
     def holding(self) -> bool:
-        """Return whether the newest estimate is held back: it must not be used yet."""
+        """Whether the newest estimate is held back and must not be used yet."""
         return bool(self._held)
 
     def _recent(self, direction: int) -> list[list[Point]]:
-        """Return for each parameter the points that a new one is compared with: of friction those of its direction."""
         points = list(self.points)
         same = [point for point in points if point.direction == direction][-RECENT:]
         return [same if name in FRICTION else points[-RECENT:] for name in PARAMETERS]
 
     def _moved(self, point: Point) -> list[str]:
-        """Return the parameters that lie beyond chance and drift from the recent history (median and MAD)."""
+        """Return the parameters that differ from the recent history by more than chance and drift (median and MAD)."""
         moved = []
         for k, (name, recent) in enumerate(zip(PARAMETERS, self._recent(point.direction), strict=True)):
             if len(recent) < LEAST_HISTORY:
@@ -137,7 +136,8 @@ class DriftTracker:
     def _alarms(self, point: Point) -> list[Notice]:
         """Return maintenance alarms that begin or end: relative change from the first value, with hysteresis.
 
-        One sure window begins an alarm; it takes the mean of the newest, surely below ``RELEASE``, to end it.
+        One significant window raises an alarm; it is cleared when the mean of the newest is significantly below
+        ``RELEASE``.
         """
         notices = []
         for k, (name, first) in enumerate(self.references[point.direction].as_dict().items()):
@@ -167,6 +167,5 @@ class DriftTracker:
         return abs(float(np.mean(shares)) - 1) + doubt < RELEASE * limit
 
     def _measured(self, point: Point, k: int) -> bool:
-        """Return whether a point's parameter has a first value that it may be measured against."""
         first = self.references.get(point.direction)
         return first is not None and bool(list(first.as_dict().values())[k])

@@ -1,4 +1,4 @@
-"""Runs a rapid through the closed loop once more, from its recorded demand alone, and tells what is left of it."""
+"""Replays a rapid through the closed loop from its recorded demand."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ ROUNDED = 0.7  # of a step: half of one, and what the neighbours' rounding adds 
 
 @dataclass(frozen=True, slots=True)
 class Rapid:
-    """One rapid on its grid, rows (n,) of its window from ``first`` on: what the drive was asked for, and what it did.
+    """One rapid, samples (n,) of its window from ``first`` on: the drive's demand and its response.
 
-    ``known`` marks whole rows; the axis stood at ``standstill_mm``, held by ``standstill_a``, or crept on at
+    ``known`` marks complete samples; the axis stood at ``standstill_mm``, held by ``standstill_a``, or still moved at
     ``creep_mm_s`` from the move before. ``load_nm`` (n,) is the torque that ``plant`` does not explain.
     """
 
@@ -60,9 +60,9 @@ class Rapid:
 
 
 def rapid_of(window: Window, plant: Parameters, sync_period_s: float | None = None) -> Rapid | None:
-    """Return the rapid of a window, moved by ``plant``; None where demand, position and current are not all told.
+    """Return the rapid of a window, moved by ``plant``; None without demand, position or current.
 
-    Set-points come every ``sync_period_s`` (left out: with every row); of rows that come more often only theirs count.
+    Set-points come every ``sync_period_s`` (default: every sample); samples between set-points are left out.
     """
     window = _on_the_grid(window, sync_period_s)
     known = np.isfinite(window.demand_mm) & np.isfinite(window.position_mm) & np.isfinite(window.current_a)
@@ -97,13 +97,12 @@ def rapid_of(window: Window, plant: Parameters, sync_period_s: float | None = No
 
 
 def _held(current_a: Float, row: int) -> float:
-    """Return the current that is held at a row: held by friction beside its place, an axis pulls ever more."""
+    """Return the holding current at a sample: an axis held by friction off its target integrates ever more current."""
     rows = np.arange(current_a.size)
     return float(np.polyval(np.polyfit(rows, current_a, 1), row)) if rows.size > LEAD_ROWS else float(current_a.mean())
 
 
 def _on_the_grid(window: Window, sync_period_s: float | None) -> Window:
-    """Return the window with the rows at which set-points came; a recording begins with one of them."""
     every = 1 if sync_period_s is None else round(sync_period_s / window.dt_s)
     if every <= 1:
         return window
@@ -119,11 +118,10 @@ def _on_the_grid(window: Window, sync_period_s: float | None) -> Window:
 
 
 def _load(position_mm: Float, current_a: Float, plant: Parameters, window: Window) -> Float:
-    """Return the torque (n,) that a plant of six parameters does not explain, low-passed; held where it stands.
+    """Return the low-passed torque (n,) that a plant of six parameters does not explain; held at standstill.
 
-    Friction that is not as modelled, a load, ripples: whatever it is, the loops answer it, and it must not end in their
-    gains. Current and motion tell it without them. All of it goes through the same low-pass, whose second differences
-    of the position are exact.
+    Unmodelled friction, a load, ripples: the loops respond to them, and they must not bias the gains. All signals pass
+    the same low-pass, so that second differences of the position are exact.
     """
     width = max(1, round(LOW_PASS_S / window.dt_s)) | 1
     rad_per_mm = 2 * math.pi / window.pitch_mm
@@ -141,7 +139,6 @@ def _load(position_mm: Float, current_a: Float, plant: Parameters, window: Windo
 
 
 def _creep(position_mm: Float, dt_s: float, least_mm: float) -> float:
-    """Return the speed (mm/s) of an axis that has not come to rest yet; 0 where it stands."""
     rows = position_mm.size
     if rows < 3 or abs(position_mm[-1] - position_mm[0]) < least_mm:
         return 0.0
@@ -149,10 +146,11 @@ def _creep(position_mm: Float, dt_s: float, least_mm: float) -> float:
 
 
 def smoothed(demand_mm: Float) -> Float:
-    """Return the smoothest course (n,) that rounds to a recorded demand: what an NC plans is smooth, and finer.
+    """Return the smoothest signal (n,) that rounds to a recorded demand, since the NC plans more finely than it
+    records.
 
-    Rounded to 1 um at 1 kHz a demand asks for jumps of the speed by 1 mm/s, which the drive never saw. The squares of
-    the third differences are weighed against the way from the record (Whittaker 1923), as far as rounding allows.
+    Rounded to 1 um at 1 kHz a demand has speed jumps of 1 mm/s that the drive never received. Squared third differences
+    are penalised (Whittaker 1923) as far as rounding allows.
     """
     steps = np.abs(np.diff(demand_mm))
     steps = steps[steps > NIL_MM]
@@ -168,7 +166,7 @@ def smoothed(demand_mm: Float) -> Float:
 
 
 def _whittaker(values: Float, weight: float) -> Float:
-    """Return the course (n,) with the least squared way from ``values`` + ``weight`` x squared third differences."""
+    """Return the signal (n,) that minimises squared distance from ``values`` + ``weight`` x squared third differences."""
     from scipy.linalg import solveh_banded  # late: loops are rarely sought, and it is slow to import
 
     n, third = values.size, np.array([-1.0, 3.0, -3.0, 1.0])
@@ -181,9 +179,9 @@ def _whittaker(values: Float, weight: float) -> Float:
 
 
 def replay(rapid: Rapid, axis: Axis, delay_cycles: float) -> Float:
-    """Return position in mm and current in A (2, n) of the closed loop along a rapid's demand.
+    """Return the closed loop's position in mm and current in A (2, n) along a rapid's demand.
 
-    ``delay_cycles`` may lie between two whole numbers: it stands in the place of the regulators' own.
+    ``delay_cycles`` replaces the regulators' own delay and may be fractional.
     """
     whole = math.floor(delay_cycles)
     part = delay_cycles - whole
@@ -203,7 +201,7 @@ def _run(rapid: Rapid, axis: Axis, delay_cycles: int) -> Float:
 
 
 def standing(rapid: Rapid, axis: Axis) -> closed_loop.State:
-    """Return the state of an axis that stands, held by a current: what the position does not ask for is integrated."""
+    """Return the state of an axis at standstill, whose integrators supply the holding current."""
     g, rad_per_mm = axis.regulators, 2 * math.pi / axis.screw_pitch_mm
     speed = rapid.creep_mm_s * rad_per_mm
     lag = (rapid.demand_mm[0] - rapid.standstill_mm) * rad_per_mm
@@ -224,12 +222,12 @@ def standing(rapid: Rapid, axis: Axis) -> closed_loop.State:
 
 
 def with_regulators(axis: Axis, **values: float | str) -> Axis:
-    """Return an axis with other regulators, unchecked: for those who try many."""
+    """Return an axis with other regulators, without validation."""
     return axis.model_copy(update={"regulators": axis.regulators.model_copy(update=values)})
 
 
 def fitting_periods(regulators: Regulators, dt_s: float) -> dict[str, float]:
-    """Return the cycles of speed and current loop that divide a row: the configured ones where they do."""
+    """Return the configured periods of speed and current loop, adjusted to divide a sample."""
     speed = dt_s / max(1, round(dt_s / regulators.speed_period_s))
     current = speed / max(1, round(speed / regulators.current_period_s))
     return {"speed_period_s": speed, "current_period_s": current}

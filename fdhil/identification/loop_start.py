@@ -1,7 +1,7 @@
-"""Where the search for a drive's loops begins when no configuration tells, or when it leads astray: a coarse grid.
+"""Starts the search for a drive's loops without a usable configuration: a coarse grid.
 
-Of a cascade that is well set up, each loop is slower than the one inside it by a factor of a few. So the corner of the
-speed loop and two such factors span what drives are, and the lag at constant speed tells the feed-forward.
+In a well-tuned cascade each loop is slower than its inner loop by a factor of a few. The corner of the speed loop and
+two such factors span the drives, and the lag at constant speed determines the feed-forward.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ NO_LIMIT = 1e5
 
 
 def begun_anew(problem: Problem) -> Problem:
-    """Return the problem begun at the best cascade of the grid, judged by the longest rapid; limits and cycles stay."""
+    """Return the problem started at the best cascade of the grid, judged by the longest rapid; limits and cycles are
+    kept.
+    """
     longest = int(np.argmax([np.ptp(one.demand_mm) for one in problem.rapids]))
     rapid = problem.rapids[longest]
     plant = rapid.plant
@@ -54,7 +56,7 @@ def begun_anew(problem: Problem) -> Problem:
 
 
 def _feedforward(rapid: Rapid, gain: float) -> float:
-    """Return the share that is fed forward: at constant speed v the lag is v (1 - share) / Kv."""
+    """Return the feed-forward share: at constant speed v the lag is v (1 - share) / Kv."""
     speed = np.gradient(rapid.demand_mm, rapid.dt_s)
     steady = np.abs(speed) > 0.95 * np.abs(speed).max()
     share = 1.0 - gain * float(np.median(rapid.lag_mm[steady] / speed[steady]))
@@ -62,7 +64,9 @@ def _feedforward(rapid: Rapid, gain: float) -> float:
 
 
 def made_up_axis(window: Window, rapid: Rapid) -> Axis:
-    """Return an axis of which only a recording is known: a fast current loop, no limits, cycles that divide a row."""
+    """Return an axis for a recording without configuration: a fast current loop, no limits, cycles that divide a
+    sample.
+    """
     plant, current = rapid.plant, 2 * math.pi * CURRENT_CORNER_HZ
     regulators = Regulators(
         position_gain_per_s=1.0,

@@ -1,10 +1,9 @@
-"""Identifies a drive's own loops from its rapids: gains, feed-forward, filters, computing delay, structure.
+"""Identifies a drive's loops from its rapids: gains, feed-forward, filters, computing delay, structure.
 
-The four gains every cascade has are fitted first. What else a drive may have joins one key at a time, the likeliest of
-all first, as long as it explains a tenth of the tolerance at the table, or of what is left: over hundreds of
-rows no chance does either. The other structures of the table are tried against the cascade by the same measure. With
-full feed-forward and no filter, a cascade answers the same when position_gain_per_s and speed_ki / speed_kp change
-places: of the two the one nearer to where the fit began is told.
+The four gains of a cascade are fitted first. Further keys are added one at a time, the likeliest first, while each
+explains a tenth of the tolerance at the table or of the residual: over hundreds of samples chance does neither. Other
+structures compete with the cascade by the same measure. With full feed-forward and no filter, exchanging
+position_gain_per_s and speed_ki / speed_kp changes nothing: the one nearer to the start is reported.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ FILTERS = (("speed_filter_s", "setpoint_filter_s"),)  # they hide each other: ne
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One key of the regulators as configured and as found; ``apart`` where chance does not explain the difference."""
+    """One key of the regulators as configured and as identified."""
 
     key: str
     configured: float
@@ -48,7 +47,7 @@ class Difference:
 
     @property
     def apart(self) -> bool:
-        """Whether the configured value lies outside the 95 % interval of what was found."""
+        """Whether the configured value lies outside the 95 % interval of the identified one."""
         return abs(self.found - self.configured) > INTERVAL_95 * self.std
 
 
@@ -61,11 +60,11 @@ def identify_loops(
     *,
     growing: bool = True,
 ) -> LoopEstimate | None:
-    """Return the loops of the drive whose rapids these are; None where no window tells demand, position and current.
+    """Return the loops of the drive that made the rapids; None where no window has demand, position and current.
 
-    ``mechanics`` are what each window's estimate says of the motor and what it moves, ``axis`` the machine's section:
-    without it the search begins from the demand alone. Set-points come every ``sync_period_s`` (left out: each row).
-    Without ``growing`` the keys that are configured are found anew, and no others are tried: that takes no time.
+    ``mechanics`` are the parameters identified from each window, ``axis`` is the machine's section; without it the
+    search starts from the demand alone. Set-points come every ``sync_period_s`` (default: every sample). Without
+    ``growing`` only the configured keys are fitted, which is fast.
     """
     if axis is not None and axis.regulators.structure == "linuxcnc_pid":
         return None  # its gains are those of the HAL files, and no other structure stands in for it
@@ -90,10 +89,11 @@ def identify_loops(
 
 
 def _of_either(problem: Problem, modelled: tuple[Rapid, ...], tolerance_um: float, configured: bool) -> Fit:
-    """Return the best fit with what the model lacks as a load, or without: sought again where the other is better.
+    """Return the best fit with or without unexplained torque as a load; the search is repeated where the other is
+    better.
 
-    A model that has all that is there is better without what noise makes of the rest. Sought is with one rapid of
-    either direction, fitted with all.
+    A complete model fits better without the noise in that torque. The search uses one rapid of either direction, the
+    final fit uses all.
     """
     few = _both_ways(problem.rapids)
     kinds = [problem.rapids, modelled]
@@ -110,18 +110,15 @@ def _of_either(problem: Problem, modelled: tuple[Rapid, ...], tolerance_um: floa
 
 
 def _both_ways(rapids: Sequence[Rapid]) -> list[int]:
-    """Return the newest rapid, and the newest of the other direction where there is one."""
     ways = [float(np.sign(rapid.demand_mm[-1] - rapid.demand_mm[0])) for rapid in rapids]
     return [j for side in (-1.0, 1.0) for j in [k for k, way in enumerate(ways) if way == side][-1:]] or [0]
 
 
 def _left_um(problem: Problem) -> float:
-    """Return what the regulators that the search begins with leave of the position."""
     return float(loop_fit.spread_of(problem, loop_fit.left_of(problem, problem.start())[0])[0]) * 1e3
 
 
 def _problem(rapids: tuple[Rapid, ...], axis: Axis | None, window: Window) -> Problem:
-    """Return where the search begins: at the configured regulators, or at what the demand alone says."""
     if axis is None:
         return begun_anew(Problem(rapids, made_up_axis(window, rapids[-1]), CASCADE))
     axis = with_regulators(axis, **fitting_periods(axis.regulators, rapids[0].dt_s))
@@ -129,7 +126,6 @@ def _problem(rapids: tuple[Rapid, ...], axis: Axis | None, window: Window) -> Pr
 
 
 def _names(regulators: Regulators) -> tuple[str, ...]:
-    """Return the keys that a structure has, and the options that are configured."""
     base: tuple[str, ...] = PID if regulators.structure == "pid" else CASCADE
     if base == CASCADE and regulators.speed_ki == 0.0:
         base = CASCADE[:3]
@@ -137,7 +133,6 @@ def _names(regulators: Regulators) -> tuple[str, ...]:
 
 
 def _best(begun: Fit, tolerance_um: float, configured: bool) -> Fit:
-    """Return the best fit of all structures; another structure than that of the start must be worth it."""
     best = _grown(begun, tolerance_um)
     if configured and best.unexplained_um > tolerance_um:  # the configuration may have led astray
         best = min(best, _grown(loop_fit.fit(begun_anew(begun.problem)), tolerance_um), key=lambda f: f.unexplained_um)
@@ -152,7 +147,6 @@ def _best(begun: Fit, tolerance_um: float, configured: bool) -> Fit:
 
 
 def _grown(made: Fit, tolerance_um: float) -> Fit:
-    """Let keys join, the likeliest first, as long as it is worth it; two at once where that is worth more."""
     begun = made.problem.names
     while beyond_rounding_um(made) > enough_um(tolerance_um):
         options = [option for option in (*SINGLE_KEYS, *FILTERS) if not {*option} & {*made.problem.names}]
@@ -166,7 +160,6 @@ def _grown(made: Fit, tolerance_um: float) -> Fit:
 
 
 def _without_spare_keys(made: Fit, joined: Sequence[str], tolerance_um: float) -> Fit:
-    """Return the fit without those of several keys that joined whose part the others take."""
     for name in joined if len(joined) > 1 else ():
         problem, place = made.problem, made.problem.names.index(name)
         names = tuple(other for other in problem.names if other != name)
@@ -178,23 +171,23 @@ def _without_spare_keys(made: Fit, joined: Sequence[str], tolerance_um: float) -
 
 
 def beyond_rounding_um(made: Fit) -> float:
-    """Return what is left of the position beyond the rounding of its record."""
+    """Return the residual of the position beyond the rounding of its recording."""
     rounding = max(rapid.resolution_mm for rapid in made.problem.rapids) * 1e3
     return math.sqrt(max(made.unexplained_um**2 - rounding**2 / 12, 0.0))
 
 
 def enough_um(tolerance_um: float) -> float:
-    """Return how little may be left for nothing to be missing."""
+    """Return the residual below which the model is complete."""
     return min(NOTHING_UM, WELL * tolerance_um)
 
 
 def worth_um(made: Fit, tolerance_um: float) -> float:
-    """Return by how much another key, or another structure, must explain more than this fit does."""
+    """Return by how much another key, or another structure, must lower the residual of this fit."""
     return max(LEAST_UM, min(WORTH * tolerance_um, WORTH_LEFT * made.unexplained_um))
 
 
 def _other_structure(made: Fit) -> Problem | None:
-    """Return the other law of the table, begun where it is nearest to this one: a cascade is a PID but for a filter."""
+    """Return the other structure, started at its nearest equivalent: a cascade is a PID except for a filter."""
     problem = made.problem
     found = made.axis()
     g = found.regulators
@@ -224,7 +217,6 @@ def _other_structure(made: Fit) -> Problem | None:
 
 
 def _whole_delay(made: Fit) -> Fit:
-    """Return the fit with a whole number of cycles as delay, the rest found anew."""
     problem = made.problem
     if DELAY not in problem.names:
         return made
@@ -237,7 +229,6 @@ def _whole_delay(made: Fit) -> Fit:
 
 
 def _told(name: str, made: Fit, verdict: Verdict, configured_um: float | None) -> LoopEstimate:
-    """Return the answer in the units of the keys."""
     names = made.problem.names
     values = made.values
     slope = [KEYS[n].scale or v for n, v in values.items()]
@@ -249,7 +240,6 @@ def _told(name: str, made: Fit, verdict: Verdict, configured_um: float | None) -
 
 
 def _verdict(made: Fit, tolerance_um: float, following_um: float, configured_um: float | None) -> Verdict:
-    """Return whether the loops explain the rapids, and what the configured ones leave beyond that."""
     left = made.unexplained_um
     reasons, warnings = [], []
     if not left <= tolerance_um:
@@ -269,9 +259,9 @@ def _verdict(made: Fit, tolerance_um: float, following_um: float, configured_um:
 
 
 def better_loops(loops: LoopEstimate) -> bool:
-    """Return whether loops are believed and explain more than the configured ones, so that they are used instead.
+    """Return whether the loops are accepted and fit better than the configured ones, so that they are used instead.
 
-    What no configuration may hold is no drive's: a demand that is not what the drive follows gives such values.
+    Values that no configuration may have are rejected: they come from a demand that the drive did not follow.
     """
     differ = any(warning.code == DIFFER for warning in loops.verdict.warnings)
     return loops.verdict.accepted and differ and _may_be_configured(loops)
@@ -287,26 +277,26 @@ def _may_be_configured(loops: LoopEstimate) -> bool:
 
 
 def with_loops(axis: Axis, loops: LoopEstimate) -> Axis:
-    """Return the axis with the regulators that were identified in the place of the configured ones."""
+    """Return the axis with the identified regulators."""
     values = {**axis.regulators.model_dump(), **regulators_of(loops)}
     return axis.model_copy(update={"regulators": Regulators.model_validate(values)})
 
 
 def regulators_of(loops: LoopEstimate) -> dict[str, Any]:
-    """Return keys of ``[axis.X.regulators]`` as they were found; what a structure does not have is 0."""
+    """Return the identified keys of ``[axis.X.regulators]``; keys that the structure lacks are 0."""
     lacks = {"pid": ("speed_ki", "speed_filter_s"), "p_pi_pi": ("position_ki_per_s2",)}.get(loops.structure, ())
     found = dict(zip(loops.names, loops.values.tolist(), strict=True))
     return {"structure": loops.structure, **found, **dict.fromkeys(lacks, 0.0)}
 
 
 def changed_regulators(configured: Axis, used: Axis) -> dict[str, Any]:
-    """Return the keys of ``[axis.X.regulators]`` by which the used regulators differ from the configured ones."""
+    """Return the keys of ``[axis.X.regulators]`` whose used value differs from the configured one."""
     before = configured.regulators.model_dump()
     return {key: value for key, value in used.regulators.model_dump().items() if value != before[key]}
 
 
 def differences(axis: Axis, loops: LoopEstimate) -> list[Difference]:
-    """Return every key that was identified beside its configured value."""
+    """Return each identified key with its configured value."""
     spread = np.sqrt(np.diag(loops.covariance))
     return [
         Difference(name, float(getattr(axis.regulators, name)), float(value), float(std))

@@ -1,8 +1,8 @@
-"""Bounds what a model that is nearly right leaves open, however many samples there are.
+"""Bounds what a nearly right model leaves open, however many samples there are.
 
-Axes d and q of a motor are not quite parted, windings and magnets saturate a little, and friction is no straight line
-over speed. Where such a remainder has the shape of a parameter's own regressor, no residual shows it: it is one
-standard deviation of the parameter, the same in all windows of a drive.
+The d and q axes of a motor are not perfectly decoupled, windings and magnets saturate slightly, and friction is not
+linear in speed. A deviation shaped like a parameter's own regressor leaves no residual: it counts as one standard
+deviation of the parameter, common to all windows of a drive.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ CROSSING = 1.5  # top speed over the one at which the straight line meets the cu
 
 
 def model_doubts(result: Fit) -> Float:
-    """Return (k, 4) one standard deviation of the entries of theta for a remainder shaped as R, L, K or friction."""
+    """Return (k, 4) standard deviations of theta for unmodelled deviations shaped like R, L, K or friction."""
     theta, top = result.theta, max(float(np.abs(m.speed).max()) for m in result.problem.motions)
     doubts = np.zeros((theta.size, 4))
     for column, (entry, share) in enumerate(SHARES.items()):

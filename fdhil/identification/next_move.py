@@ -1,7 +1,7 @@
-"""Predicts which further move narrows the intervals of an estimate most: by the information of [1] and [2].
+"""Predicts which further move narrows the intervals of an estimate most, by the information of [1] and [2].
 
-Each row of a move adds the information of its regressors, divided by the variance that the sensors' noise gives to the
-equation ([LJU] ch. 13). Moves are simulated with the estimated model, within the voltage of the recording.
+Each sample adds the information of its regressors, divided by the variance of the equation due to sensor noise ([LJU]
+ch. 13). Moves are simulated with the estimated model, within the voltage of the recording.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ MOVES: Mapping[str, Callable[[Float], Float]] = {  # share (n,) of the voltage o
 
 @dataclass(frozen=True)
 class NextMove:
-    """A further move: the least share of its present interval that it leaves to each parameter."""
+    """A further move, and the share of the present interval that remains at least for each parameter."""
 
     name: str
     shares: Mapping[str, float]
 
 
 def predict_next_moves(window: Window, estimate: Estimate) -> list[NextMove]:
-    """Return for each move, as long as the window, what it leaves of the intervals, the same recording again first.
+    """Return for each move, as long as the window, the remaining intervals; the same recording again comes first.
 
-    What the sensors' noise does not explain of the intervals of the ``estimate`` stays, whatever is recorded.
+    The part of the intervals that sensor noise does not explain remains in any case.
     """
     if window.voltage_v is None:
         return []

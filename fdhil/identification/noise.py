@@ -1,4 +1,4 @@
-"""Tells the noise levels of voltage, current and speed, for given parameters, by the likelihood of the innovations."""
+"""Fits the noise levels of voltage, current and speed for given parameters, by the likelihood of the innovations."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ ENOUGH = 0.15  # what such a step leaves is less than the data can tell
 
 
 def fit_noise(motion: Motion, theta: Float, start: Noise) -> Noise:
-    """Return the noise levels that make the innovations most likely, by Newton steps on their logarithms.
-
-    ``theta`` (7,) is [R, L, K, Jt, ft, Cd, delay].
+    """Return the most likely noise levels, by Newton steps on their logarithms. ``theta`` (7,) is [R, L, K, Jt, ft, Cd,
+    delay].
     """
     lower = np.log(motion.noise.vector()) + np.log(motion.noise_floor)
     x = np.log(start.vector())
@@ -50,7 +49,6 @@ def fit_noise(motion: Motion, theta: Float, start: Noise) -> Noise:
 
 
 def _differences(costs: Callable[[Float], Float], x: Float, here: float) -> tuple[Float, Float]:
-    """Return gradient (3,) and diagonal curvature (3,) by central differences."""
     steps = STEP * np.eye(3)
     around = costs(np.concatenate([x + steps, x - steps]))
     high, low = around[:3], around[3:]

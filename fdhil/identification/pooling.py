@@ -1,8 +1,7 @@
-"""Combines the estimates of several windows of one drive, and tells how far two of them may lie apart by chance.
+"""Pools the estimates of several windows of one drive, and computes how far two of them may differ by chance.
 
-A small mixed model: what is common to all windows is estimated by generalised least squares, with what differs between
-them (:mod:`fdhil.identification.between`) in the covariance. Moves in both directions tell a constant load from dry
-friction, and viscous friction by direction.
+A small mixed model: common values are estimated by generalised least squares, with the variance between windows in the
+covariance. Moves in both directions separate a constant load from dry friction, and viscous friction by direction.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ BY_DIRECTION = {"load": "Cd", "viscous": "ft"}  # what the direction changes, an
 
 
 def member(window: Window, estimate: Estimate, place: int = 0) -> Member:
-    """Return what a window tells, ready to be pooled: its own chance apart from the doubts that all windows share."""
+    """Return a window's estimate ready to be pooled: own covariance separated from the doubts that all windows share."""
     own, systematic, alias = _parts(window, estimate)
     told = np.isfinite(estimate.values) & np.isfinite(np.diag(estimate.covariance))
     kept = [k for k, name in enumerate(estimate.names) if told[k] and name not in estimate.given]
@@ -39,10 +38,10 @@ def member(window: Window, estimate: Estimate, place: int = 0) -> Member:
 
 
 def pooled(members: Sequence[Member], first: Estimate, apart: Between, *, joining: bool = True) -> Estimate:
-    """Return what windows, given in order, tell together of the drive as it is at the newest of them.
+    """Pool the estimates of windows given in order, as of the newest of them.
 
-    ``apart`` is what differs between them. With ``joining`` a load, and viscous friction by direction, join where the
-    windows surely tell them. Method, and what no window tells, are those of ``first``.
+    ``apart`` is the variance between windows. With ``joining`` a load, and viscous friction by direction, are added
+    where significant. Method, and parameters that no window determines, are those of ``first``.
     """
     names = _common(members)
     joined: list[str] = []
@@ -63,9 +62,9 @@ def pooled(members: Sequence[Member], first: Estimate, apart: Between, *, joinin
 
 
 def _is_beyond_all(answer: _Solution, told: _Stack) -> bool:
-    """Return whether R, L, K or Jt lies outside of what all windows tell.
+    """Return whether R, L, K or Jt lies outside the range of all windows.
 
-    Doubts that tie parameters together more than windows agree drive a common value away from each of them.
+    Shared doubts that tie parameters together more than windows agree move the common value away from each of them.
     """
     for k, name in enumerate(told.names):
         if name in ("R", "L", "K", "Jt"):
@@ -76,7 +75,6 @@ def _is_beyond_all(answer: _Solution, told: _Stack) -> bool:
 
 
 def _common(members: Sequence[Member]) -> tuple[str, ...]:
-    """Return the parameters that any window tells, and the terms that at least half of the windows have."""
     seen = dict.fromkeys(name for m in members for name in m.names)
     known = [name for name in PARAMETERS if name in seen]
     terms = [name for name in seen if name not in PARAMETERS and 2 * sum(name in m.names for m in members)
@@ -85,26 +83,23 @@ def _common(members: Sequence[Member]) -> tuple[str, ...]:
 
 
 def _open(members: Sequence[Member], names: Sequence[str], joined: Sequence[str]) -> list[str]:
-    """Return the terms by direction that may still join: there must be moves in both."""
     both = len({m.direction for m in members}) == 2
     return [term for term, of in BY_DIRECTION.items() if both and of in names and term not in joined]
 
 
 @dataclass(frozen=True, slots=True)
 class _Solution:
-    """Common ``values`` (k,) with their chance (k, k) and the doubts (k, q) that the windows share."""
+    """Common ``values`` (k,) with their covariance ``chance`` (k, k) and the doubts (k, q) that the windows share."""
 
     values: Float
     chance: Float
     doubts: Float
 
     def surety(self) -> float:
-        """Return how many standard deviations the last value lies from 0."""
         return abs(float(self.values[-1])) / float(np.sqrt(self.chance[-1, -1]))
 
 
 def _solved(told: _Stack, joined: Sequence[str]) -> _Solution:
-    """Return the generalised least squares of what the windows tell, by the stack's names and the terms ``joined``."""
     of = [told.names.index(BY_DIRECTION[term]) for term in joined]
     columns = np.equal.outer(told.which, np.arange(len(told.names))).astype(np.float64)
     columns = np.column_stack([columns, *(np.where(told.which == k, told.side, 0.0) for k in of)])
@@ -117,10 +112,10 @@ def _solved(told: _Stack, joined: Sequence[str]) -> _Solution:
 
 @dataclass(frozen=True, slots=True)
 class _Stack:
-    """What all windows tell, one value a row (m,): ``which`` of the ``names`` it is and the ``side`` that was moved to.
+    """All windows' values stacked (m,): ``which`` of the ``names`` each is, and the ``side`` it was moved to.
 
-    ``weight`` (m, m) is the inverse of the rows' covariance about what the drive is at the newest window, in units (k,)
-    of the names; ``shared`` (m, q) are the doubts that the windows share.
+    ``weight`` (m, m) is the inverse covariance relative to the newest window, in units (k,) of the names; ``shared``
+    (m, q) are the doubts that the windows share.
     """
 
     names: tuple[str, ...]
@@ -133,7 +128,6 @@ class _Stack:
 
     @classmethod
     def of(cls, members: Sequence[Member], names: tuple[str, ...], apart: Between) -> _Stack:
-        """Return the rows of all members that have one of the names."""
         kept = [[k for k, name in enumerate(m.names) if name in names] for m in members]
         which = np.array([names.index(m.names[k]) for m, own in zip(members, kept, strict=True) for k in own])
         values = np.concatenate([m.values[own] for m, own in zip(members, kept, strict=True)])
@@ -157,7 +151,7 @@ class _Stack:
 def _between(
     members: Sequence[Member], kept: Sequence[Sequence[int]], which: Int, names: Sequence[str], apart: Between
 ) -> Float:
-    """Return the covariance (m, m) that windows have because they differ, about what the drive is at the newest."""
+    """Return the covariance (m, m) due to variation between windows, relative to the newest."""
     place = np.repeat([float(m.place) for m in members], [len(own) for own in kept])
     back = place.max() - place
     walk, scatter = (
@@ -171,7 +165,6 @@ def _between(
 
 
 def _estimate(found: _Solution, names: Sequence[str], joined: Sequence[str], first: Estimate) -> Estimate:
-    """Return the solution as an estimate: parameters that no window tells stay open, given ones stay as given."""
     listed = (*PARAMETERS, *(name for name in names if name not in PARAMETERS), *_told_terms(joined))
     values, total, doubts = as_amplitude((*names, *joined), found.values, found.chance, found.doubts)
     known = {name: k for k, name in enumerate((*names, *joined))}
@@ -200,22 +193,20 @@ def _estimate(found: _Solution, names: Sequence[str], joined: Sequence[str], fir
 
 
 def _told_terms(joined: Sequence[str]) -> tuple[str, ...]:
-    """Return the names under which terms by direction are told."""
     sides = ("viscous_positive", "viscous_negative") if "viscous" in joined else ()
     return (*(("load",) if "load" in joined else ()), *sides)
 
 
 def _made_of(name: str) -> dict[str, float]:
-    """Return of what solved values, and by which shares, a told value is made."""
     sides = {"viscous_positive": 1.0, "viscous_negative": -1.0}
     return {"ft": 1.0, "viscous": sides[name]} if name in sides else {name: 1.0}
 
 
 def friction_at(estimate: Estimate, speed_rad_s: float) -> tuple[float, float] | None:
-    """Return the friction torque Cd + ft w at a speed, and its standard deviation (N.m); None where it is not known.
+    """Return the friction torque Cd + ft w at a speed and its standard deviation (N.m); None where it is unknown.
 
-    At one speed ft and Cd trade, each with a wide interval: this sum is what is known, and what trends follow. Of a
-    single window it holds the load of its direction.
+    At one speed ft and Cd compensate each other, each with a wide interval: their sum is well determined, and trends
+    follow it. From a single window it includes the load of its direction.
     """
     if not {"ft", "Cd"} <= set(estimate.names):
         return None
@@ -227,10 +218,10 @@ def friction_at(estimate: Estimate, speed_rad_s: float) -> tuple[float, float] |
 
 
 def difference_covariance(one: tuple[Window, Estimate], other: tuple[Window, Estimate]) -> Float:
-    """Return the covariance (6, 6) of the difference between what two windows of one drive tell.
+    """Return the covariance (6, 6) of the difference between the estimates of two windows of one drive.
 
-    What is not known of the voltage's course within its samples is the regulators' doing and the same in both: with s
-    and t what it does to either estimate, it moves their difference by s - t only, and hides no change of the drive.
+    The voltage's unknown waveform within its samples depends on the regulators and is the same in both: with its
+    effects s and t on the two estimates, their difference moves by s - t only, and hides no change of the drive.
     """
     (own, systematic, alias), (its_own, its_systematic, its_alias) = (_of_six(*_parts(*pair)) for pair in (one, other))
     wide = max(systematic.shape[1], its_systematic.shape[1])
@@ -243,9 +234,9 @@ def difference_covariance(one: tuple[Window, Estimate], other: tuple[Window, Est
 
 
 def change_covariance(window: Window, estimate: Estimate) -> Float:
-    """Return the covariance (6, 6) by which an estimate is compared with earlier ones of the same drive.
+    """Return the covariance (6, 6) for comparing an estimate with earlier ones of the same drive.
 
-    How set-points step within long rows is the same in all of them, and hides no change.
+    How set-points step within long samples is the same in all of them, and hides no change.
     """
     own, systematic, alias = _of_six(*_parts(window, estimate))
     part = _unshared(window, systematic)
@@ -254,7 +245,7 @@ def change_covariance(window: Window, estimate: Estimate) -> Float:
 
 
 def _unshared(window: Window, systematic: Float) -> Float:
-    """Return the doubts (k, q) that windows of one drive may have in part for themselves: not how set-points step."""
+    """Return the doubts (k, q) that may differ partly between windows of one drive: not how set-points step."""
     return systematic[:, :2] if leaves_steps_open(window) else systematic
 
 

@@ -1,10 +1,10 @@
-"""Lets terms join the six where the data surely show them: forward selection on a fit's own innovations.
+"""Adds significant terms to the six parameters: forward selection on a fit's own innovations.
 
-The innovations are linear in the terms and nearly so in the six, so what each would explain beyond all that are free
-follows from one Gram matrix, without another fit. A term joins where minus twice the log likelihood falls by more than
-its price: the Bayesian criterion, extended by the number of terms that were tried (Chen and Chen 2008), with as many
-rows as are independent; where it is worth it; and where the six stay identifiable. Then all are fitted once more, from
-where the straight line leads.
+The innovations are linear in the terms and nearly so in the six, so one Gram matrix yields what each term would explain
+beyond all free entries, without another fit. A term is added where minus twice the log likelihood falls by more than
+its price (the Bayesian criterion, extended by the number of terms tried, Chen and Chen 2008, with the number of
+independent samples), where it is worthwhile, and where the six stay identifiable. All are then fitted once more, from
+the linear prediction.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ SURE_DELAY = 5.0  # standard deviations beyond which a delay is accepted
 
 
 def add_terms(base: Fit, command: bool, estimate_of: Callable[[Fit], Estimate], *, delayed: bool = False) -> Fit:
-    """Return the fit with the terms that its windows surely show; itself where there are none.
+    """Return the fit with the terms that are significant in its windows; the fit itself without any.
 
-    ``command`` says whether the voltage may be a commanded one, ``estimate_of`` makes an estimate of a fit. Where the
-    voltage may be ``delayed``, its delay is one of the candidates: dead time and others resemble it.
+    ``command`` is true where the voltage may be a commanded one; ``estimate_of`` converts a fit to an estimate. Where
+    the voltage may be ``delayed``, its delay is a candidate too: dead time and other terms resemble it.
     """
     result, left = base, candidates(base.problem.motions, command)
     if delayed and DELAY not in base.free:
@@ -74,9 +74,9 @@ def add_terms(base: Fit, command: bool, estimate_of: Callable[[Fit], Estimate], 
 
 
 def _weak(wider: Fit, chosen: Sequence[Candidate], base: Fit, estimate_of: Callable[[Fit], Estimate]) -> set[str]:
-    """Return the families of what is not sure beside all else; the last chosen where the six are told no more.
+    """Return the families that are insignificant given all else; the last chosen where the six lose identifiability.
 
-    Friction that pushes is none: what makes it so stands for something else.
+    Negative friction is rejected: it stands for something else.
     """
     estimate = estimate_of(wider)
     terms = [c.family for c in chosen if c.family != LATE]
@@ -94,7 +94,6 @@ def _weak(wider: Fit, chosen: Sequence[Candidate], base: Fit, estimate_of: Calla
 
 
 def _surely_late(wider: Fit, estimate: Estimate) -> bool:
-    """Return whether a fit's delay is surely there, and one that data of these rows can tell."""
     if estimate.delay_s is None or estimate.delay_std_s is None or not _may_be_late(wider, estimate.delay_s):
         return False
     alone = not wider.problem.motions[0].courses
@@ -106,7 +105,7 @@ def _may_be_late(base: Fit, delay_s: float) -> bool:
 
 
 def _std(estimate: Estimate, family: str) -> float:
-    """Return the deviation of a term; of friction at low speed for the speed that was chosen: whether it is there."""
+    """Return the deviation of a term; for Stribeck friction at its chosen speed, which decides whether it exists."""
     if family != "stribeck":
         return estimate.std(family)
     k, speed = estimate.names.index(family), estimate.names.index("stribeck_speed")
@@ -115,7 +114,6 @@ def _std(estimate: Estimate, family: str) -> float:
 
 
 def _with(base: Fit, chosen: Sequence[Candidate], bench: _Bench) -> Fit:
-    """Return the windows fitted with the chosen terms too, from where the straight line leads."""
     motions = []
     for k, motion in enumerate(base.problem.motions):
         more = tuple(course for candidate in chosen for course in candidate.courses[k])
@@ -133,7 +131,6 @@ def _with(base: Fit, chosen: Sequence[Candidate], bench: _Bench) -> Fit:
 
 
 def _entries(candidate: Candidate, chosen: Sequence[Candidate], first: int) -> list[int]:
-    """Return the entries of theta of one of the ``chosen``, of which the ``first`` begins the new ones."""
     if candidate.family == LATE:
         return [DELAY]
     before = sum(len(c.courses[0]) for c in chosen[: list(chosen).index(candidate)])
@@ -141,7 +138,6 @@ def _entries(candidate: Candidate, chosen: Sequence[Candidate], first: int) -> l
 
 
 def _chosen(base: Fit, left: Sequence[Candidate], delayed: bool) -> tuple[_Bench, list[Candidate]]:
-    """Return the candidates that join this fit, the surest first, and the bench on which they were tried."""
     number, room = len(left), MOST - len(base.problem.motions[0].courses)
     bench = begun = _Bench.of(base, left, delayed)
     found: list[Candidate] = []
@@ -172,10 +168,10 @@ def _price(freedom: Float, rows: float | Float, number: int) -> Float:
 
 
 class _Scores(NamedTuple):
-    """What each of c candidates, of one course or two, explains beyond all that is free.
+    """Score of each of c candidates, of one regressor or two, given all free entries.
 
-    ``shares`` (k, 2, c) are of the free entries in the courses; ``powers`` (2, c) the squares of what is beyond them,
-    ``amplitudes`` (2, c), and ``gains`` (c,) the fall of minus twice the log likelihood.
+    ``shares`` (k, 2, c) are the projections of the regressors on the free entries; ``powers`` (2, c) the squares of the
+    rest, ``amplitudes`` (2, c), and ``gains`` (c,) the fall of minus twice the log likelihood.
     """
 
     shares: Float
@@ -187,12 +183,12 @@ class _Scores(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Bench:
-    """A fit with the ``candidates`` for it, of which those ``left`` (c,) are tried.
+    """A fit with ``candidates``, of which those ``left`` (c,) are still tried.
 
-    ``columns`` (m, p) are ``doubts`` about the voltage's course, the jacobian, and the courses of the candidates,
-    the two of each at ``places`` (2, candidates): the last column, which is nil, where there is no second. ``gram``
-    (p, p), as far as it is asked for, and ``pulls`` (p,) are their products, the doubts' expected sizes included;
-    ``free`` are those that are fitted.
+    ``columns`` (m, p) are ``doubts`` about the voltage's waveform, the jacobian, and the candidates' regressors, the
+    two of each at ``places`` (2, candidates); the last column is zero and stands for a missing second. ``gram`` (p, p),
+    filled on demand, and ``pulls`` (p,) are their products, with the doubts' expected sizes; ``free`` are those that
+    are fitted.
     """
 
     fit: Fit
@@ -208,7 +204,6 @@ class _Bench:
 
     @classmethod
     def of(cls, base: Fit, left: Sequence[Candidate], delayed: bool) -> _Bench:
-        """Return the bench of a fit, whose voltage may be ``delayed`` by what is to be found."""
         doubts = base.problem.course_effects(base.theta)
         begin = doubts.shape[1] + base.jacobian.shape[1]
         motions = range(len(base.problem.motions))
@@ -230,12 +225,10 @@ class _Bench:
         return made
 
     def _fill(self, rows: list[int]) -> None:
-        """Fill in the Gram matrix's ``rows``: those of candidates are asked for when they join."""
         products = self.columns[:, rows].T @ self.columns
         self.gram[rows], self.gram[:, rows] = products, products.T
 
     def without(self, taken: int, kept: Rows, joins: bool) -> _Bench:
-        """Return the bench of those ``kept`` that are of another family than the ``taken``, which ``joins`` or not."""
         family = self.candidates[self.left[taken]].family
         others = [k for k in self.left[kept] if self.candidates[k].family != family]
         more = self._columns_of(int(self.left[taken])) if joins else []
@@ -247,23 +240,19 @@ class _Bench:
         return [int(p) for p in self.places[:, candidate] if p < self.columns.shape[1] - 1]
 
     def step(self, chosen: Sequence[Candidate]) -> Float:
-        """Return by how much the fit's free entries, and those of the ``chosen``, move with all of them (k,)."""
         free = self.free + [p for c in chosen for p in self._columns_of(list(self.candidates).index(c))]
         moved: Float = inverse_of(self.gram[np.ix_(free, free)])[0] @ self.pulls[free]
         return moved[self.doubts :]
 
     @property
     def rows(self) -> float:
-        """How many innovations tell of the motion."""
         return 2.0 * sum(int(np.count_nonzero(np.abs(m.mode) == 1)) for m in self.fit.problem.motions)
 
     @property
     def inverse(self) -> Float:
-        """The covariance (k, k) of all that is free."""
         return inverse_of(self.gram[np.ix_(self.free, self.free)])[0]
 
     def scores(self) -> _Scores:
-        """Return what each candidate explains."""
         free, inverse = self.free, self.inverse
         first, second = places = self.places[:, self.left]
         across = self.gram[free][:, places]  # (k, 2, c)
@@ -280,10 +269,10 @@ class _Bench:
         return _Scores(shares, powers, amplitudes, (amplitudes * s).sum(axis=0), seen.sum(axis=0) * 1.0)
 
     def colour(self, scores: _Scores, asked: Rows) -> Float:
-        """Return by how much the scores of those ``asked`` (c,) vary more than were innovations independent.
+        """Return by how much the scores of the candidates ``asked`` (c,) vary more than with independent innovations.
 
-        After Newey and West (1987), by rows, of what is left with the candidate: what it explains is no colour.
-        Bartlett's weights over lags are the mean square of moving sums.
+        After Newey and West (1987), of the residuals including the candidate, so that what it explains does not count
+        as colour. Bartlett's weights over lags are the mean square of moving sums.
         """
         basis = self.columns[:, self.free]
         rest = self.fit.residuals - basis @ (self.inverse @ self.pulls[self.free])
@@ -304,10 +293,7 @@ class _Bench:
 
 
 def _worth(bench: _Bench, scores: _Scores, k: int) -> bool:
-    """Return whether a term's torque matters to the path, or without it one of the six is beyond its interval.
-
-    A delay must be one that the rows can tell.
-    """
+    """Return whether a term's torque matters to the path, or moves one of the six beyond its interval."""
     amplitudes, six = scores.amplitudes[:, k], slice(bench.doubts, bench.doubts + SIX)
     candidate = bench.candidates[bench.left[k]]
     if candidate.family == LATE and not _may_be_late(bench.fit, float(amplitudes[0])):

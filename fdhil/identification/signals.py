@@ -1,8 +1,8 @@
-"""Brings a recorded speed that is late to the instants of its rows: what drives call speed is often no reading.
+"""Aligns a late recorded speed to its samples: what drives report as speed is often not a direct reading.
 
-A difference of encoder positions is the mean of the row before, so half a row late; a filter behind it, or about a
-reading, adds its own lag. The recorded position has none, and tells how late the speed is. The lag is then undone on
-the speed itself, which is finer than the position as a rule: a filter by its inverse, a mean by a stencil.
+A difference of encoder positions is the mean of the sample before, so half a sample late; a filter adds its own lag.
+The recorded position has none and reveals the lag. It is removed from the speed itself, which is usually finer than the
+position: a filter by its inverse, a mean by a stencil.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ REACH = 3  # rows about a lost one that cannot be mended
 
 @dataclass(frozen=True, slots=True)
 class Lag:
-    """By how much a speed is late, with its standard deviation; of what it is the lag, and ``share`` of a filter.
+    """The lag of a speed with its standard deviation, and its cause.
 
-    The speed is a ``mean`` of the row before, or the instants; of it a first-order filter keeps ``share`` of a row
-    before. ``moved_s`` is a plain delay.
+    The speed is a ``mean`` over the sample before, or instants, behind a first-order filter that keeps ``share`` per
+    sample; ``moved_s`` is a pure delay.
     """
 
     late_s: float
@@ -51,14 +51,14 @@ class Lag:
     moved_s: float = 0.0
 
     def seen(self, angle: Float, dt_s: float) -> Float:
-        """Return the speed (n,) that a drive with this lag tells of ``angle`` (n,), rad."""
+        """Return the speed (n,) that a drive with this lag reports for ``angle`` (n,), rad."""
         speed = np.diff(angle, prepend=angle[0]) / dt_s if self.mean else of_position(angle, dt_s)
         if self.moved_s:
             return shifted(speed, -self.moved_s / dt_s)
         return filtered(speed, self.share) if self.share else speed
 
     def undone(self, speed: Float, dt_s: float) -> Float:
-        """Return the speed (n,) at the instants of the rows."""
+        """Return the speed (n,) at the instants of the samples."""
         if self.moved_s:
             return shifted(speed, self.moved_s / dt_s)
         if self.share:
@@ -67,7 +67,7 @@ class Lag:
 
 
 def mended(window: Window, source: SpeedSource = "auto") -> Window:
-    """Return the window with its speed at the instants of its rows; itself where the speed is not surely late.
+    """Return the window with its speed at the instants of its samples; the window itself without a significant lag.
 
     ``source`` is ``[identification] speed_source``.
     """
@@ -96,7 +96,9 @@ def _mended(window: Window, source: SpeedSource) -> Window:
 
 
 def lag_of(window: Window, source: SpeedSource = "auto") -> Lag | None:
-    """Return the lag of a window's speed; None where there surely is none, or position and speed do not tell."""
+    """Return the lag of a window's speed; None without a significant lag, or where position and speed do not determine
+    it.
+    """
     dt = window.dt_s
     told = _lateness(window)
     if source == "difference":
@@ -120,7 +122,6 @@ def lag_of(window: Window, source: SpeedSource = "auto") -> Lag | None:
 
 
 def _possible(late: float, std: float, dt: float) -> list[Lag]:
-    """Return what may make a speed late by ``late``, the most usual first."""
     unsure = max(SURE * std, LEAST * dt)
     possible = [Lag(late, std, share=late / (dt + late)), Lag(late, std, moved_s=late)]
     rest = late - 0.5 * dt
@@ -130,7 +131,7 @@ def _possible(late: float, std: float, dt: float) -> list[Lag]:
 
 
 def _lateness(window: Window) -> tuple[float, float] | None:
-    """Return by how much (s) the speed is late against the position, and the standard deviation; None if not told.
+    """Return the lag (s) of the speed against the position and its standard deviation; None if undetermined.
 
     The speed is a scale times that of the position, a constant, and minus the acceleration times the lag.
     """
@@ -156,7 +157,6 @@ def _lateness(window: Window) -> tuple[float, float] | None:
 
 
 def _moving(window: Window) -> Bool:
-    """Return the rows (n,) in which the shaft surely turns and nothing about them is lost."""
     known = np.isfinite(window.speed_rad_s) & np.isfinite(window.position_mm)
     whole = np.convolve(known, np.ones(2 * REACH + 1), "same") > 2 * REACH + 0.5
     sure: Bool = whole & surely_moving(window.speed_rad_s, window.rapid_speed_rad_s)
@@ -169,7 +169,6 @@ def _angle(window: Window) -> Float:
 
 
 def _left(speed: Float, seen: Float, rows: Bool) -> Float:
-    """Return what of the speed (m,) a scale and a constant do not make of what a drive would have ``seen``."""
     columns = np.column_stack([seen, np.ones(seen.size)])[rows]
     inverse, _ = inverse_gram(columns)
     rest: Float = speed[rows] - columns @ (inverse @ (columns.T @ speed[rows]))
@@ -177,7 +176,7 @@ def _left(speed: Float, seen: Float, rows: Bool) -> Float:
 
 
 def _explained(left: Float, window: Window, rows: Bool) -> bool:
-    """Return whether no more is left between speed and position than noise, and the position's steps, explain."""
+    """Return whether noise and the position's resolution explain the difference between speed and position."""
     top = float(np.abs(window.speed_rad_s[rows]).max())
     step = resolution(_angle(window)) / window.dt_s / math.sqrt(6.0)  # of the difference of two positions
     allowed = EXPLAINED * math.hypot(noise_of(left), step) + FLOOR * top
@@ -197,7 +196,7 @@ def of_position(angle: Float, dt_s: float) -> Float:
 
 
 def between_means(means: Float) -> Float:
-    """Return a signal (n,) at the instants of its rows from its means over the row before each, exact for cubics."""
+    """Return a signal (n,) at the instants of its samples from means over the sample before each, exact for cubics."""
     instants = means.copy()
     instants[1:-2] = (-means[:-3] + 7.0 * means[1:-2] + 7.0 * means[2:-1] - means[3:]) / 12.0
     instants[[0, -2]] = (means[[0, -2]] + means[[1, -1]]) / 2.0
@@ -205,14 +204,14 @@ def between_means(means: Float) -> Float:
 
 
 def filtered(values: Float, share: float) -> Float:
-    """Return ``values`` (n,) behind a first-order filter that keeps ``share`` of what it gave a row before."""
+    """Return ``values`` (n,) through a first-order filter that keeps ``share`` of its output per sample."""
     weights = (1.0 - share) * share ** np.arange(math.ceil(math.log(NIL) / math.log(share)))
     padded = np.concatenate([np.full(weights.size - 1, values[0]), values])
     return np.convolve(padded, weights, "valid")
 
 
 def shifted(values: Float, rows: float) -> Float:
-    """Return ``values`` (n,) as they are ``rows`` later, by cubics through four rows; the ends are held."""
+    """Return ``values`` (n,) as they are ``rows`` samples later, by cubic interpolation; the ends are held."""
     whole = math.floor(rows)
     x = rows - whole
     at = np.clip(np.arange(values.size)[:, None] + whole + np.arange(-1, 3), 0, values.size - 1)

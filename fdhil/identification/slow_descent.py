@@ -1,8 +1,8 @@
-"""Climbs to the most likely parameters of windows with a slow voltage, by Fisher's scoring on all innovations.
+"""Maximises the likelihood of windows with a low-rate voltage, by Fisher scoring on all innovations.
 
-How sure an innovation is depends on the parameters too: half of what a slow voltage is off by is the current at the
-ends of its samples, times L / T. So the likelihood is taken whole, determinant and all; its steps are those of the
-innovations' squares, and of their variances beside them.
+The variance of an innovation depends on the parameters too: half the deviation of a low-rate voltage is the current at
+the ends of its samples, times L / T. The full likelihood is used, including the determinant; steps combine the
+innovations' squares and their variances.
 """
 
 from __future__ import annotations
@@ -31,16 +31,13 @@ GAIN = 1e-3  # of twice the log likelihood: a step that gains less moves nothing
 
 @dataclass(frozen=True, slots=True)
 class Likelihood:
-    """Windows with a slow voltage and their noise levels."""
+    """Windows with a low-rate voltage and their noise levels."""
 
     motions: tuple[Motion, ...]
     noises: tuple[Noise, ...]
 
     def at(self, theta: Float, ordered_for_s: float | None = None) -> Innovations:
-        """Return all innovations for ``theta`` (7,), rows and samples in the order of a delay of ``ordered_for_s``.
-
-        That is its own when left out.
-        """
+        """Return all innovations for ``theta`` (7,), ordered for a delay of ``ordered_for_s`` (default: its own)."""
         pairs = zip(self.motions, self.noises, strict=True)
         made = [innovations_of(m, theta, s.vector() ** 2, ordered_for_s) for m, s in pairs]
         return Innovations(np.concatenate([one.values for one in made]), np.concatenate([one.variance for one in made]))
@@ -48,8 +45,8 @@ class Likelihood:
     def slopes(self, here: Innovations, theta: Float, free: Sequence[int], sizes: Float) -> tuple[Float, Float]:
         """Return minus the derivatives (m, k) of innovations by ``free``, in deviations, and of half the log variance.
 
-        The order of rows and samples is held: an innovation must stay the same row's. So the delay is varied to the
-        side on which the samples are further from a row that they would pass, and by no more than that.
+        The order of samples is kept, so that an innovation stays that of the same sample. The delay is varied to the
+        side with more room, and by no more than that.
         """
         deviation, order = np.sqrt(here.variance), float(theta[DELAY])
         of_mean, of_variance = np.empty((here.values.size, len(free))), np.empty((here.values.size, len(free)))
@@ -63,7 +60,6 @@ class Likelihood:
         return of_mean, of_variance
 
     def _delay_step(self, delay_s: float) -> float:
-        """Return a small change of the delay by which no sample passes a row."""
         rooms = [room_s(motion, delay_s) for motion in self.motions]
         earlier, later = min(room[0] for room in rooms), min(room[1] for room in rooms)
         # a longer delay puts a sample earlier
@@ -72,7 +68,8 @@ class Likelihood:
 
 
 def ascend(likelihood: Likelihood, theta: Float, free: Sequence[int], sizes: Float) -> tuple[Float, Float, Float, bool]:
-    """Step from ``theta`` (7,) until a step is nothing; return theta, innovations (m,), jacobian (m, k), and success.
+    """Step from ``theta`` (7,) until a step is negligible; return theta, innovations (m,), jacobian (m, k), and
+    success.
 
     ``sizes`` (7,) are the parameters' typical ones.
     """
@@ -98,10 +95,10 @@ def ascend(likelihood: Likelihood, theta: Float, free: Sequence[int], sizes: Flo
 def _along(
     likelihood: Likelihood, theta: Float, here: Innovations, free: Sequence[int], step: Float
 ) -> tuple[Float, Innovations] | None:
-    """Return where along the ``step`` it is more likely, and the innovations there; None where it is nowhere.
+    """Return a likelier theta along the ``step`` and its innovations; None without one.
 
-    A step that is not more likely is halved, and a whole one doubled as long as that is more likely: innovations that
-    hold much noise seem to tell the delay better than they do, and steps are too short then.
+    A step that is not likelier is halved; a full one is doubled while that is likelier, because noisy innovations
+    overrate the information on the delay and make steps too short.
     """
 
     def tried(share: float) -> tuple[Float, Innovations] | None:
@@ -130,10 +127,10 @@ def _along(
 
 
 def likelier_delay(likelihood: Likelihood, theta: Float, information: Float, period_s: float) -> Float | None:
-    """Return theta (7,) with the delay, up to ``REACH`` samples off, that is surely likelier; None where none is.
+    """Return theta (7,) with a significantly likelier delay, up to ``REACH`` samples off; None without one.
 
-    Whether a sample ends before or after a row makes the likelihood uneven: it has tops a part of a sample apart. The
-    other parameters follow the delay as the ``information`` (7, 7) says.
+    Whether a sample ends before or after another makes the likelihood uneven, with local maxima a fraction of a sample
+    apart. The other parameters follow the delay by the ``information`` (7, 7).
     """
     inverse = inverse_of(information)[0]
     if not (np.isfinite(inverse).all() and inverse[DELAY, DELAY] > 0.0):

@@ -1,7 +1,7 @@
-"""Takes a spring between motor and table into a window's fit: what the motor's encoder shows of a resonance.
+"""Adds a spring between motor and table to a window's fit, from the resonance in the motor's own encoder.
 
-The spring's torque (:mod:`fdhil.identification.spring_torques`) is straight in the resonance f and in the table's share
-s of the inertia about the values found so far, so both are entries of the fit, a few times over.
+The spring's torque is linearised in the resonance f and in the table's share s of the inertia about their present
+values, so both are entries of the fit, over a few iterations.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ LEAST_NOISE = 0.3  # of what readings show: with less, a swing that is not quite
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What is known of a spring before the data: f in Hz with its standard deviation; of s what is usual."""
+    """Prior of a spring: f in Hz with its standard deviation; s as usual."""
 
     hertz: float
     hertz_std: float
@@ -53,27 +53,27 @@ class Told:
         return np.array([self.hertz_std, SHARE_DOUBT])
 
     def precision(self) -> Float:
-        """Return (2,) the information about f and s."""
+        """Return (2,) the prior information about f and s."""
         return self.std**-2.0 * (FIRM if self.firm else 1.0)
 
     def allows(self, spring: Spring) -> bool:
-        """Return whether data may tell such a spring: what they put far from it is something else."""
+        """Return whether a spring is plausible: one far from the prior stands for something else."""
         near = abs(spring.hertz / self.hertz - 1.0) < (FAR if self.hertz_std < self.hertz else FOUND_DOUBT)
         return near and LEAST_SHARE < spring.share < MOST_SHARE
 
     def away(self, spring: Spring) -> Float:
-        """Return (2,) how far f and s should move from ``spring`` by what is known alone."""
+        """Return (2,) the difference between the prior's f and s and those of ``spring``."""
         return np.array([self.hertz - spring.hertz, USUAL_SHARE - spring.share])
 
     def cost(self, spring: Spring) -> float:
-        """Return minus twice the log likelihood of a spring by what is known."""
+        """Return minus twice the log likelihood of a spring by the prior."""
         return float(self.precision() @ self.away(spring) ** 2)
 
 
 def sprung(base: Fit, axis: Axis | None) -> Fit | None:
-    """Return the fit of one window with the spring that the ``axis``' section tells of, or that the window shows.
+    """Return the fit of one window with the configured or a significant resonance; None without one.
 
-    f and s of a configured resonance are what both tell together. None where no spring is told, or surely shown.
+    f and s of a configured resonance combine prior and data.
     """
     motion = base.problem.motions[0]
     if motion.slow is not None or not base.converged or not np.isfinite(base.residuals).all():
@@ -100,7 +100,6 @@ def sprung(base: Fit, axis: Axis | None) -> Fit | None:
 
 
 def _scores(base: Fit, grid: Float) -> Float:
-    """Return (g,) by how much minus twice the log likelihood would fall with a spring at each frequency."""
     motion, theta = base.problem.motions[0], base.theta
     torques = Torques.of(motion, theta)
     springs = [Spring(float(hertz), USUAL_SHARE, USUAL_DAMPING) for hertz in grid]
@@ -113,7 +112,6 @@ def _scores(base: Fit, grid: Float) -> Float:
 
 
 def _turned(base: Fit, spring: Spring, told: Told) -> tuple[Fit, float] | None:
-    """Return the fit with the spring, and minus twice its log likelihood; None where it tells none."""
     plain, theta = base.problem.motions[0], base.theta
     free = (*base.free, theta.size, theta.size + 1)
     noises: Sequence[Noise] = ()
@@ -134,7 +132,6 @@ def _turned(base: Fit, spring: Spring, told: Told) -> tuple[Fit, float] | None:
 
 
 def _bent(plain: Motion, theta: Float, spring: Spring) -> Motion:
-    """Return the motion with the spring: its torque at ``theta`` is known, f and s move about what they are."""
     torques = Torques.of(plain, theta)
     answer = torques.answer(spring)
 
@@ -159,7 +156,6 @@ def _bent(plain: Motion, theta: Float, spring: Spring) -> Motion:
 
 
 def _surely(motion: Motion) -> Modes:
-    """Return the modes (n,) without the rows near rest."""
     reach = math.ceil(NEAR_REST_S / motion.dt_s)
     near = np.convolve(motion.mode == UNKNOWN, np.ones(2 * reach + 1), "same") > 0.0
     mode: Modes = np.where(near & (motion.mode != BROKEN), UNKNOWN, motion.mode).astype(np.int8)
@@ -167,7 +163,6 @@ def _surely(motion: Motion) -> Modes:
 
 
 def _with_prior(made: Fit, spring: Spring, told: Told) -> Fit:
-    """Return the fit with what is known of f and s beforehand, as one more observation of each."""
     prior, std = np.zeros((2, len(made.free)))
     prior[-2:], std[-2:] = told.precision(), told.std
     information = made.information + np.diag(prior)
@@ -181,7 +176,6 @@ def _with_prior(made: Fit, spring: Spring, told: Told) -> Fit:
 
 
 def _cost(made: Fit) -> float:
-    """Return minus twice the log likelihood of a fit of one window, by its own noise, without the rows near rest."""
     motion = made.problem.motions[0]
     variances = np.maximum(made.problem.noises[0].vector(), LEAST_NOISE * motion.noise.vector()) ** 2
     if not any(course.name == RESONANCE for course in motion.courses):

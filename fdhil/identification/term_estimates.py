@@ -1,7 +1,7 @@
-"""Tells the terms of a fit beside the six: ripples as amplitude and phase, and what was not a free entry of the fit.
+"""Adds the terms of a fit to the estimate: ripples as amplitude and phase, and values that were fixed during the fit.
 
-The speed at which friction falls off is found beside the fit, and a speed's lag before it: neither is known without an
-error, and what that error makes of the others is added to their covariance.
+The Stribeck speed is found next to the fit, a speed's lag before it. Both have an error, whose effect on the others is
+added to their covariance.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from fdhil.records import PARAMETERS, Estimate, Float
 
 
 def told_terms(six: Estimate, result: Fit, values: Float, beyond: Float) -> tuple[Estimate, Float]:
-    """Return the estimate with the terms, and what is ``beyond`` its covariance (k, k) turned in the same way.
+    """Return the estimate with the terms, and the additional covariance ``beyond`` (k, k) in the same coordinates.
 
     ``six`` is the estimate with the covariance of all entries of theta but the delay, whose ``values`` are given.
     """
@@ -42,7 +42,7 @@ def told_terms(six: Estimate, result: Fit, values: Float, beyond: Float) -> tupl
 
 
 def _chosen_before(result: Fit) -> list[tuple[str, float, float, Float]]:
-    """Return name, value and deviation of what no entry of theta is, and what one deviation makes of theta."""
+    """Return name, value and deviation of each value outside theta, and the effect of one deviation on theta."""
     motions = result.problem.motions
     kept = [k for k, j in enumerate(result.free) if j != DELAY]
     found = []

@@ -1,7 +1,4 @@
-"""Reads a parameter's history: its slope, where it stepped, when it will reach a limit, each with its interval.
-
-Pure: rows in, figures out; nothing here reads a clock.
-"""
+"""Analyses a parameter's history: its slope, its steps, when it reaches a limit, each with an interval. Pure functions."""
 
 from __future__ import annotations
 
@@ -35,10 +32,10 @@ LEAST_STEP |= {f"{name}/K": LEAST_STEP[name] for name in ("Jt", "ft", "Cd")}  # 
 
 @dataclass(frozen=True, slots=True)
 class Slope:
-    """A straight line through a parameter's history: ``value`` per unit of what it was drawn against, with ``std``.
+    """A line through a parameter's history: slope ``value`` with ``std``.
 
     The line passes through ``level`` (with ``level_std``, independent of the slope's) at ``at``. ``freedom`` is the
-    degrees of freedom that the standard deviations rest on, infinite when they come from the estimates themselves.
+    degrees of freedom of the standard deviations, infinite when they come from the estimates themselves.
     """
 
     value: float
@@ -56,7 +53,7 @@ class Slope:
 
 @dataclass(frozen=True, slots=True)
 class Crossing:
-    """Where a line reaches a limit, with its 95 % interval, in units of what the line was drawn against."""
+    """Where a line reaches a limit, with its 95 % interval, in units of the line's abscissa."""
 
     at: float
     low: float
@@ -65,7 +62,7 @@ class Crossing:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A parameter stepped between rows ``row - 1`` and ``row``: by ``size`` with ``std``, from ``before`` on."""
+    """A step of a parameter between rows ``row - 1`` and ``row``: by ``size`` with ``std``, from ``before`` on."""
 
     name: str
     row: int
@@ -84,10 +81,10 @@ def student_95(freedom: float) -> float:
 
 
 def slope(points: Float, against: Float, stds: Float | None = None, beside: Float | None = None) -> Slope | None:
-    """Fit a line to ``points`` (n,) over ``against`` (n,), weighted by ``stds`` (n,); None when it has no slope.
+    """Fit a line to ``points`` (n,) over ``against`` (n,), weighted by ``stds`` (n,); None without a slope.
 
-    ``beside`` (n,) is held constant: what of the points follows it is no slope against the other. The slope's standard
-    deviation is the larger of what ``stds`` promise and what the scatter about the line shows.
+    ``beside`` (n,) is a covariate: its effect does not count towards the slope. The standard deviation is the larger of
+    that by ``stds`` and that by the scatter about the line.
     """
     known = np.isfinite(points) & np.isfinite(against)
     if beside is not None:
@@ -117,17 +114,16 @@ def slope(points: Float, against: Float, stds: Float | None = None, beside: Floa
 
 
 def _without(other: Float, column: Float) -> Float:
-    """Return ``column`` (n,) without what of it follows ``other`` (n,)."""
     length = float(other @ other)
     rest: Float = column - other * (float(other @ column) / length if length > 0 else 0.0)
     return rest
 
 
 def without_direction(points: Float, direction: Float) -> Float:
-    """Return ``points`` (n,) without what they owe to the ``direction`` (n,), 1 or -1: a constant load, a screw's bias.
+    """Return ``points`` (n,) less the effect of the ``direction`` (n,), 1 or -1: a constant load, a screw's bias.
 
-    It is half the median difference between windows that follow each other in opposite directions, so that drift and
-    steps leave it alone; nothing where there are fewer than ``LEAST_TURNS``.
+    It is half the median difference between consecutive windows of opposite directions, which excludes drift and steps;
+    0 with fewer than ``LEAST_TURNS``.
     """
     known = np.isfinite(points)
     y, side = points[known], direction[known]
@@ -140,9 +136,7 @@ def without_direction(points: Float, direction: Float) -> Float:
 
 
 def crossing(line: Slope, limit: float) -> Crossing | None:
-    """Return where the line reaches ``limit``, by Fieller's theorem; None when the slope may as well be nil: it is less
-    than ``SURE_SLOPE`` standard deviations.
-    """
+    """Return where the line reaches ``limit``, by Fieller's theorem; None for an insignificant slope."""
     sure = student_95(line.freedom) ** 2
     if line.value**2 <= sure * (SURE_SLOPE / INTERVAL_95 * line.std) ** 2:
         return None
@@ -155,7 +149,7 @@ def crossing(line: Slope, limit: float) -> Crossing | None:
 
 
 def reach_days(span_days: float) -> float:
-    """Return how many days ahead a slope may be followed that was seen over ``span_days``; 0 when that is too short."""
+    """Return how many days ahead a slope observed over ``span_days`` may be extrapolated; 0 for too short a span."""
     return FARTHEST_SPANS * span_days if span_days >= LEAST_DAYS else 0.0
 
 
@@ -164,7 +158,7 @@ def steps(
 ) -> list[Step]:
     """Return the steps of the parameters ``names`` (n, k) with ``stds`` (n, k), by row; rows are windows in order.
 
-    Steady drift, a slow curve and what follows ``temperature`` (n,) are no steps.
+    Steady drift, a slow curve and the effect of ``temperature`` (n,) are not steps.
     """
     found = [s for k, name in enumerate(names) for s in _steps_of(name, values[:, k], stds[:, k], temperature)]
     return sorted(found, key=lambda step: (step.row, names.index(step.name)))
@@ -194,7 +188,7 @@ def _steps_of(name: str, values: Float, stds: Float, temperature: Float | None) 
 
 
 def _stands_out(y: Float, weights: Float, row: int, size: float) -> bool:
-    """Return whether the rows close to a step show it too: a smooth curve that is no parabola has none there."""
+    """Return whether the rows near a step show it too: a smooth curve that is not a parabola has none there."""
     first, last = max(0, row - NEAR), min(y.size, row + NEAR)
     columns = [np.ones(last - first), np.linspace(-1.0, 1.0, last - first), *_jumps(last - first, [row - first])]
     if last - first < ENOUGH_FOR_DRIFT:
@@ -204,7 +198,6 @@ def _stands_out(y: Float, weights: Float, row: int, size: float) -> bool:
 
 
 def _courses(n: int, temperature: Float | None) -> list[Float]:
-    """Return what a parameter may do without a step: columns (n,)."""
     order = np.linspace(-1.0, 1.0, n)
     columns = [np.ones(n)]
     if n >= ENOUGH_FOR_DRIFT:
@@ -221,7 +214,6 @@ def _jumps(n: int, rows: Sequence[int]) -> list[Float]:
 
 
 def _fit(y: Float, weights: Float, columns: Sequence[Float]) -> tuple[Float, Float]:
-    """Return coefficients and covariance of the weighted regression; scatter beyond the weights widens it."""
     phi = np.column_stack(columns) * weights[:, None]
     inverse = np.linalg.pinv(phi.T @ phi)
     theta = inverse @ (phi.T @ y)
@@ -231,7 +223,6 @@ def _fit(y: Float, weights: Float, columns: Sequence[Float]) -> tuple[Float, Flo
 
 
 def _best_row(y: Float, weights: Float, columns: Sequence[Float], taken: Sequence[int]) -> int | None:
-    """Return the row whose step explains most of what the columns leave; None when no row may have one."""
     n = y.size
     base = np.linalg.qr(np.column_stack(columns) * weights[:, None])[0]
     left = y - base @ (base.T @ y)

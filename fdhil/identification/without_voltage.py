@@ -1,15 +1,14 @@
-"""Fits [2] alone where there is no voltage: Jt, ft and Cd from current and position, with the K that is given.
+"""Fits [2] alone where there is no voltage: Jt, ft and Cd from current and position, with a given K.
 
-Least squares on K i = Jt dw/dt + ft w + Cd sign(w), all filtered alike, and on what joins it: friction at low speed, a
-ripple with the screw's turn. A term joins where the Bayesian information criterion (Schwarz 1978) wants it at the
-number of rows that tell something new, and where it is worth it. The current may be late: the torque's own slope
--tau (Jt dj/dt + ft dw/dt) is always fitted, so that it biases nothing. So is the acceleration's second derivative, by
-which the torque of a table behind a screw that gives differs from that of one mass, to first order. A constant load is
-part of the friction of its direction; windows of both directions tell it.
+Least squares on K i = Jt dw/dt + ft w + Cd sign(w), all filtered alike, and on additional terms: Stribeck friction, a
+ripple with the screw's turn. A term is added by the Bayesian information criterion (Schwarz 1978) at the number of
+effective samples, where it is worthwhile. The current may be late: the torque's slope -tau (Jt dj/dt + ft dw/dt) is
+always fitted, to avoid its bias. So is the acceleration's second derivative, the first-order effect of a compliant
+screw. A constant load is part of the friction of its direction; windows of both directions separate it.
 
-What is left is friction that no model has, much more than noise, and coloured. So the intervals stand around the
-variance of the scores (Newey and West 1987), widened for what that variance itself scatters (Kiefer and Vogelsang
-2005). Without K, its ratios are told.
+Residuals are dominated by unmodelled, coloured friction, not by sensor noise. The intervals therefore use the variance
+of the scores (Newey and West 1987), widened for its own scatter (Kiefer and Vogelsang 2005). Without K, ratios to K are
+reported.
 """
 
 from __future__ import annotations
@@ -49,9 +48,9 @@ NO_K = Reason(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Term:
-    """What may join: its ``names``, and one column (m,) for each value that is fitted linearly.
+    """A candidate term: its ``names``, and one column (m,) for each linear value.
 
-    ``slope`` (m,) is how the torque of one unit answers a value that is not, such as the Stribeck speed ``at``.
+    ``slope`` (m,) is the derivative of the torque of one unit by a nonlinear value, such as the Stribeck speed ``at``.
     """
 
     names: tuple[str, ...]
@@ -62,10 +61,10 @@ class Term:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TorqueFit:
-    """[2] in amperes, fitted to the rows of a window: ``design`` (m, k) and ``current`` (m,).
+    """[2] in amperes, fitted to the samples of a window: ``design`` (m, k) and ``current`` (m,).
 
-    ``theta`` (k,) are the columns' amplitudes: those of ``BASE``, then of each of ``terms``. ``shifts`` (k,) are
-    by how much they would move with a term that is there and was not worth joining, by its name.
+    ``theta`` (k,) are the columns' amplitudes: those of ``BASE``, then of each of ``terms``. ``shifts`` (k,) are their
+    changes with a significant term that was not worth adding, by its name.
     """
 
     rows: TorqueRows
@@ -77,22 +76,19 @@ class TorqueFit:
 
     @property
     def residual(self) -> Float:
-        """What is left of the current (m,), A."""
+        """The residual of the current (m,), A."""
         left: Float = self.current - self.design @ self.theta
         return left
 
     @property
     def unexplained(self) -> float:
-        """RMS of what is left as a share of the current's."""
+        """RMS of the residual as a share of the current's."""
         return rms(self.residual) / max(rms(self.current), 1e-300)
 
 
 @lru_cache(maxsize=8)
 def fit(window: Window, settings: Identification) -> TorqueFit | None:
-    """Fit [2] and the terms that join it to a window; None where hardly any row surely moves.
-
-    Estimate and checks ask for it.
-    """
+    """Fit [2] and its terms to a window; None with hardly any samples in motion. Cached: estimate and checks share it."""
     rows = torque_rows(window, settings)
     if rows is None or rows.count < LEAST_ROWS:
         return None
@@ -104,14 +100,12 @@ def fit(window: Window, settings: Identification) -> TorqueFit | None:
 
 
 def _beside(fitted: TorqueFit, term: Term) -> TorqueFit:
-    """Return the fit with one term more."""
     design = np.column_stack([fitted.design, term.columns])
     theta, _ = solve(design, fitted.current)
     return replace(fitted, design=design, theta=theta, terms=(*fitted.terms, term))
 
 
 def _joined(fitted: TorqueFit) -> TorqueFit:
-    """Let the best term join as long as one is wanted and worth it; what is wanted only puts the others in doubt."""
     news = effective_rows(fitted.residual)
     while True:
         wanted = _wanted(fitted, news)
@@ -124,7 +118,7 @@ def _joined(fitted: TorqueFit) -> TorqueFit:
 
 
 def _wanted(fitted: TorqueFit, news: float) -> list[TorqueFit]:
-    """Return the fits with one term more that the criterion prefers, the best first, one for each kind of term."""
+    """Return the fits with one additional term that the criterion prefers, the best of each kind, best first."""
     power, found = float(np.square(fitted.residual).sum()), []
     for term in candidates(fitted):
         tried = _beside(fitted, term)
@@ -140,12 +134,11 @@ def _wanted(fitted: TorqueFit, news: float) -> list[TorqueFit]:
 
 
 def _explained(other: TorqueFit, fitted: TorqueFit) -> float:
-    """Return the RMS of the torque by which two fits differ, A."""
     return rms(other.design @ other.theta - fitted.design @ fitted.theta)
 
 
 def effective_rows(e: Float) -> float:
-    """Return how many rows of residuals (n,) tell something new: n / (1 + 2 sum rho), rho up to where it is nil."""
+    """Return the effective number of residuals (n,): n / (1 + 2 sum rho), rho up to its first zero."""
     size = 1 << (2 * e.size).bit_length()
     correlation = np.fft.irfft(np.abs(np.fft.rfft(e, size)) ** 2, size)[: e.size]
     if correlation[0] <= 0.0:
@@ -156,7 +149,7 @@ def effective_rows(e: Float) -> float:
 
 
 def candidates(fitted: TorqueFit) -> list[Term]:
-    """Return the terms that have not joined and that these rows could tell."""
+    """Return the candidate terms that these samples can determine."""
     rows, joined = fitted.rows, {name for term in fitted.terms for name in term.names}
     found = []
     if "stribeck" not in joined:
@@ -180,10 +173,10 @@ def _stribeck(rows: TorqueRows, speed_rad_s: float) -> Term:
 
 
 def told(window: Window, fitted: TorqueFit | None, known: Mapping[str, float]) -> Estimate:
-    """Return what the fit of a window tells, with the K of the recording itself, else the one ``known``.
+    """Return the estimate of a window's fit, with the K of the recording itself, else the one ``known``.
 
-    ``known`` may hold K, R and L of the data sheet: they are ``given`` in the estimate. R and L that are not known are
-    missing. Without any K all six are, and ``RATIOS`` follow them.
+    ``known`` may hold K, R and L of the data sheet: they are ``given`` in the estimate. Unknown R and L are missing.
+    Without K all six are missing, and ``RATIOS`` follow them.
     """
     if fitted is None:
         text = "hardly any row lies beyond the low-pass's reach from standstill"
@@ -195,7 +188,7 @@ def told(window: Window, fitted: TorqueFit | None, known: Mapping[str, float]) -
 
 
 def late_s(fitted: TorqueFit) -> tuple[float, float]:
-    """Return by how much the current is late against the motion (early: negative), and the standard deviation."""
+    """Return the lag of the current against the motion (negative: early), and its standard deviation."""
     inertia, lag = float(fitted.theta[0]), float(fitted.theta[1])
     if not inertia > 0.0:
         return 0.0, np.inf
@@ -204,10 +197,9 @@ def late_s(fitted: TorqueFit) -> tuple[float, float]:
 
 
 def _covariance(fitted: TorqueFit) -> Float:
-    """Return the covariance (k + s, k + s) of the amplitudes and of the values that enter in no linear way.
+    """Return the covariance (k + s, k + s) of the amplitudes and of the nonlinear values.
 
-    In every direction the larger of two counts: by the scores, and by what as many residuals would be that hang
-    together as these do; a lucky sample is not precision.
+    In every direction the larger of two counts: by the scores, and by as many residuals with this correlation.
     """
     slopes = [t.slope * fitted.theta[_first(fitted, t)] for t in fitted.terms if t.slope is not None]
     design = np.column_stack([fitted.design, *slopes])
@@ -223,7 +215,6 @@ def _covariance(fitted: TorqueFit) -> Float:
 
 
 def _summed(scores: Float, lags: int) -> Float:
-    """Return the variance (k, k) of the sum of ``scores`` (n, k) that hang together, with Bartlett's weights."""
     meat = scores.T @ scores
     for lag in range(1, lags + 1):
         shifted = scores[lag:].T @ scores[:-lag]
@@ -232,13 +223,11 @@ def _summed(scores: Float, lags: int) -> Float:
 
 
 def _first(fitted: TorqueFit, term: Term) -> int:
-    """Return the column of a term's first amplitude."""
     at = next(k for k, other in enumerate(fitted.terms) if other is term)
     return len(BASE) + sum(int(t.columns.shape[1]) for t in fitted.terms[:at])
 
 
 def _with_constant(fitted: TorqueFit, given: Mapping[str, float]) -> Estimate:
-    """Return the parameters and terms with the torque constant that is ``given``, N.m/A, and R and L if they are."""
     values, rates = _values(fitted)
     doubts = _doubts(fitted, rates)
     covariance = rates @ _covariance(fitted) @ rates.T + doubts @ doubts.T
@@ -262,7 +251,6 @@ def _with_constant(fitted: TorqueFit, given: Mapping[str, float]) -> Estimate:
 
 
 def _without(estimate: Estimate, names: Sequence[str]) -> Estimate:
-    """Return the estimate with some parameters missing because there is no voltage."""
     values, covariance = estimate.values.copy(), estimate.covariance.copy()
     for name in names:
         k = estimate.names.index(name)
@@ -273,7 +261,6 @@ def _without(estimate: Estimate, names: Sequence[str]) -> Estimate:
 
 
 def _ratios(fitted: TorqueFit) -> Estimate:
-    """Return the estimate whose six parameters are missing, and whose ``RATIOS`` are known with their covariance."""
     values, rates = _values(fitted)
     known, k = len(RATIOS), len(PARAMETERS)
     whole = np.full((k + known, k + known), np.nan)
@@ -291,7 +278,6 @@ def _ratios(fitted: TorqueFit) -> Estimate:
 
 
 def _values(fitted: TorqueFit) -> tuple[dict[str, float], Float]:
-    """Return Jt, ft, Cd and the terms' values by name, per N.m/A, and how they follow from what was fitted."""
     inertia, lag, _, viscous, dry = fitted.theta[: len(BASE)]
     told = {"Jt": float(inertia - lag / inertia * viscous), "ft": float(viscous), "Cd": float(dry)}
     size, others = fitted.theta.size, sum(t.slope is not None for t in fitted.terms)
@@ -311,9 +297,9 @@ def _values(fitted: TorqueFit) -> tuple[dict[str, float], Float]:
 
 
 def _doubts(fitted: TorqueFit, rates: Float) -> Float:
-    """Return what is in doubt of each value (v, q), the same in all windows of a drive: one deviation a column.
+    """Return the doubts (v, q) of each value, common to all windows of a drive: one deviation a column.
 
-    Noise on the acceleration takes from Jt; and each term that is there and did not join would move them all.
+    Noise on the acceleration reduces Jt; each significant term that was not added would move all values.
     """
     power = float(np.mean(np.square(fitted.design[:, 0])))
     noise = fitted.rows.error_rad_s2**2 / max(power, 1e-300)
