@@ -17,15 +17,15 @@ import numpy as np
 from fdhil.model.compiled import compiled
 from fdhil.records import PARAMETERS, Float
 
-HISTORY = 24  # windows: what came before says little of how fast the drive warms now
-FOR_BOTH_SLOPES = 3  # windows in either direction from which on viscous friction may differ by it
-# shares of a parameter's size; steps of a factor two, as finer ones change no interval by a tenth
+HISTORY = 24  # windows: older ones say little about the present warming
+FOR_BOTH_SLOPES = 3  # windows per direction from which on viscous friction may depend on it
+# shares of a parameter's size; finer steps than a factor of two change no interval by a tenth
 STEPS = np.array([0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064])
 SCATTERS = np.array([0.0, 0.003, 0.01, 0.03])
 SMALL_SCATTERS = np.array([0.0, 0.0005, 0.002, 0.008])
-UNKNOWN = 100.0  # squared shares of a parameter's size: what is known of it before the first window
-SURELY = 6.9  # logarithm of a ratio of likelihoods: two sizes more explain so much by chance once in a thousand
-NO_SCATTER = 0.9  # prior chance that there is no scatter at all
+UNKNOWN = 100.0  # squared shares of a parameter's size: prior variance
+SURELY = 6.9  # log likelihood ratio that two more sizes reach by chance once in a thousand
+NO_SCATTER = 0.9  # prior probability of no scatter
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,13 +123,13 @@ def between(members: Sequence[Member]) -> Between:
     return Between(sizes, walk, scatter, surely)
 
 
-def _excess(told: Sequence[tuple[Float, Float]]) -> float:
+def _excess(estimates: Sequence[tuple[Float, Float]]) -> float:
     """Return the variance of one term beyond its own (DerSimonian, Laird 1986).
 
     Where windows disagree on a ripple or a resonance, it must not distort the other parameters of the pool.
     """
-    values = np.array([value[0] for value, _ in told])
-    weights = 1.0 / np.maximum([own[0, 0] for _, own in told], np.finfo(np.float64).tiny)
+    values = np.array([value[0] for value, _ in estimates])
+    weights = 1.0 / np.maximum([own[0, 0] for _, own in estimates], np.finfo(np.float64).tiny)
     whole = float(weights.sum())
     apart = float(weights @ np.square(values - weights @ values / whole)) - (values.size - 1)
     spread = whole - float(weights @ weights) / whole
@@ -137,11 +137,11 @@ def _excess(told: Sequence[tuple[Float, Float]]) -> float:
 
 
 def _weighed(members: Sequence[Member], kind: Kind) -> tuple[Float, Float, Float, Float]:
-    told = [m.part(kind.names) for m in members]
-    values = np.array([value for value, _ in told])
+    estimates = [m.part(kind.names) for m in members]
+    values = np.array([value for value, _ in estimates])
     typical = np.median(np.abs(values), axis=0)
     typical[typical == 0.0] = 1.0
-    owns = np.array([own for _, own in told]) / np.outer(typical, typical)
+    owns = np.array([own for _, own in estimates]) / np.outer(typical, typical)
     pairs, prior = kind.grid()
     places = np.array([m.place for m in members], dtype=np.float64)
     likely = _likelihoods(owns, _levels(members, kind), values / typical, places, pairs)
@@ -183,7 +183,7 @@ def _bank(owns: Float, levels: Float, values: Float, places: Float, pairs: Float
         for j in range(n):
             for q in range(p):
                 spread[q, q] += walk * (places[j] - places[max(j - 1, 0)])
-                # the next row of the covariance's Cholesky root, and what it makes of the columns
+                # the next row of the covariance's Cholesky root, applied to the columns
                 for a in range(q + 1):
                     left = owns[j, q, a] + (scatter if a == q else 0.0)
                     for c in range(a):

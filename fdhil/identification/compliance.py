@@ -18,20 +18,20 @@ from fdhil.records import INTERVAL_95, Estimate, Float, Parameters, Reason, Wind
 
 TERMS = ("resonance", "resonance_damping", "resonance_share")
 BAND_HZ = (12.0, 300.0)
-TRIALS = 70  # frequencies at which it is sought first
-WHOLE = 0.8  # of the rows in which the table moves must be told
-EVIDENCE = 30.0  # by which twice the log likelihood must rise, of rows of their own: by chance once in 10^5 windows,
-ELSEWHERE = (0.6, 0.75, 1.33, 1.67)  # above that of a stiff screw, and of springs at these shares of the frequency
-LARGEST_STD = 0.1  # of the frequency: where it is wider none is told
-DAMPING = (0.03, 1.2)  # what is expected before it is seen, and the deviation of its logarithm
-LATE_STD_S = 2e-3  # of how late the table's sensor may be against the drive's
-SHARE = (0.5, 0.15)  # of the inertia that is the table's, before it is seen
+TRIALS = 70  # frequencies of the first search
+WHOLE = 0.8  # of the moving samples must have a reading
+EVIDENCE = 30.0  # least rise of twice the log likelihood, in independent samples: by chance once in 10^5 windows,
+ELSEWHERE = (0.6, 0.75, 1.33, 1.67)  # above that of a rigid screw, and of springs at these shares of the frequency
+LARGEST_STD = 0.1  # of the frequency: with more none is reported
+DAMPING = (0.03, 1.2)  # prior, and the deviation of its logarithm
+LATE_STD_S = 2e-3  # prior of the lag between the table's sensor and the drive's
+SHARE = (0.5, 0.15)  # prior of the table's share of the inertia
 SHARES = (0.05, 0.95)
-# what is never known better, since ripples of the motor's torque are no noise: the share, which is told less surely the
-# stiffer the screw is, and the frequency that an accelerometer alone tells; at this frequency (Hz)
+# least doubts, since ripples of the motor's torque are not noise: of the share, which grows with the screw's stiffness,
+# and of the frequency by an accelerometer alone; at this frequency (Hz)
 UNSURE_SHARE, UNSURE_ALONE, AT_HZ = 0.04, 0.025, 80.0
-CORRELATED_S = 0.02  # over which what is left is taken to be of one piece
-SAME = 0.03  # of the frequency: what a configured one may be off
+CORRELATED_S = 0.02  # range of correlation of the residuals
+SAME = 0.03  # of the frequency: tolerance of the configured one
 STEPS = 25
 NIL = 1e-30
 Left = Callable[[Float], Float]
@@ -74,7 +74,7 @@ def compliance(window: Window, parameters: Parameters) -> Compliance | None:
     if encoder is None:
         share = _share(lambda q: shaft(motor, w, z, q), motor.dt_s)
         return _told(w, z, *share, spread, float(values[2]), held=False)
-    held = encoder  # w and z are those with the motor held, of which the share makes those with the motor free
+    held = encoder  # w and z are those with the motor held; the share converts them to the motor free
     share = _share(lambda q: held.bends(w / math.sqrt(1.0 - q), z / math.sqrt(1.0 - q), q), motor.dt_s)
     return _told(w, z, *share, spread, float(values[2]), held=True)
 
@@ -98,7 +98,7 @@ def _fitted(eye: Encoder | Accelerometer, dt: float) -> tuple[Float, Float] | No
     trials = 2 * math.pi * np.geomspace(*BAND_HZ, TRIALS)
     shown = [_evidence(eye, w, DAMPING[0], late) for w in trials]
     best = int(np.argmax(shown))
-    if best in (0, TRIALS - 1):  # it swings beyond the band, or not at all
+    if best in (0, TRIALS - 1):  # a resonance beyond the band, or none
         return None
     start = np.array([math.log(trials[best]), math.log(DAMPING[0]), late])
     weak = np.array([0.0, 1.0 / DAMPING[1], 1.0 / LATE_STD_S])
@@ -135,8 +135,8 @@ def _evidence(eye: Encoder | Accelerometer, w: float, z: float, late_s: float) -
 def _own(rest: Float) -> float:
     """Return the number of independent samples among residuals (m,), from their correlation at lag 1."""
     power = float(rest @ rest)
-    alike = max(0.0, float(rest[1:] @ rest[:-1]) / power) if power else 0.0
-    return rest.size * (1.0 - alike) / (1.0 + alike)
+    correlation = max(0.0, float(rest[1:] @ rest[:-1]) / power) if power else 0.0
+    return rest.size * (1.0 - correlation) / (1.0 + correlation)
 
 
 def _share(unexplained: Callable[[float], Float], dt: float) -> tuple[float, float]:
@@ -204,7 +204,7 @@ def _spread(slopes: Float, rest: Float, size: int, reach: int) -> Float:
     """
     bread = np.linalg.inv(slopes.T @ slopes)
     scores = slopes * rest[:, None]
-    part, own = scores[:size], slopes[size:]  # what was expected counts with its own deviation
+    part, own = scores[:size], slopes[size:]  # the prior counts with its own deviation
     meat = part.T @ part + own.T @ own
     for lag in range(1, min(reach, size - 1)):
         both = part[lag:].T @ part[:-lag]
@@ -218,7 +218,7 @@ def joined(estimate: Estimate, found: Compliance) -> Estimate:
     """
     kept = [k for k, name in enumerate(estimate.names) if name not in TERMS]
     before = np.zeros((len(estimate.names), 0))
-    if estimate.systematic is not None:  # told of the first names
+    if estimate.systematic is not None:  # covers the first names only
         before = np.pad(estimate.systematic, ((0, len(estimate.names) - len(estimate.systematic)), (0, 0)))
     return replace(
         estimate,
@@ -230,8 +230,8 @@ def joined(estimate: Estimate, found: Compliance) -> Estimate:
 
 
 def _apart(one: Float, other: Float) -> Float:
-    below, beside = np.zeros((len(other), one.shape[1])), np.zeros((len(one), other.shape[1]))
-    return np.block([[one, beside], [below, other]])
+    lower, upper = np.zeros((len(other), one.shape[1])), np.zeros((len(one), other.shape[1]))
+    return np.block([[one, upper], [lower, other]])
 
 
 def beside_the_config(found: Compliance, axis: Axis | None) -> list[Reason]:
@@ -241,6 +241,6 @@ def beside_the_config(found: Compliance, axis: Axis | None) -> list[Reason]:
     hertz, half = float(found.values[0]), INTERVAL_95 * math.sqrt(found.covariance[0, 0])
     if abs(hertz - axis.resonance_hz) <= max(half, SAME * hertz):
         return []
-    text = f"the table swings at {hertz:.1f} ± {half:.1f} Hz, not at {axis.resonance_hz:.4g} Hz as configured or found "
-    text += "from the motor"
-    return [Reason("ResonanceDiffers", text, "set resonance_hz of the axis to what its table does")]
+    text = f"the table resonates at {hertz:.1f} ± {half:.1f} Hz, not at {axis.resonance_hz:.4g} Hz as configured or "
+    text += "identified from the motor"
+    return [Reason("ResonanceDiffers", text, "set resonance_hz of the axis to the table's resonance")]

@@ -14,10 +14,10 @@ from fdhil.records import Float, VoltageSampling
 
 Complex = npt.NDArray[np.complex128]
 TESTED_LAGS = 25
-SUMMED_LAGS = 50  # rows over which innovations may hang together
-COLOUR_ROWS = 10  # rows before that foretell an innovation: a window of 0.1 s tells no more weights
+SUMMED_LAGS = 50  # samples over which innovations may correlate
+COLOUR_ROWS = 10  # order of the autoregression: a window of 0.1 s determines no more weights
 VARIANCE_PARTS = 10
-BEYOND_CHANCE = 5.0  # standard deviations: some seventy figures a window
+BEYOND_CHANCE = 5.0  # standard deviations: some seventy statistics a window
 
 
 def coloured_meat(blocks: Sequence[Float], gammas: Sequence[Sequence[Float]], lengths: Sequence[int]) -> Float:
@@ -84,7 +84,7 @@ def suspicious(innovations: Float) -> bool:
     if n < 4 * TESTED_LAGS:
         return False
     power = (innovations**2).sum(axis=0)
-    size = 1 << (n + TESTED_LAGS).bit_length()  # long enough that no lag wraps round
+    size = 1 << (n + TESTED_LAGS).bit_length()  # zero-padded so that no lag wraps round
     spectrum = np.fft.rfft(innovations, size, axis=0)
     correlations = np.fft.irfft(np.abs(spectrum) ** 2, size, axis=0)[1 : TESTED_LAGS + 1] / power
     shares = np.array([(part**2).mean(axis=0) for part in np.array_split(innovations, VARIANCE_PARTS)]) * n / power

@@ -22,12 +22,12 @@ from fdhil.identification.windows import bridged, carried
 from fdhil.model.closed_loop import simulate
 from fdhil.records import Float, Parameters, Window, read_only, rms
 
-SURELY = 0.6  # of what the other replay leaves, at most, for one to be right
-SAME_GRID = 1e-3  # of a row, by which it may differ from the cycle of the set-points
+SURELY = 0.6  # of the other replay's residual: largest of the right one
+SAME_GRID = 1e-3  # of a sample: tolerance of the set-points' cycle
 LEAST_ROWS = 50
-LEFT_OPEN = 0.2  # of what known loops determine: they are known to a tenth or so
+LEFT_OPEN = 0.2  # of what known loops determine: they are known to about a tenth
 SMOOTHING_S = 0.005
-SETTLED, LEAST_CYCLES = 8.0, 16  # time constants of the speed loop, and cycles, until all cycles are alike
+SETTLED, LEAST_CYCLES = 8.0, 16  # time constants of the speed loop, and cycles, until the cycles repeat
 
 
 def with_current_means(
@@ -43,7 +43,7 @@ def with_current_means(
         return windows
     plain, stepped = _left_mm(windows[0], settings, axis, sync_period_s)
     if plain < SURELY * stepped and windows[0].dt_s < STEPPED_ROW_S:
-        return windows  # there is no doubt to take away
+        return windows  # no doubt to remove
     if plain < SURELY * stepped:
         return [replace(w, current_off_a=read_only(np.zeros(w.n))) for w in windows]
     if not stepped < SURELY * plain:

@@ -15,12 +15,12 @@ from fdhil.identification.terms import WHOLE_DEAD_TIME
 from fdhil.records import Float
 
 SPAN_S = 0.025
-# times that the power left must fall before a delay of whole rows is accepted: no voltage is early, but what the model
-# lacks of inverter and winding looks so
+# factors by which the residual power must fall before a delay of whole samples is accepted: a voltage is never early,
+# but unmodelled effects of inverter and winding look like it
 LATER, EARLIER = 1.5, 9.0
-MOST_DELAY = 2.5  # rows, two with rounding: what resembles a longer delay, and is none of whole rows, is none
-LEAST_DELAY = 0.05  # of a row; a smaller delay cannot be told from the voltage's course within a row
-CHANCE = 2.0  # standard deviations of a delay that are chance, not doubt
+MOST_DELAY = 2.5  # samples, two with rounding: a longer delay would be one of whole samples
+LEAST_DELAY = 0.05  # of a sample; a smaller delay cannot be distinguished from the voltage's waveform
+CHANCE = 2.0  # standard deviations of a delay due to chance
 
 
 def coarse_delay(signals: Signals, dt_s: float) -> float:

@@ -15,11 +15,9 @@ from fdhil.identification.windows import bridged
 from fdhil.model.closed_loop import simulate
 from fdhil.records import Float, Parameters, Window, read_only, rms
 
-LEAST_FEEDFORWARD = 0.5  # with less, a lag at constant speed is that of the position loop
-WHOLE = 0.3  # of a cycle, by which a lead may miss a whole number
-EXPLAINED = (
-    0.003  # of what was left, at most, when the lead is taken out: with a filter or less feed-forward it is more
-)
+LEAST_FEEDFORWARD = 0.5  # with less, the lag at constant speed is the position loop's
+WHOLE = 0.3  # of a cycle: tolerance of a whole lead
+EXPLAINED = 0.003  # largest share of the residual that remains without the lead; more with a filter
 MOST = 32  # cycles
 LEAST_ROWS, SAME_GRID = 50, 1e-3
 
@@ -50,7 +48,7 @@ def _lead(window: Window, axis: Axis, sync_period_s: float | None) -> tuple[floa
     offset = None if window.offset_mm is None else np.nan_to_num(window.offset_mm)
     moved = simulate(Parameters(**axis.nominal.model_dump()), axis, window.dt_s, demand, offset).position_mm
     ahead = (moved - moved[0] - position + position[0])[known]
-    way = np.gradient(position)[known]  # in a cycle
+    way = np.gradient(position)[known]  # travel in a cycle
     power = float(way @ way)
     if not (power > 0.0 and np.isfinite(ahead).all()):
         return 0.0, 0.0

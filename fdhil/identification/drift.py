@@ -22,11 +22,11 @@ LEAST_HISTORY = 3
 BEYOND_CHANCE = 5.0
 HELD_EPISODES = 2
 AGREEING = 2
-SURELY = 2.0  # standard deviations by which a change must be beyond its limit
-RELEASE = 0.8  # an alarm is released when the change has fallen to this share of its limit
-RELEASING = 4  # estimates whose mean releases an alarm
+SURELY = 2.0  # standard deviations by which a change must exceed its limit
+RELEASE = 0.8  # an alarm is cleared when the change has fallen to this share of its limit
+RELEASING = 4  # estimates whose mean clears an alarm
 FRICTION = ("ft", "Cd")
-# changes smaller than these are drift, not a jump, however sure the estimates are
+# smaller changes are drift, not a jump, however narrow the intervals are
 LEAST_JUMP: Mapping[str, float] = {"R": 0.05, "L": 0.08, "K": 0.03, "Jt": 0.03, "ft": 0.40, "Cd": 0.25}
 
 
@@ -127,8 +127,8 @@ class DriftTracker:
 
     @staticmethod
     def _agree(one: Point, other: Point) -> bool:
-        alike = one.direction == other.direction
-        rows = [k for k, name in enumerate(PARAMETERS) if alike or name not in FRICTION]
+        same_direction = one.direction == other.direction
+        rows = [k for k, name in enumerate(PARAMETERS) if same_direction or name not in FRICTION]
         chance = BEYOND_CHANCE * np.sqrt(one.stds**2 + other.stds**2)
         least = np.array([LEAST_JUMP[name] for name in PARAMETERS]) * np.abs(one.values)
         return bool((np.abs(one.values - other.values) <= np.maximum(chance, least))[rows].all())
@@ -147,7 +147,7 @@ class DriftTracker:
             change, doubt = abs(point.values[k] - first) / abs(first), SURELY * point.stds[k] / abs(first)
             if name not in self.alarms and change - doubt > limit:
                 self.alarms.add(name)
-                moved = f"{name} has moved by {100 * change:.0f} % to {point.values[k]:.4g} {UNITS[name]}"
+                moved = f"{name} has changed by {100 * change:.0f} % to {point.values[k]:.4g} {UNITS[name]}"
                 text = f"{moved}, limit {100 * limit:.0f} %"
                 notices.append(Notice("MaintenanceDue", "minor", text, self.axis, point.tick))
             elif name in self.alarms and self._released(k, limit):

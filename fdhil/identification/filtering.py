@@ -14,7 +14,7 @@ from fdhil.records import Bool, Float
 
 ORDER = 4
 REACH_SHARE = 0.01
-SPAN_PERIODS = 6  # of the corner's period: beyond it the impulse response is nil
+SPAN_PERIODS = 6  # of the corner's period: beyond it the impulse response is negligible
 PADDING_PERIODS = 3
 
 

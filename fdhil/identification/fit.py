@@ -25,13 +25,13 @@ from fdhil.records import Float
 RENEWALS = 3
 STEPS = 16
 CONVERGED = 1e-3  # of a standard deviation
-ROUGH = 0.3  # of a standard deviation: near enough to tell the noise levels
-KEPT = 0.2  # of the step before: as long as steps shorten by more, their jacobian is good enough
-SLACK = 1e-6  # of the squares' sum, by which a step may miss the bottom
+ROUGH = 0.3  # of a standard deviation: near enough to estimate the noise levels
+KEPT = 0.2  # of the step before: while steps shorten faster, the jacobian is reused
+SLACK = 1e-6  # of the sum of squares, by which a step may miss the minimum
 DIFFERENCE = 1e-5
 DELAY_DIFFERENCE_S = 1e-5
-SHAPE_DOUBT = 1.5  # of the back-EMF's ramp within a sample: one standard deviation of the voltage's course
-SETTLED = 0.25  # squared standard deviations moved: for less, no noise level changes by a thousandth
+SHAPE_DOUBT = 1.5  # of the back-EMF's ramp within a sample: one standard deviation of the voltage's waveform
+SETTLED = 0.25  # squared standard deviations: smaller moves change no noise level by a thousandth
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +114,7 @@ class Fit:
         """The jacobian (m, k) without the delay's column."""
         if DELAY not in self.free:
             return self.jacobian
-        at = self.free.index(DELAY)  # a slice is no copy, and keeps the order in memory, and with it the last bit
+        at = self.free.index(DELAY)  # a slice keeps the order in memory, and with it the last bit
         before, after = self.jacobian[:, :at], self.jacobian[:, at + 1 :]
         return np.column_stack([before, after]) if after.size else before
 
@@ -224,7 +224,7 @@ def descend(
                     break
             share *= 0.5
         else:
-            return theta, residuals, j, True  # nothing lower along the step: this is the bottom, to rounding
+            return theta, residuals, j, True  # nothing lower along the step: the minimum, to rounding
         if size < enough:
             return theta, residuals, j, True
         last = size

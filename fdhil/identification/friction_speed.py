@@ -15,10 +15,10 @@ from fdhil.identification.terms import SPEEDS, stribeck, stribeck_slope
 from fdhil.records import Float
 
 TURNS = 3
-SPREAD = 0.5  # of the speed: what is known of it beforehand
-ENOUGH = 0.2  # deviations of the speed, by which a step may miss it
-BEYOND = 1.25  # times, by which it may lie beyond the grid
-MOST = 1.6  # times: a step beyond the neighbours on the grid is none of a straight line
+SPREAD = 0.5  # of the speed: its prior
+ENOUGH = 0.2  # standard deviations: smaller steps end the search
+BEYOND = 1.25  # factor by which it may lie beyond the grid
+MOST = 1.6  # factor: longer steps would leave the linear range
 
 
 def marginal(result: Fit, courses: Sequence[Sequence[Course]], prior: float) -> tuple[float, float, Float]:

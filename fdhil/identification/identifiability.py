@@ -22,7 +22,7 @@ PHYSICAL: Mapping[str, tuple[float, float]] = {
     "K": (1e-3, 100.0),
     "Jt": (1e-7, 100.0),
     "ft": (-np.inf, 10.0),
-    "Cd": (-1e3, 1e3),  # in one direction with a load, which may help
+    "Cd": (-1e3, 1e3),  # in one direction with a load, which may assist
 }
 
 CURRENT_AND_SPEED = "current and speed"
@@ -81,8 +81,8 @@ def judge(estimate: Estimate, condition: float, top_rad_s: float, top_nm: float 
 def _unknown(estimate: Estimate, top_rad_s: float, top_nm: float) -> dict[str, Reason]:
     missing = {}
     friction = abs(estimate.value("ft")) * top_rad_s + abs(estimate.value("Cd"))
-    # a friction coefficient may be nil: its interval is measured against the friction torque that
-    # there is, or, since a weight may balance it in one direction, against the torque that the drive makes
+    # a friction coefficient may be zero: its interval is compared with the total friction torque, or, since a weight
+    # may balance it in one direction, with the drive's torque
     matters = max(FRICTION_SHARE * friction, TORQUE_SHARE * top_nm)
     least = {"ft": matters / max(top_rad_s, 1e-300), "Cd": matters}
     for name, limit in RELATIVE_STD_LIMIT.items():

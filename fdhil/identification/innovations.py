@@ -75,8 +75,8 @@ def whiten(motion: Motion, thetas: Float, variances: Float) -> tuple[Float, Floa
 
 
 def _whitened(motion: Motion, thetas: Float, variances: Float, gains: Float) -> tuple[Float, Float]:
-    told = thetas[:, DELAY:] if any_voltage(motion) else thetas[:, DELAY, None]
-    together = bool((told == told[0]).all())
+    delays = thetas[:, DELAY:] if any_voltage(motion) else thetas[:, DELAY, None]
+    together = bool((delays == delays[0]).all())
     voltages = np.array([voltage_v(motion, theta) for theta in (thetas[:1] if together else thetas)])
     frictions = thetas[:, [CD, *range(FIRST_COURSE, thetas.shape[1])]]
     loads = loads_nm(motion, thetas[:1] if bool((frictions == frictions[0]).all()) else thetas)

@@ -26,18 +26,18 @@ Rows = npt.NDArray[np.int64]
 
 R, L, K, JT, FT, CD, DELAY = range(7)  # entries of theta
 OF_VOLTAGE, OF_CURRENT, OF_SPEED = range(3)  # entries of noise variances
-LOAD, VOLTAGE, CURRENT, SPEED = range(4)  # signals that move the filter over the rows
-# columns of an interval's step: what current and speed become of those at its begin, of the mean voltage, of friction
-# and load together, of the voltage's rise within it; and how a walk of the speed over it reaches the current
+LOAD, VOLTAGE, CURRENT, SPEED = range(4)  # signals that drive the filter
+# columns of an interval's transition: current and speed from those at its begin, from the mean voltage, from friction
+# and load together, from the voltage's rise within it; and the effect of a walk of the speed on the current
 I_I, I_W, W_I, W_W, I_U, W_U, I_T, W_T, I_RISE, W_RISE, I_WALK = range(11)
-# columns of a row's gains: from the innovations of current and speed to their states, and to whitened innovations
+# columns of a sample's gains: from the innovations of current and speed to their states, and to whitened innovations
 G_II, G_IW, G_WI, G_WW, WHITE_I, WHITE_IW, WHITE_W = range(7)
-STATE_I, STATE_W, STATE_SLOPE, STATE_SUM = range(4)  # of the filter beside a slow voltage
-STATE_U = 2  # of the filter whose voltage walks
+STATE_I, STATE_W, STATE_SLOPE, STATE_SUM = range(4)  # of the filter with a low-rate voltage
+STATE_U = 2  # of the filter with a random-walk voltage
 STATES = 4
 NO_SAMPLE = -1
-SETTLED, SETTLED_ROWS = 1e-12, 4  # relative change of a gain from row to row, and how often: from then on it stays
-LOG_ROWS = 16  # determinants, at most DIFFUSE^2 of the measurement's, that are multiplied before a logarithm is taken
+SETTLED, SETTLED_ROWS = 1e-12, 4  # relative change of a gain per sample, and how often: then it is constant
+LOG_ROWS = 16  # determinants, at most DIFFUSE^2 of the measurement's, multiplied per logarithm
 
 
 class Readings(NamedTuple):
@@ -106,7 +106,7 @@ def interval_steps(theta: Float, dt: float, emf_share: float) -> Float:
             a[1, :] = 0.0
         phi, mean, ramp = transition(a, dt)
         u = 1.0 / theta[L]
-        f = -1.0 / theta[JT] if known else 0.0  # else the friction torque is whatever keeps the speed on its walk
+        f = -1.0 / theta[JT] if known else 0.0  # else the speed is a random walk, whatever the friction
         to_i = np.array([phi[0, 0], phi[0, 1], mean[0, 0] * u, mean[0, 1] * f])
         to_w = np.array([phi[1, 0], phi[1, 1], mean[1, 0] * u, mean[1, 1] * f])
         rise = emf_share * theta[K] * (to_w - np.array([0.0, 1.0, 0.0, 0.0]))
@@ -194,7 +194,7 @@ def _whiten_one(
         was, known = known, 0 if mode[k] == UNKNOWN else 1
         if known != was:
             still = 0
-        if still < SETTLED_ROWS:  # else the gains change no more
+        if still < SETTLED_ROWS:  # else the gains are constant
             if observed[k]:
                 p11, p12, p22 = g11 * vi, g12 * vw, g22 * vw
             p11, p12, p22 = _spread(steps, known, p11, p12, p22, vu, 0.0 if known else readings.walk)
@@ -358,7 +358,7 @@ def slow_innovations(
                 at = 2 * n + j
                 noisy = noise[OF_VOLTAGE] + sensor.shape_variance[j]
                 values[at], variance[at] = _take(x, p, of_voltage, voltage[j], noisy)
-            if not instant:  # a sample begins: nothing is summed yet but - L i / T of the present current
+            if not instant:  # a sample begins: its sum starts at - L i / T of the present current
                 x[STATE_SUM] = -lever * x[STATE_I]
                 for a in range(STATE_SUM):
                     p[STATE_SUM, a] = p[a, STATE_SUM] = -lever * p[STATE_I, a]

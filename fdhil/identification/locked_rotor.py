@@ -22,7 +22,7 @@ NAME = "locked_rotor"
 TURNING = 8.0  # of the noise of the speed
 ADVICE = "add a recording in which the rotor turns"
 START_L_H = 1e-3
-OPEN_SHARE = np.array([5e-4, 1e-3])  # of R and L: what the voltage's course within a sample leaves open
+OPEN_SHARE = np.array([5e-4, 1e-3])  # of R and L: doubt of the voltage's waveform within a sample
 TOO_SLOW = "the current changes too little, or too slowly, to determine {}"
 
 
@@ -55,7 +55,7 @@ def estimate_locked(window: Window) -> Estimate:
     )
     shares = np.sqrt(np.diag(spread) * correlation_factor(found.fun) + OPEN_SHARE**2)
     values, covariance = np.full(6, np.nan), np.full((6, 6), np.nan)
-    still = "the rotor does not turn, which leaves {} open"
+    still = "the rotor does not turn, so {} cannot be determined"
     missing = {name: Reason("LowExcitation", still.format(name), ADVICE) for name in PARAMETERS}
     for k, name in enumerate(PARAMETERS[:2]):
         if 0.0 < shares[k] <= RELATIVE_STD_LIMIT[name]:

@@ -20,9 +20,9 @@ from fdhil.records import Float
 
 DELAY = "current_delay_cycles"
 STEPS, TRIALS = 24, 8
-CONVERGED, ENOUGH = 1e-4, 0.05  # of the squares' sum: a step that gains less is the last, or asks for new slopes
-ROUNDS, SETTLED = 4, 1e-3  # in which the scale is renewed, until what is left changes by less
-SYSTEMATIC = 0.005  # of a gain: what rounding of the demand and a start that is not quite at rest do to all rapids
+CONVERGED, ENOUGH = 1e-4, 0.05  # of the sum of squares: a smaller gain ends the steps, or requires new slopes
+ROUNDS, SETTLED = 4, 1e-3  # renewals of the scale, until the residual changes by less
+SYSTEMATIC = 0.005  # of a gain: common effect of the demand's rounding and of a start not quite at standstill
 LEAST_POSITION_MM, LEAST_CURRENT_A = 1e-5, 1e-4
 
 
@@ -255,7 +255,7 @@ def covariance_of(made: Fit) -> Float:
     """Return the covariance (k, k) of the coordinates: the larger of inverse information and sandwich."""
     slopes = made.problem.slopes(made.coordinates, made.answers())
     information, _ = normal(made, slopes)
-    # what the model does not have is no white noise (Newey and West 1987)
+    # unmodelled dynamics are coloured (Newey and West 1987)
     meat = sum(summed(np.einsum("cnk,cn->nk", phi, rest)) for phi, rest in _weighed(made, slopes))
     inverse = np.linalg.inv(information + np.diag(1.0 / made.problem.doubt() ** 2))
     sandwich = inverse @ meat @ inverse

@@ -17,14 +17,14 @@ from fdhil.records import Bool, Float, Parameters, Window, read_only
 LEAST_ROWS = 50
 REST_ROWS = 30
 LEAD_ROWS = 5
-BEGUN = 1e-6  # of the way
+BEGUN = 1e-6  # of the travel
 CREEP = 1e-5
 EDGE_ROWS = 3  # at either end, where the demand may be cut
 NIL_MM = 1e-9
 PENALISED = 3  # order of the differences
 WEIGHTS = tuple(10.0**k for k in range(6))
-LOW_PASS_S = 0.009  # twice: about 40 Hz, as far as the outer loops reach
-ROUNDED = 0.7  # of a step: half of one, and what the neighbours' rounding adds at a corner
+LOW_PASS_S = 0.009  # applied twice: about 40 Hz, the bandwidth of the outer loops
+ROUNDED = 0.7  # of a step: half a step, and more at a corner where the neighbours are rounded too
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +132,7 @@ def _load(position_mm: Float, current_a: Float, plant: Parameters, window: Windo
     torque = plant.K * moving_mean(moving_mean(current_a, width), width)
     acceleration = np.diff(angle, 2, prepend=angle[0], append=angle[-1]) / window.dt_s**2
     rows = np.flatnonzero(all_about(moving, 2 * width + 1, beyond=False))
-    if not rows.size or width == 1:  # between rows so far apart the current is not what its instants say
+    if not rows.size or width == 1:  # in such long samples instants of the current are not its mean
         return np.zeros(window.n)
     left = torque - friction - plant.Jt * acceleration
     return np.asarray(np.interp(np.arange(window.n), rows, left[rows]))
@@ -166,8 +166,8 @@ def smoothed(demand_mm: Float) -> Float:
 
 
 def _whittaker(values: Float, weight: float) -> Float:
-    """Return the signal (n,) that minimises squared distance from ``values`` + ``weight`` x squared third differences."""
-    from scipy.linalg import solveh_banded  # late: loops are rarely sought, and it is slow to import
+    """Return the signal (n,) of least squared distance from ``values`` + ``weight`` x squared third differences."""
+    from scipy.linalg import solveh_banded  # imported late: it is slow, and loops are rarely identified
 
     n, third = values.size, np.array([-1.0, 3.0, -3.0, 1.0])
     bands = np.zeros((PENALISED + 1, n))
@@ -193,7 +193,7 @@ def replay(rapid: Rapid, axis: Axis, delay_cycles: float) -> Float:
 
 def _run(rapid: Rapid, axis: Axis, delay_cycles: int) -> Float:
     drive = with_regulators(axis, current_delay_cycles=delay_cycles)
-    # a load is a torque offset of the other sign, but for the current, which has it
+    # a load is a torque offset of the opposite sign, except in the current, which includes it
     offset = -rapid.load_nm * (axis.nominal.K / rapid.plant.K)
     start = standing(rapid, drive)
     answer = closed_loop.simulate(rapid.plant, drive, rapid.dt_s, rapid.demand_mm, torque_offset_nm=offset, state=start)

@@ -20,7 +20,7 @@ from fdhil.records import Window
 CASCADE = ("position_gain_per_s", "speed_feedforward", "speed_kp", "speed_ki")
 CORNERS_HZ = (8.0, 16.0, 32.0, 64.0, 128.0)
 SLOWER = (2.5, 5.0, 10.0)
-CURRENT_CORNER_HZ = 400.0  # faster than what rows of 1 ms show
+CURRENT_CORNER_HZ = 400.0  # faster than samples of 1 ms resolve
 NO_LIMIT = 1e5
 
 

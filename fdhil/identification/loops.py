@@ -24,16 +24,16 @@ from fdhil.identification.loop_replay import Rapid, fitting_periods, rapid_of, w
 from fdhil.identification.loop_start import CASCADE, begun_anew, made_up_axis
 from fdhil.records import INTERVAL_95, LoopEstimate, Parameters, Reason, Verdict, Window, frozen, rms
 
-WORTH, WORTH_LEFT = 0.1, 0.1  # of the tolerance, or of what is left: what a key must explain to join
+WORTH, WORTH_LEFT = 0.1, 0.1  # of the tolerance, or of the residual: least effect of another key
 LEAST_UM = 0.02
-WELL, NOTHING_UM = 0.25, 0.1  # of the tolerance, and in um: with less left nothing is missing
+WELL, NOTHING_UM = 0.25, 0.1  # of the tolerance, and in um: a smaller residual is complete
 MOST_WINDOWS, MOST_TRIED = 4, 4
 DIFFER = "LoopsDiffer"
-LOOSE = 0.25  # relative standard deviation above which a gain is not known
+LOOSE = 0.25  # relative standard deviation of an undetermined gain
 PID = ("position_gain_per_s", "speed_feedforward", "speed_kp", "position_ki_per_s2")
 SINGLE = ("speed_filter_s", "setpoint_filter_s", DELAY, "torque_feedforward", "position_ki_per_s2")
 SINGLE_KEYS = tuple((name,) for name in SINGLE)
-FILTERS = (("speed_filter_s", "setpoint_filter_s"),)  # they hide each other: neither alone explains much
+FILTERS = (("speed_filter_s", "setpoint_filter_s"),)  # they mask each other: neither alone explains much
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,17 +67,17 @@ def identify_loops(
     ``growing`` only the configured keys are fitted, which is fast.
     """
     if axis is not None and axis.regulators.structure == "linuxcnc_pid":
-        return None  # its gains are those of the HAL files, and no other structure stands in for it
+        return None  # its gains are those of the HAL files, and no other structure is equivalent
     on_time = [with_demand_on_time(window, axis, sync_period_s)[0] for window in windows[-MOST_WINDOWS:]]
     pairs = list(zip(on_time, mechanics[-MOST_WINDOWS:], strict=True))
-    told = [(rapid, own) for w, own in pairs if (rapid := rapid_of(w, own, sync_period_s)) is not None]
-    if not told:
+    usable = [(rapid, own) for w, own in pairs if (rapid := rapid_of(w, own, sync_period_s)) is not None]
+    if not usable:
         return None
-    rapids = tuple(rapid for rapid, _ in told)
+    rapids = tuple(rapid for rapid, _ in usable)
     following = rms(np.concatenate([one.lag_mm[one.known] for one in rapids])) * 1e3
     tolerance = settings.tolerance_for(following)
     problem = _problem(rapids, axis, windows[0])
-    modelled = tuple(replace(rapid, plant=own, load_nm=np.zeros_like(rapid.load_nm)) for rapid, own in told)
+    modelled = tuple(replace(rapid, plant=own, load_nm=np.zeros_like(rapid.load_nm)) for rapid, own in usable)
     if growing:
         found = _whole_delay(_of_either(problem, modelled, tolerance, axis is not None))
     else:
@@ -134,7 +134,7 @@ def _names(regulators: Regulators) -> tuple[str, ...]:
 
 def _best(begun: Fit, tolerance_um: float, configured: bool) -> Fit:
     best = _grown(begun, tolerance_um)
-    if configured and best.unexplained_um > tolerance_um:  # the configuration may have led astray
+    if configured and best.unexplained_um > tolerance_um:  # the configuration may be a bad start
         best = min(best, _grown(loop_fit.fit(begun_anew(begun.problem)), tolerance_um), key=lambda f: f.unexplained_um)
     if best.problem.names == CASCADE and beyond_rounding_um(best) < enough_um(tolerance_um):
         return best
@@ -243,18 +243,20 @@ def _verdict(made: Fit, tolerance_um: float, following_um: float, configured_um:
     left = made.unexplained_um
     reasons, warnings = [], []
     if not left <= tolerance_um:
-        text = f"the best loops leave {left:.3g} um of a following error of {following_um:.3g} um"
-        advice = "the drive has a structure or a filter that is not known; identification.tolerance_um may be raised"
+        text = f"the best loops leave {left:.3g} um of a following error of {following_um:.3g} um unexplained"
+        advice = (
+            "the drive has an unknown structure or filter; check its regulators, or raise identification.tolerance_um"
+        )
         reasons.append(Reason("LoopsUnexplained", f"{text}, more than {tolerance_um:.3g} um", advice))
     elif configured_um is not None and configured_um - left > WORTH * tolerance_um:
         text = f"the configured regulators leave {configured_um:.3g} um of a following error of {following_um:.3g} um"
-        advice = "put what was found into [axis.X.regulators]"
-        warnings.append(Reason(DIFFER, f"{text}, those found {left:.3g} um", advice))
+        advice = "write the identified values to [axis.X.regulators]"
+        warnings.append(Reason(DIFFER, f"{text}, the identified ones {left:.3g} um", advice))
     doubts = np.sqrt(np.diag(loop_fit.covariance_of(made)))
     for n, doubt in zip(made.problem.names, doubts, strict=True):
         if KEYS[n].scale == 0.0 and doubt > LOOSE:
-            text = f"{n} is known to {100 * doubt:.0f} % only"
-            warnings.append(Reason("LoopsUndetermined", text, "let the axis accelerate harder"))
+            text = f"the standard deviation of {n} is {100 * doubt:.0f} %, limit {100 * LOOSE:.0f} %"
+            warnings.append(Reason("LoopsUndetermined", text, "record rapids with a higher acceleration"))
     return Verdict(not reasons, None, tuple(reasons), left, tuple(warnings))
 
 

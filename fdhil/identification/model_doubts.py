@@ -16,7 +16,7 @@ from fdhil.identification.kalman import CD, FT, K, L, R
 from fdhil.records import Float
 
 SHARES: Mapping[int, float] = {R: 0.008, L: 0.03, K: 0.0003}
-CURVE_SHARE = 0.004  # of the friction at top speed, by which a straight line over speed misses it
+CURVE_SHARE = 0.004  # of the friction at top speed: its deviation from a straight line over speed
 CROSSING = 1.5  # top speed over the one at which the straight line meets the curve again
 
 

@@ -14,11 +14,11 @@ from fdhil.identification.windows import RUN_SHARE, bridged, carried, noise_of, 
 from fdhil.model.feed_drive import interval_shape
 from fdhil.records import Bool, Float, SlowVoltage, VoltageSampling, Window
 
-UNKNOWN = 0  # stuck, reversing or about to move: the friction torque is not known
-# what the model can explain at best, as a share of a signal's peak: the voltage's course within a sample is not known
+UNKNOWN = 0  # stuck, reversing or about to move: the friction torque is unknown
+# best possible accuracy of the model, as a share of a signal's peak: the voltage's waveform within a sample is unknown
 SHAPE_SHARE = (3e-4, 1e-4, 1e-4)
-BROKEN = 9  # a sample is lost: nothing is known over this interval
-DIFFUSE = 1e6  # variance, in units of the measurement's, of a state about which nothing is known
+BROKEN = 9  # a sample is lost: the interval is skipped
+DIFFUSE = 1e6  # variance, in units of the measurement's, of an unknown state
 
 Modes = npt.NDArray[np.int8]
 
@@ -126,7 +126,7 @@ class Motion:
         return replace(self, voltage_mean=self.delayed(delay_s))
 
     def delayed(self, delay_s: float) -> Float:
-        """Return the mean voltage (n,) of each interval, corrected for a measured voltage that is late by ``delay_s``."""
+        """Return the mean voltage (n,) of each interval, corrected for a voltage that is late by ``delay_s``."""
         if delay_s == 0.0:
             return self.voltage_mean
         rows = delay_s / self.dt_s
@@ -160,7 +160,7 @@ def prepare(window: Window) -> Motion:
     sure = surely_moving(window.speed_rad_s, window.rapid_speed_rad_s)
     side = np.sign(carried(window.speed_rad_s)).astype(np.int8)
     mode = np.where(sure, np.sign(_majority(side, sure)), UNKNOWN).astype(np.int8)
-    mode[:-1][mode[:-1] != mode[1:]] = UNKNOWN  # an interval belongs to a motion when both its ends do
+    mode[:-1][mode[:-1] != mode[1:]] = UNKNOWN  # both ends of an interval must be in the same motion
     if slow is not None:
         mean, rise = carried(slow.voltage_v), np.zeros(slow.voltage_v.size)
     elif window.voltage_v is not None:

@@ -17,7 +17,7 @@ from fdhil.identification.windows import carried
 from fdhil.model.feed_drive import simulate_plant
 from fdhil.records import PARAMETERS, Estimate, Float, Parameters, Window
 
-MOVES: Mapping[str, Callable[[Float], Float]] = {  # share (n,) of the voltage over the share (n,) of the time
+MOVES: Mapping[str, Callable[[Float], Float]] = {  # share (n,) of the voltage over that of the time
     "steps of voltage in both directions": lambda t: np.array([0.0, 0.5, 1.0, -1.0, -0.5, 0.0])[(t * 6).astype(int)],
     "fast chirp about half the voltage": lambda t: 0.5 + 0.5 * np.sin(2 * np.pi * (2.0 + 60.0 * t) * t),
     "slowly in both directions": lambda t: np.where(t < 0.5, 0.15, -0.15),

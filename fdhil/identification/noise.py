@@ -13,7 +13,7 @@ from fdhil.records import Float
 ITERATIONS = 12
 STEP = 0.05
 LARGEST = 1.0
-ENOUGH = 0.15  # what such a step leaves is less than the data can tell
+ENOUGH = 0.15  # smaller steps are below the data's resolution
 
 
 def fit_noise(motion: Motion, theta: Float, start: Noise) -> Noise:

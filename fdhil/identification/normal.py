@@ -13,8 +13,8 @@ from fdhil.model.compiled import compiled
 from fdhil.records import Float
 
 NIL = 1e-15  # of the largest power: below it a direction is rounding
-ROUNDING = 1e-16  # of two powers: below it they need no turn
-SWEEPS = 30  # of Jacobi's rotations: six do for any matrix of this size
+ROUNDING = 1e-16  # of two powers: below it no rotation is needed
+SWEEPS = 30  # of Jacobi rotations: six suffice for any matrix of this size
 
 
 def solve(phi: Float, y: Float) -> tuple[Float, float]:

@@ -17,20 +17,20 @@ from fdhil.identification.ripple_parts import as_amplitude, as_parts
 from fdhil.identification.slow_rows import leaves_steps_open
 from fdhil.records import PARAMETERS, Estimate, Float, Int, Window, frozen
 
-# of a doubt that windows of one drive share, what may still differ between them: its size depends on the regulators,
-# which are the same, and a little on the move
+# share of a common doubt that may still differ between windows of one drive: it depends on the regulators, which are
+# the same, and a little on the move
 UNSHARED = 0.2
-JOINS = 3.3  # standard deviations: of a thousand pools of a drive without a load, one is given one
-LEAST_BEYOND = 0.5  # of the range of the windows' values, by which a common one may lie outside of them
-LEAST_SHARE = 1e-6  # of a parameter's size: what is not told more narrowly than rounding
-BY_DIRECTION = {"load": "Cd", "viscous": "ft"}  # what the direction changes, and of which parameter
+JOINS = 3.3  # standard deviations: one false load in a thousand pools
+LEAST_BEYOND = 0.5  # of the windows' range, by which a common value may lie outside it
+LEAST_SHARE = 1e-6  # of a parameter's size: rounding
+BY_DIRECTION = {"load": "Cd", "viscous": "ft"}  # term by direction: the parameter that it changes
 
 
 def member(window: Window, estimate: Estimate, place: int = 0) -> Member:
-    """Return a window's estimate ready to be pooled: own covariance separated from the doubts that all windows share."""
+    """Return a window's estimate ready to be pooled: own covariance separated from the doubts shared by all windows."""
     own, systematic, alias = _parts(window, estimate)
-    told = np.isfinite(estimate.values) & np.isfinite(np.diag(estimate.covariance))
-    kept = [k for k, name in enumerate(estimate.names) if told[k] and name not in estimate.given]
+    finite = np.isfinite(estimate.values) & np.isfinite(np.diag(estimate.covariance))
+    kept = [k for k, name in enumerate(estimate.names) if finite[k] and name not in estimate.given]
     doubts = np.column_stack([np.diag(alias)[:, : len(PARAMETERS)], systematic])
     names = tuple(estimate.names[k] for k in kept)
     values, own, doubts = as_parts(names, estimate.values[kept], own[np.ix_(kept, kept)], doubts[kept])
@@ -45,14 +45,14 @@ def pooled(members: Sequence[Member], first: Estimate, apart: Between, *, joinin
     """
     names = _common(members)
     joined: list[str] = []
-    told = _Stack.of(members, names, apart)
-    answer = _solved(told, joined)
-    if _is_beyond_all(answer, told):
+    stack = _Stack.of(members, names, apart)
+    answer = _solved(stack, joined)
+    if _is_beyond_all(answer, stack):
         members = [replace(m, own=np.diag(np.diag(m.own))) for m in members]
-        told = _Stack.of(members, names, apart)
-        answer = _solved(told, joined)
+        stack = _Stack.of(members, names, apart)
+        answer = _solved(stack, joined)
     while joining:
-        trials = {term: _solved(told, [*joined, term]) for term in _open(members, names, joined)}
+        trials = {term: _solved(stack, [*joined, term]) for term in _open(members, names, joined)}
         surest = max(trials, key=lambda term: trials[term].surety(), default=None)
         if surest is None or trials[surest].surety() < JOINS:
             break
@@ -61,14 +61,14 @@ def pooled(members: Sequence[Member], first: Estimate, apart: Between, *, joinin
     return _estimate(answer, names, joined, first)
 
 
-def _is_beyond_all(answer: _Solution, told: _Stack) -> bool:
+def _is_beyond_all(answer: _Solution, stack: _Stack) -> bool:
     """Return whether R, L, K or Jt lies outside the range of all windows.
 
     Shared doubts that tie parameters together more than windows agree move the common value away from each of them.
     """
-    for k, name in enumerate(told.names):
+    for k, name in enumerate(stack.names):
         if name in ("R", "L", "K", "Jt"):
-            own = told.values[told.which == k]
+            own = stack.values[stack.which == k]
             if not own.min() - LEAST_BEYOND * np.ptp(own) <= answer.values[k] <= own.max() + LEAST_BEYOND * np.ptp(own):
                 return True
     return False
@@ -99,15 +99,15 @@ class _Solution:
         return abs(float(self.values[-1])) / float(np.sqrt(self.chance[-1, -1]))
 
 
-def _solved(told: _Stack, joined: Sequence[str]) -> _Solution:
-    of = [told.names.index(BY_DIRECTION[term]) for term in joined]
-    columns = np.equal.outer(told.which, np.arange(len(told.names))).astype(np.float64)
-    columns = np.column_stack([columns, *(np.where(told.which == k, told.side, 0.0) for k in of)])
-    unit = np.concatenate([told.unit, told.unit[of]])
-    phi = columns * unit / told.unit[told.which][:, None]
-    chance = np.linalg.inv(phi.T @ told.weight @ phi)
-    gain = chance @ phi.T @ told.weight / told.unit[told.which]
-    return _Solution(gain @ told.values * unit, chance * np.outer(unit, unit), (gain @ told.shared) * unit[:, None])
+def _solved(stack: _Stack, joined: Sequence[str]) -> _Solution:
+    of = [stack.names.index(BY_DIRECTION[term]) for term in joined]
+    columns = np.equal.outer(stack.which, np.arange(len(stack.names))).astype(np.float64)
+    columns = np.column_stack([columns, *(np.where(stack.which == k, stack.side, 0.0) for k in of)])
+    unit = np.concatenate([stack.unit, stack.unit[of]])
+    phi = columns * unit / stack.unit[stack.which][:, None]
+    chance = np.linalg.inv(phi.T @ stack.weight @ phi)
+    gain = chance @ phi.T @ stack.weight / stack.unit[stack.which]
+    return _Solution(gain @ stack.values * unit, chance * np.outer(unit, unit), (gain @ stack.shared) * unit[:, None])
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +158,7 @@ def _between(
         np.array([shares.get(name, 0.0) * apart.sizes.get(name, 0.0) ** 2 for name in names])[which]
         for shares in (apart.walk, apart.scatter)
     )
-    # two windows share the way from the newer of them to the newest
+    # two windows share the walk from the newer of them to the newest
     total = np.where(np.equal.outer(which, which), walk * np.minimum.outer(back, back), 0.0)
     together: Float = total + np.diag(scatter)
     return together
@@ -258,7 +258,7 @@ def _parts(window: Window, estimate: Estimate) -> tuple[Float, Float, Float]:
     """Return the covariance (k, k) of a window's own chance, and the doubts (k, q) and (k,) that it shares."""
     size = len(estimate.names)
     systematic = np.zeros((size, 0))
-    if estimate.systematic is not None:  # told of the first names
+    if estimate.systematic is not None:  # covers the first names only
         systematic = np.pad(estimate.systematic, ((0, size - len(estimate.systematic)), (0, 0)))
     slow = window.slow_voltage
     period = window.dt_s if slow is None else slow.period_s

@@ -18,23 +18,23 @@ _AMPLITUDE = re.compile(r"ripple_(screw|motor)_[0-9]+")
 
 def as_parts(names: Sequence[str], values: Float, covariance: Float, doubts: Float) -> tuple[Float, Float, Float]:
     """Return values (k,), covariance (k, k) and doubts (k, q) with each ripple split into its parts."""
-    told, slopes = values.copy(), np.eye(values.size)
+    converted, slopes = values.copy(), np.eye(values.size)
     for a, p in _pairs(names):
         size, sine, cosine = values[a], np.sin(values[p]), np.cos(values[p])
-        told[[a, p]] = size * cosine, size * sine
+        converted[[a, p]] = size * cosine, size * sine
         slopes[np.ix_([a, p], [a, p])] = [[cosine, -size * sine], [sine, size * cosine]]
-    return told, slopes @ covariance @ slopes.T, slopes @ doubts
+    return converted, slopes @ covariance @ slopes.T, slopes @ doubts
 
 
 def as_amplitude(names: Sequence[str], values: Float, covariance: Float, doubts: Float) -> tuple[Float, Float, Float]:
     """Return the same with the parts combined into amplitude and phase."""
-    told, slopes = values.copy(), np.eye(values.size)
+    converted, slopes = values.copy(), np.eye(values.size)
     for a, p in _pairs(names):
         size = max(float(np.hypot(values[a], values[p])), 1e-300)
         sine, cosine = values[p] / size, values[a] / size
-        told[[a, p]] = size, np.arctan2(values[p], values[a])
+        converted[[a, p]] = size, np.arctan2(values[p], values[a])
         slopes[np.ix_([a, p], [a, p])] = [[cosine, sine], [-sine / size, cosine / size]]
-    return told, slopes @ covariance @ slopes.T, slopes @ doubts
+    return converted, slopes @ covariance @ slopes.T, slopes @ doubts
 
 
 def _pairs(names: Sequence[str]) -> Iterator[tuple[int, int]]:

@@ -34,13 +34,13 @@ from fdhil.records import Estimate, Float
 Rows = npt.NDArray[np.intp]
 
 ROUNDS = 3
-MOST = 8  # courses in all
-IMITATED = 1e-6  # share of a direction below which only rounding is left of it
-WORTH = 0.005  # of the motor's torque (RMS): a tenth of the share of the following error that is tolerated
-SHIFT = 1.0  # standard deviations of one of the six: a smaller shift is within its interval anyway
+MOST = 8  # regressors in all
+IMITATED = 1e-6  # share of a direction below which only rounding remains
+WORTH = 0.005  # of the motor's torque (RMS): a tenth of the tolerated share of the following error
+SHIFT = 1.0  # standard deviations of one of the six: a smaller shift is within its interval
 SIX = 6
-LEAST_SURE = 3.5  # standard deviations of a term, colour and all else that was chosen included
-LATE = "late"  # the candidate that is a delay of the voltage, and no term
+LEAST_SURE = 3.5  # standard deviations of a term, with colour and all other terms
+LATE = "late"  # the candidate that is a delay of the voltage, not a term
 SURE_DELAY = 5.0  # standard deviations beyond which a delay is accepted
 
 
@@ -144,7 +144,7 @@ def _chosen(base: Fit, left: Sequence[Candidate], delayed: bool) -> tuple[_Bench
     while bench.left.size and len(found) < room:
         scores = bench.scores()
         plain = scores.gains - _price(scores.freedom, bench.rows, number)
-        hopeful = np.flatnonzero(plain > 0.0)  # were all innovations independent
+        hopeful = np.flatnonzero(plain > 0.0)  # if all innovations were independent
         if not hopeful.size:
             break
         colour = bench.colour(scores, hopeful)
@@ -212,16 +212,16 @@ class _Bench:
         columns = np.column_stack([doubts, base.jacobian, answer, *late, np.zeros(len(base.residuals))])
         sizes = [len(c.courses[0]) for c in left]
         first = begin + np.cumsum([0, *sizes])[:-1]
-        nil = columns.shape[1] - 1
-        places = np.array([first, np.where(np.array(sizes) == 2, first + 1, nil)], dtype=np.intp)
-        places[0, [c.family == LATE for c in left]] = nil - 1
+        zero_column = columns.shape[1] - 1
+        places = np.array([first, np.where(np.array(sizes) == 2, first + 1, zero_column)], dtype=np.intp)
+        places[0, [c.family == LATE for c in left]] = zero_column - 1
         rows, free = np.arange(len(left)), list(range(begin))
         gram = np.diag(np.einsum("mp,mp->p", columns, columns))
         gram[tuple(places)] = gram[tuple(places[::-1])] = np.einsum("mc,mc->c", *(columns[:, p] for p in places))
         pulls = columns.T @ base.residuals
         made = cls(base, left, columns, gram, pulls, doubts.shape[1], places, rows, free, delayed)
         made._fill(free)
-        gram[range(doubts.shape[1]), range(doubts.shape[1])] += 1.0  # one deviation of them is all that is expected
+        gram[range(doubts.shape[1]), range(doubts.shape[1])] += 1.0  # their prior: one standard deviation
         return made
 
     def _fill(self, rows: list[int]) -> None:

@@ -23,17 +23,17 @@ from fdhil.records import Bool, Float, Window, read_only
 
 SpeedSource = Literal["auto", "sensor", "difference", "filtered"]
 
-SURE = 5.0  # standard deviations beyond which a lag is believed
-LEAST = 0.05  # of a row: a smaller lag is less than the regulators' doing within a row
-LARGEST_S = 0.020  # no drive shows a speed that is older
-SMOOTHING_S = 0.005  # over which the acceleration is taken
-EXPLAINED = 2.0  # of its own scatter from row to row: what may be left between speed and position
-FLOOR = 1e-3  # of the top speed, of the same
-SURELY_LESS = 0.5  # of the squares that the most usual lag leaves: by less, another is not told from it
-FINER = 0.5  # noise of the position's derivative, of that of the mended speed, for it to take its place
+SURE = 5.0  # standard deviations of a significant lag
+LEAST = 0.05  # of a sample: a smaller lag is less than the regulators' effect within a sample
+LARGEST_S = 0.020  # no drive reports an older speed
+SMOOTHING_S = 0.005  # of the acceleration
+EXPLAINED = 2.0  # of the noise: allowed RMS difference between speed and position
+FLOOR = 1e-3  # of the top speed, added to it
+SURELY_LESS = 0.5  # of the squares by the most usual lag: another one must have fewer
+FINER = 0.5  # of the aligned speed's noise: the position's derivative must have less to replace it
 LEAST_ROWS = 32
-NIL = 1e-6  # of a filter's answer: what is left out of it
-REACH = 3  # rows about a lost one that cannot be mended
+NIL = 1e-6  # of a filter's response: the part that is left out
+REACH = 3  # samples about a lost one that cannot be aligned
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,7 @@ def mended(window: Window, source: SpeedSource = "auto") -> Window:
 
 @lru_cache(maxsize=12)
 def _mended(window: Window, source: SpeedSource) -> Window:
-    with np.errstate(over="ignore", invalid="ignore"):  # a signal that no drive has tells no lag
+    with np.errstate(over="ignore", invalid="ignore"):  # implausible signals yield no lag
         found = lag_of(window, source)
     if found is None:
         return window
@@ -100,13 +100,13 @@ def lag_of(window: Window, source: SpeedSource = "auto") -> Lag | None:
     it.
     """
     dt = window.dt_s
-    told = _lateness(window)
+    lateness = _lateness(window)
     if source == "difference":
-        std = told[1] if told is not None else 0.0
+        std = lateness[1] if lateness is not None else 0.0
         return Lag(0.5 * dt, min(std, 0.1 * dt), mean=True)
-    if told is None:
+    if lateness is None:
         return None
-    late, std = told
+    late, std = lateness
     if source == "auto" and late < max(SURE * std, LEAST * dt):
         return None
     if not 0.0 < late < LARGEST_S:
@@ -114,7 +114,7 @@ def lag_of(window: Window, source: SpeedSource = "auto") -> Lag | None:
     angle, speed, rows = _angle(window), bridged(window.speed_rad_s), _moving(window)
     possible = _possible(late, std, dt)
     left = [_left(speed, lag.seen(angle, dt), rows) for lag in possible]
-    # from row to row there is the position's own noise, of which a filter passes less
+    # between samples there is the position's own noise, of which a filter passes less
     powers = [float(np.square(moving_mean(e, 2 * round(SMOOTHING_S / dt) + 1)).sum()) for e in left]
     best = int(np.argmin(powers))
     best = best if powers[best] < SURELY_LESS * powers[0] else 0
@@ -149,7 +149,7 @@ def _lateness(window: Window) -> tuple[float, float] | None:
     weights = inverse @ (columns.T @ speed)
     left = speed - columns @ weights
     scores = (columns @ inverse[:, :1]) * left[:, None]
-    variance = float(summed(scores)[0, 0])  # noise of either may hang together over rows
+    variance = float(summed(scores)[0, 0])  # noise of either may correlate over samples
     if not (math.isfinite(condition) and 0.0 <= variance < np.inf and weights[1] != 0.0):
         return None
     deviation = math.sqrt(variance)

@@ -26,7 +26,7 @@ DELAY_DIFFERENCE_S = 1e-6
 LEAST_DIFFERENCE_S = 1e-8
 LEAST_SHARE, MOST_SHARE = 1e-3, 256.0
 REACH, SPACING = 1.5, 0.125  # samples of the voltage
-GAIN = 1e-3  # of twice the log likelihood: a step that gains less moves nothing by more than some hundredths
+GAIN = 1e-3  # of twice the log likelihood: smaller gains move theta by some hundredths of a deviation
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class Likelihood:
     def _delay_step(self, delay_s: float) -> float:
         rooms = [room_s(motion, delay_s) for motion in self.motions]
         earlier, later = min(room[0] for room in rooms), min(room[1] for room in rooms)
-        # a longer delay puts a sample earlier
+        # a longer delay moves a sample earlier
         step = min(DELAY_DIFFERENCE_S, max(max(earlier, later) / 2, LEAST_DIFFERENCE_S))
         return step if earlier >= later else -step
 
@@ -85,7 +85,7 @@ def ascend(likelihood: Likelihood, theta: Float, free: Sequence[int], sizes: Flo
             return theta, white, mean, True
         found = _along(likelihood, theta, here, free, step)
         if found is None:
-            return theta, white, mean, True  # nothing more likely along the step: this is the top, to rounding
+            return theta, white, mean, True  # nothing likelier along the step: the maximum, to rounding
         gained, (theta, here) = here.cost - found[1].cost, found
         if gained < GAIN:
             return theta, here.whitened, mean, True

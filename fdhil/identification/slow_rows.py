@@ -26,13 +26,14 @@ from fdhil.identification.windows import RUN_SHARE
 from fdhil.model.closed_loop import simulate
 from fdhil.records import PARAMETERS, Float, Parameters, Window, rms
 
-LEAST_ROW_S = 0.003  # in shorter rows the first two are less than a regulator's own doing
-ROW_S, OFF_MEAN = 0.010, 0.08  # at such rows, with a speed loop of 40 Hz; a slower loop answers less
-STEPPED_ROW_S, STEPPED = 0.0015, 0.08  # from such rows on, of the accelerating current, where set-points may step
-
-
-LEFT_OPEN = 0.2  # of what known loops tell: they are known to a tenth or so
-SAME_GRID = 1e-3  # of a row, by which it may differ from the cycle of the set-points
+LEAST_ROW_S = 0.003  # in shorter samples the first two are less than the regulator's own effect
+ROW_S, OFF_MEAN = 0.010, 0.08  # at such samples, with a speed loop of 40 Hz; a slower loop responds less
+STEPPED_ROW_S, STEPPED = (
+    0.0015,
+    0.08,
+)  # from such samples on, share of the accelerating current where set-points may step
+LEFT_OPEN = 0.2  # of what known loops determine: they are known to about a tenth
+SAME_GRID = 1e-3  # of a sample: tolerance of the set-points' cycle
 
 
 def with_open_course(motion: Motion, theta: Float, off_a: Float | None = None) -> Motion:

@@ -29,10 +29,10 @@ from fdhil.records import Estimate, Float, Window
 SPAN_S = 0.025
 SPAN_SAMPLES = 3
 SHIFTS_PER_SAMPLE = 4
-IMPROVEMENT = 1.5  # the residual's power must fall by this factor before a shift is believed
+IMPROVEMENT = 1.5  # the residual's power must fall by this factor for a shift to be accepted
 LEAST_SAMPLES = 16
-BEYOND_NOISE = 3.0  # of the variance that noise gives: what five rows rarely exceed by chance
-TIME_CONSTANT_S, LEAST_TIME_CONSTANT_S = 3e-3, 1e-4  # of a winding: a usual one, and what none has
+BEYOND_NOISE = 3.0  # of the noise's variance: five samples rarely exceed it by chance
+TIME_CONSTANT_S, LEAST_TIME_CONSTANT_S = 3e-3, 1e-4  # of a winding: usual, and least possible
 FLOORS = 10.0 ** np.arange(-6.0, 1.01, 0.5)  # of the variance of the current's second difference that is noise
 
 
@@ -47,7 +47,7 @@ def slow_start(windows: Sequence[Window], settings: Identification) -> tuple[Flo
     electrical, mechanical = rows
     theta = solve_two_steps(electrical, mechanical)[0][ORDER]
     if theta[R] > 0.0 and theta[L] < LEAST_TIME_CONSTANT_S * theta[R]:
-        # so coarse a delay is taken for L: the voltage R i + L di/dt is that of R i, earlier by L / R
+        # so coarse a delay is mistaken for L: R i + L di/dt is like R i, earlier by L / R
         shifts = [shift + TIME_CONSTANT_S - float(theta[L] / theta[R]) for shift in shifts]
         theta[L] = TIME_CONSTANT_S * theta[R]
     return theta, shifts, [prepare(w) for w in windows]

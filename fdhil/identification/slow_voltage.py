@@ -23,7 +23,7 @@ from fdhil.identification.kalman import DELAY, JT, NO_SAMPLE, K, Marks, Readings
 from fdhil.identification.motion import Motion
 from fdhil.records import Float, read_only
 
-CURRENT_LATE_S, CURRENT_LATE = 1e-5, 0.01  # in s, and of a row: one standard deviation, see course_effect()
+CURRENT_LATE_S, CURRENT_LATE = 1e-5, 0.01  # in s, and of a sample: one standard deviation, see below
 CURRENT_ABOVE = 2.5e-4  # of the accelerating current, one standard deviation
 CORNER_ROWS = 5
 SMOOTH_ROWS = 15
@@ -130,7 +130,7 @@ def course_effect(motion: Motion, theta: Float, variances: Float) -> Float:
     """
     slope = np.gradient(moving_mean(motion.current, CORNER_ROWS))
     accelerating = theta[JT] / theta[K] * np.gradient(moving_mean(motion.speed, SMOOTH_ROWS), motion.dt_s)
-    late_rows = max(CURRENT_LATE, CURRENT_LATE_S / motion.dt_s)  # finer rows make no finer regulators
+    late_rows = max(CURRENT_LATE, CURRENT_LATE_S / motion.dt_s)  # shorter samples do not make regulators faster
     mean = replace(motion, current=motion.current + late_rows * slope - CURRENT_ABOVE * accelerating)
     changed: Float = innovations_of(mean, theta, variances).whitened
     return changed - innovations_of(motion, theta, variances).whitened
@@ -147,7 +147,7 @@ def left_open_v(motion: Motion, theta: Float, variances: Float) -> float:
 
 
 def in_order(motion: Motion, delay_s: float, columns: Float) -> Float:
-    """Return sums (n, k) by sample of values that belong to innovations (2 n + m, k): a voltage sample's where it ends."""
+    """Return sums (n, k) by sample of values of innovations (2 n + m, k): a voltage sample counts where it ends."""
     n = motion.n
     by_row: Float = columns[: 2 * n].reshape(n, 2, -1).sum(axis=1)
     if motion.slow is None:

@@ -22,19 +22,19 @@ from fdhil.identification.spring_torques import LEAST_SHARE, MOST_OF_ROWS, MOST_
 from fdhil.records import Float
 
 RESONANCE, SHARE, DAMPING = "resonance", "resonance_share", "resonance_damping"
-USUAL_DAMPING, DAMPING_DOUBT = 0.03, 0.02  # the ratio of ordinary screws: it hardly shows
-USUAL_SHARE, SHARE_DOUBT = 0.5, 0.15  # of the inertia behind the spring, before any data
-TOLD_DOUBT = 0.05  # relative, of a resonance that is configured
-FOUND_DOUBT = 1.0  # relative, of one that is sought
-GRID = np.geomspace(40.0, 320.0, 24)  # Hz, where one is sought
-AROUND = np.array([0.92, 0.96, 1.0, 1.04, 1.08])  # of a configured resonance, where it may begin
-FAR, FIRM = 0.35, 1e4  # relative, of a resonance from the configured one; of the prior's information, to hold it
+USUAL_DAMPING, DAMPING_DOUBT = 0.03, 0.02  # of ordinary screws: the data hardly show it
+USUAL_SHARE, SHARE_DOUBT = 0.5, 0.15  # prior of the inertia behind the spring
+TOLD_DOUBT = 0.05  # relative, of a configured resonance
+FOUND_DOUBT = 1.0  # relative, of a searched one
+GRID = np.geomspace(40.0, 320.0, 24)  # Hz, of the search
+AROUND = np.array([0.92, 0.96, 1.0, 1.04, 1.08])  # of a configured resonance: starts of the fit
+FAR, FIRM = 0.35, 1e4  # relative distance from the configured resonance; factor of the prior that fixes it
 TURNS = 4
 SETTLED = np.array([0.005, 0.01])  # relative in f, and in s
-STEP = 0.02  # of f and s, over which their derivatives are taken
-SURE = 40.0  # fall of minus twice the log likelihood, of which chance explains one in millions of a grid
-NEAR_REST_S = 0.025  # in which the motor does not tell when the table breaks loose, or stops
-LEAST_NOISE = 0.3  # of what readings show: with less, a swing that is not quite right would be no chance at all
+STEP = 0.02  # of f and s, for their derivatives
+SURE = 40.0  # fall of minus twice the log likelihood: by chance once in millions of grids
+NEAR_REST_S = 0.025  # in which the motor does not show when the table breaks away, or stops
+LEAST_NOISE = 0.3  # of the visible noise: with less, an inexact vibration would be impossible by chance
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,23 +78,23 @@ def sprung(base: Fit, axis: Axis | None) -> Fit | None:
     motion = base.problem.motions[0]
     if motion.slow is not None or not base.converged or not np.isfinite(base.residuals).all():
         return None
-    told = None
+    expected = None
     if axis is not None and axis.resonance_hz is not None:
-        told = Told(axis.resonance_hz, TOLD_DOUBT * axis.resonance_hz, axis.resonance_damping)
-    grid = GRID if told is None else AROUND * told.hertz
-    # of a configured one that rows do not tell, they tell what it does below
-    grid = grid[grid * motion.dt_s < MOST_OF_ROWS * (1 if told is None else 2)]
+        expected = Told(axis.resonance_hz, TOLD_DOUBT * axis.resonance_hz, axis.resonance_damping)
+    grid = GRID if expected is None else AROUND * expected.hertz
+    # a configured resonance above the samples' band still acts below it
+    grid = grid[grid * motion.dt_s < MOST_OF_ROWS * (1 if expected is None else 2)]
     if not grid.size:
         return None
     scores = _scores(base, grid)
     best = float(grid[int(np.argmax(scores))])
-    if told is None and scores.max() < SURE:
+    if expected is None and scores.max() < SURE:
         return None
-    known = told or Told(best, FOUND_DOUBT * best)
+    known = expected or Told(best, FOUND_DOUBT * best)
     found = _turned(base, Spring(best, USUAL_SHARE, known.damping), known)
-    if told is not None:
+    if expected is not None:
         if found is None:
-            found = _turned(base, Spring(told.hertz, USUAL_SHARE, told.damping), replace(told, firm=True))
+            found = _turned(base, Spring(expected.hertz, USUAL_SHARE, expected.damping), replace(expected, firm=True))
         return None if found is None else found[0]
     return found[0] if found is not None and _cost(base) - found[1] > SURE else None
 
@@ -111,7 +111,7 @@ def _scores(base: Fit, grid: Float) -> Float:
     return scores
 
 
-def _turned(base: Fit, spring: Spring, told: Told) -> tuple[Fit, float] | None:
+def _turned(base: Fit, spring: Spring, expected: Told) -> tuple[Fit, float] | None:
     plain, theta = base.problem.motions[0], base.theta
     free = (*base.free, theta.size, theta.size + 1)
     noises: Sequence[Noise] = ()
@@ -119,15 +119,15 @@ def _turned(base: Fit, spring: Spring, told: Told) -> tuple[Fit, float] | None:
         made = fit([_bent(plain, theta, spring)], np.append(theta, [0.0, 0.0]), free, noises)
         if not made.converged or not np.isfinite(made.residuals).all():
             return None
-        made, noises = _with_prior(made, spring, told), made.problem.noises
+        made, noises = _with_prior(made, spring, expected), made.problem.noises
         theta, before = made.theta[:-2], spring
         spring = spring.moved(*made.theta[-2:])
-        if not told.allows(spring):
+        if not expected.allows(spring):
             return None
         if (np.abs([spring.hertz / before.hertz - 1, spring.share - before.share]) < SETTLED).all():
             break
     torques = Torques.of(plain, theta)
-    cost = _cost(made) + told.cost(spring) + torques.squeezed(torques.answer(spring))
+    cost = _cost(made) + expected.cost(spring) + torques.squeezed(torques.answer(spring))
     return replace(made, delay_doubt_s=base.delay_doubt_s), cost
 
 
@@ -162,12 +162,12 @@ def _surely(motion: Motion) -> Modes:
     return mode
 
 
-def _with_prior(made: Fit, spring: Spring, told: Told) -> Fit:
+def _with_prior(made: Fit, spring: Spring, expected: Told) -> Fit:
     prior, std = np.zeros((2, len(made.free)))
-    prior[-2:], std[-2:] = told.precision(), told.std
+    prior[-2:], std[-2:] = expected.precision(), expected.std
     information = made.information + np.diag(prior)
     theta, pull = made.theta.copy(), np.zeros(len(made.free))
-    pull[-2:] = prior[-2:] * (told.away(spring) - theta[-2:])
+    pull[-2:] = prior[-2:] * (expected.away(spring) - theta[-2:])
     theta[list(made.free)] += inverse_of(information)[0] @ pull
     problem = pose(made.problem.motions, theta, made.problem.noises)
     residuals = problem.residuals(theta)

@@ -27,10 +27,13 @@ from fdhil.records import Float
 
 Spectrum = npt.NDArray[np.complex128]
 
-MOST_OF_ROWS, SEEN_ORDER = 0.16, 12  # periods in a row, up to which rows tell a swing, and how sharply that ends
-RINGS_S = 0.5  # after which a spring has surely come to rest
+MOST_OF_ROWS, SEEN_ORDER = (
+    0.16,
+    12,
+)  # periods per sample up to which a vibration is visible, and the order of that limit
+RINGS_S = 0.5  # until a spring's vibration has decayed
 LEAST_SHARE, MOST_SHARE = 0.1, 0.9
-MOST_STEP = 0.25  # of f at once
+MOST_STEP = 0.25  # of f per step
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,8 +137,8 @@ class Torques:
         """Return a spring's frequency response."""
         ratio, swing = spring.share / (1.0 - spring.share), self._swing(spring)
         motor = 1.0 + ratio * swing
-        told = np.square(np.abs(motor)) * self.noise_current
-        return Answer(ratio, swing, motor, self.noise_speed / np.maximum(self.noise_speed + told, 1e-300))
+        noise = np.square(np.abs(motor)) * self.noise_current
+        return Answer(ratio, swing, motor, self.noise_speed / np.maximum(self.noise_speed + noise, 1e-300))
 
     def _swing(self, spring: Spring) -> Spectrum:
         w, square = 2 * math.pi * spring.hertz, self.p**2

@@ -31,7 +31,7 @@ Complex = npt.NDArray[np.complex128]
 
 MOVING = 0.15  # of the top speed: below it friction changes with speed
 LEAST_ROWS = 80
-FINEST = 0.03  # of the encoder's noise: the least that a speed's may be taken for
+FINEST = 0.03  # of the encoder's noise: least noise of the speed
 NIL = 1e-9
 
 
@@ -47,7 +47,7 @@ class Motor:
     dt_s: float
     place_mm: Float
     speed_mm_s: Float
-    turns: Float  # as an angle, rad
+    turns: Float  # angle of the shaft, rad
     push: Float
     rows: Bool
     omega: Float
@@ -64,7 +64,7 @@ class Motor:
         if np.count_nonzero(known) < LEAST_ROWS or not math.isfinite(scale):
             return None
         speed, push = bridged(window.speed_rad_s) * mm_per_rad, bridged(window.current_a) * scale
-        size = 2 * quick_size(speed.size)  # even, as the inverse transform takes it
+        size = 2 * quick_size(speed.size)  # even, for the inverse transform
         place, noise = _place(bridged(window.position_mm), speed, dt, size)
         slow = smooth(speed, dt)
         first, last = longest(known & (window.direction * slow > MOVING * np.abs(slow).max()))

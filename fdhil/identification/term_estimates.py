@@ -26,19 +26,19 @@ def told_terms(six: Estimate, result: Fit, values: Float, beyond: Float) -> tupl
     """
     names = (*PARAMETERS, *(course.name for course in result.problem.motions[0].courses))
     assert six.systematic is not None
-    covariance, systematic, told = six.covariance, six.systematic, values.copy()
-    told[len(PARAMETERS) :] += [course.about for course in result.problem.motions[0].courses]
+    covariance, systematic, extended = six.covariance, six.systematic, values.copy()
+    extended[len(PARAMETERS) :] += [course.about for course in result.problem.motions[0].courses]
     for name, value, own, effect in _chosen_before(result):
-        moved = np.pad(effect, (0, told.size - effect.size))
-        wider = np.empty((told.size + 1, told.size + 1))
+        moved = np.pad(effect, (0, extended.size - effect.size))
+        wider = np.empty((extended.size + 1, extended.size + 1))
         wider[:-1, :-1] = covariance + np.outer(moved, moved)
         wider[-1, :-1] = wider[:-1, -1] = own * moved
         wider[-1, -1] = own**2
-        covariance, told, names = wider, np.append(told, value), (*names, name)
+        covariance, extended, names = wider, np.append(extended, value), (*names, name)
         systematic, beyond = np.pad(systematic, ((0, 1), (0, 0))), np.pad(beyond, (0, 1))
-    beyond = as_amplitude(names, told, beyond, systematic)[1]
-    told, covariance, systematic = as_amplitude(names, told, covariance, systematic)
-    return replace(six, names=names, values=told, covariance=covariance, systematic=systematic), beyond
+    beyond = as_amplitude(names, extended, beyond, systematic)[1]
+    extended, covariance, systematic = as_amplitude(names, extended, covariance, systematic)
+    return replace(six, names=names, values=extended, covariance=covariance, systematic=systematic), beyond
 
 
 def _chosen_before(result: Fit) -> list[tuple[str, float, float, Float]]:

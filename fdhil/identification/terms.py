@@ -16,15 +16,15 @@ from fdhil.identification.kalman import LOAD, VOLTAGE
 from fdhil.identification.motion import Course, Motion
 from fdhil.records import Float
 
-SPEEDS = np.geomspace(0.02, 0.35, 8)  # of the top speed, at which friction at low speed may fall off
-SCREW_ORDERS = (1, 2)  # periods in a turn
+SPEEDS = np.geomspace(0.02, 0.35, 8)  # of the top speed: Stribeck speeds
+SCREW_ORDERS = (1, 2)  # periods per turn
 # of 2 to 8 pole pairs: sensors' zeros and gains once and twice an electrical turn, windings 6 times, slots
 MOTOR_ORDERS = (3, 4, 5, 6, 8, 10, 12, 16, 18, 20, 24, 30, 36)
-MOST_TURN = 0.9 * np.pi  # of a ripple in a row at top speed: beyond it another order looks the same
+MOST_TURN = 0.9 * np.pi  # of a ripple per sample at top speed: beyond it orders alias
 SMOOTHING_S = 0.005
-WHOLE_DEAD_TIME = 0.01  # of the peak current: from there on a dead time has its whole effect
-LEAST_TURN = 1e-9  # rad in an interval
-PHASE = "_phase"  # ends the name of a ripple's cosine, as of its phase
+WHOLE_DEAD_TIME = 0.01  # of the peak current: above it a dead time has its full effect
+LEAST_TURN = 1e-9  # rad per interval
+PHASE = "_phase"  # suffix of a ripple's cosine, and of its phase
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,4 +1,4 @@
-"""Analyses a parameter's history: its slope, its steps, when it reaches a limit, each with an interval. Pure functions."""
+"""Analyses a parameter's history: its slope, its steps, when it reaches a limit, each with an interval."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ import numpy as np
 from fdhil.records import INTERVAL_95, PARAMETERS, Float
 
 LEAST_ROWS = 3
-LEAST_STRETCH = 3  # rows on either side of a step: fewer may be one bad estimate
-NEWEST = 2  # rows after the newest step: two that agree are believed, as they are when they are taken in
-ENOUGH_FOR_DRIFT = 8  # rows from which on a steady drift is told apart from a step
+LEAST_STRETCH = 3  # rows on either side of a step: fewer may be a single bad estimate
+NEWEST = 2  # rows after the newest step: two that agree are accepted
+ENOUGH_FOR_DRIFT = 8  # rows from which on a steady drift is distinguished from a step
 ENOUGH_FOR_CURVE = 16
-NEAR = 8  # rows on either side in which a step must be seen too
+NEAR = 8  # rows on either side in which a step must be visible too
 BEYOND_CHANCE = 5.0
-# a date is told only of a slope that is so sure, seen over so long, and only so far ahead
+# a date is predicted only from a significant slope, over a minimum span, and only so far ahead
 SURE_SLOPE = 3.0  # standard deviations
 LEAST_DAYS = 1.0
 FARTHEST_SPANS = 5.0
-COLLINEAR = 1e-4  # share of a covariate that the others must leave
-FRICTION = "friction_at_rapid"  # Cd + ft w at the rapid speed: where ft and Cd trade it is what is known of them
+COLLINEAR = 1e-4  # share of a covariate that must be independent of the others
+FRICTION = "friction_at_rapid"  # Cd + ft w at the rapid speed: well determined where ft and Cd compensate each other
 BY_DIRECTION = ("ft", "Cd", FRICTION)
-LEAST_TURNS = 3  # from which on it is told what friction owes to the direction
-# a smaller step is not told: drift that is no straight line looks like one
+LEAST_TURNS = 3  # least changes of direction
+# smaller steps are not reported: nonlinear drift resembles them
 LEAST_STEP: dict[str, float] = {"R": 0.05, "L": 0.08, "K": 0.03, "Jt": 0.02, "ft": 0.15, "Cd": 0.10, FRICTION: 0.10}
-LEAST_STEP |= {f"{name}/K": LEAST_STEP[name] for name in ("Jt", "ft", "Cd")}  # as K hardly moves
+LEAST_STEP |= {f"{name}/K": LEAST_STEP[name] for name in ("Jt", "ft", "Cd")}  # K hardly changes
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,17 +80,17 @@ def student_95(freedom: float) -> float:
     return sum(term / v**k for k, term in enumerate(terms))
 
 
-def slope(points: Float, against: Float, stds: Float | None = None, beside: Float | None = None) -> Slope | None:
+def slope(points: Float, against: Float, stds: Float | None = None, covariate: Float | None = None) -> Slope | None:
     """Fit a line to ``points`` (n,) over ``against`` (n,), weighted by ``stds`` (n,); None without a slope.
 
-    ``beside`` (n,) is a covariate: its effect does not count towards the slope. The standard deviation is the larger of
+    The effect of the ``covariate`` (n,) does not count towards the slope. The standard deviation is the larger of
     that by ``stds`` and that by the scatter about the line.
     """
     known = np.isfinite(points) & np.isfinite(against)
-    if beside is not None:
-        known &= np.isfinite(beside)
+    if covariate is not None:
+        known &= np.isfinite(covariate)
     y, x = points[known], against[known]
-    terms = 2 if beside is None else 3
+    terms = 2 if covariate is None else 3
     if y.size <= terms - 1 + (terms == 2) or np.ptp(x) == 0.0:
         return None
     weights = np.ones(y.size) if stds is None else 1.0 / np.maximum(stds[known], 1e-300) ** 2
@@ -98,8 +98,8 @@ def slope(points: Float, against: Float, stds: Float | None = None, beside: Floa
     root = np.sqrt(weights)
     lever, left = root * (x - at), root * (y - level)
     whole = float(lever @ lever)
-    if beside is not None:
-        other = beside[known] - np.average(beside[known], weights=weights)
+    if covariate is not None:
+        other = covariate[known] - np.average(covariate[known], weights=weights)
         lever, left = (_without(root * other, column) for column in (lever, left))
     spread = float(lever @ lever)
     if not spread > COLLINEAR * whole:
@@ -182,9 +182,9 @@ def _steps_of(name: str, values: Float, stds: Float, temperature: Float | None) 
     if not rows:
         return []
     theta, covariance = _fit(y * weights, weights, [*columns, *_jumps(n, rows)])
-    told = zip(rows, theta[len(columns) :], np.sqrt(np.diag(covariance))[len(columns) :], strict=True)
+    stepped = zip(rows, theta[len(columns) :], np.sqrt(np.diag(covariance))[len(columns) :], strict=True)
     base = np.column_stack([*columns, *_jumps(n, rows)]) @ theta
-    return [Step(name, int(known[r]), float(s), float(d), float(base[r] - s)) for r, s, d in told if abs(s) >= least]
+    return [Step(name, int(known[r]), float(s), float(d), float(base[r] - s)) for r, s, d in stepped if abs(s) >= least]
 
 
 def _stands_out(y: Float, weights: Float, row: int, size: float) -> bool:
@@ -226,7 +226,7 @@ def _best_row(y: Float, weights: Float, columns: Sequence[Float], taken: Sequenc
     n = y.size
     base = np.linalg.qr(np.column_stack(columns) * weights[:, None])[0]
     left = y - base @ (base.T @ y)
-    # the step from row s on, weighted: its products are sums from s to the end
+    # products with a weighted step from row s are sums from s to the end
     lever = np.cumsum((left * weights)[::-1])[::-1]
     shadow = np.cumsum((base * weights[:, None])[::-1], axis=0)[::-1]
     whole = np.cumsum((weights**2)[::-1])[::-1]

@@ -38,7 +38,7 @@ class Run:
 
 
 def smooth(values: Float, dt_s: float, seconds: float = SMOOTHING_S) -> Float:
-    """Return ``values`` (n,) averaged over ``seconds`` about each sample; lost samples (NaN) take the last one before."""
+    """Return ``values`` (n,) averaged over ``seconds`` about each sample; a lost one (NaN) repeats the last."""
     width = 2 * round(seconds / dt_s / 2) + 1
     return moving_mean(carried(values), width)
 
@@ -62,13 +62,13 @@ def noise_of(values: Float) -> float:
     """Return the standard deviation of white noise on a smooth signal, from its third differences (robust)."""
     if values.size < 4:
         return 0.0
-    with np.errstate(invalid="ignore"):  # of two infinite readings; what is not finite is left out
+    with np.errstate(invalid="ignore"):  # inf - inf; non-finite values are left out
         d = np.abs(values[3:] - values[:-3] - 3.0 * (values[2:-1] - values[1:-2]))
     d = d[np.isfinite(d)]
     if not d.size:
         return 0.0
     middle = (d.size - 1) // 2, d.size // 2
-    ordered = np.partition(d, middle)  # a library's median takes five times longer
+    ordered = np.partition(d, middle)  # np.median takes five times longer
     return float(1.4826 * (ordered[middle[0]] + ordered[middle[1]]) / 2 / np.sqrt(20.0))
 
 
@@ -87,7 +87,7 @@ def find_windows(recording: Recording, rapid_speed_rad_s: float | None = None) -
         if np.abs(speed[run.start : run.end]).max() < RAPID_SHARE * rapid:
             continue
         floor = runs[k - 1].rest_end if k else 0
-        # a drive that settles is no next move: the window lasts until it rests
+        # settling is not another move: the window lasts until standstill
         later = (other for other in islice(runs, k + 1, None) if not _settles(speed, recording.dt_s, run, other))
         following = next(later, None)
         ceiling = speed.size if following is None else following.rest_start
@@ -111,7 +111,7 @@ def _runs(speed: Float, rapid: float, dt: float, noise: float) -> list[Run]:
     edges = np.flatnonzero(np.diff(side)) + 1
     bounds = np.concatenate([[0], edges, [side.size]])
     spans = [(int(a), int(b)) for a, b in pairwise(bounds) if b > a and side[a] != 0]
-    # what the smoothed noise may reach at rest
+    # largest smoothed noise at standstill
     still = np.abs(speed) <= max(0.002 * rapid, 3 * noise / np.sqrt(max(1.0, SMOOTHING_S / dt)))
     reach = round(EXTENSION_S / dt)
     runs = []
@@ -134,7 +134,7 @@ def _settles(speed: Float, dt: float, run: Run, other: Run) -> bool:
 
 def _cut(recording: Recording, speed: Float, run: Run, floor: int, ceiling: int, rapid: float) -> Window:
     margin = round(MARGIN_S / recording.dt_s)
-    # the moves beside it may take its margins, never a part of itself
+    # neighbouring moves may shorten the margins, not the move
     a = max(min(floor, run.rest_start), run.rest_start - margin)
     b = min(max(ceiling, run.rest_end), run.rest_end + margin)
     part = slice(a, b)

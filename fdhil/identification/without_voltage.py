@@ -1,6 +1,6 @@
 """Fits [2] alone where there is no voltage: Jt, ft and Cd from current and position, with a given K.
 
-Least squares on K i = Jt dw/dt + ft w + Cd sign(w), all filtered alike, and on additional terms: Stribeck friction, a
+Least squares on K i = Jt dw/dt + ft w + Cd sign(w), through one filter, and on additional terms: Stribeck friction, a
 ripple with the screw's turn. A term is added by the Bayesian information criterion (Schwarz 1978) at the number of
 effective samples, where it is worthwhile. The current may be late: the torque's slope -tau (Jt dj/dt + ft dw/dt) is
 always fitted, to avoid its bias. So is the acceleration's second derivative, the first-order effect of a compliant
@@ -33,11 +33,11 @@ BASE = ("Jt", "delay", "give", "ft", "Cd")
 STRIBECK_SHARES = (0.02, 0.03, 0.05, 0.08, 0.12, 0.18, 0.27)  # of the top speed
 SCREW_ORDERS = (1, 2)
 TERMS = ("stribeck", *(f"ripple_screw_{order}" for order in SCREW_ORDERS))
-WORTH = 0.005  # of the torque's RMS: what a term must explain, a tenth of what may be left
-SUMMED_SHARE = 0.1  # of a window's rows: over which its residuals may hang together
+WORTH = 0.005  # of the torque's RMS: least effect of a term, a tenth of the allowed residual
+SUMMED_SHARE = 0.1  # of a window's samples: range of correlation of its residuals
 WIDENED = 2.9694 / 1.96  # per share, of the 95 % interval: Kiefer and Vogelsang 2005, Bartlett's weights
-OPEN_SHARE = 3e-4  # of Jt: what a current that is read once a row leaves open
-OPEN_SHARE_ROWS = 3e-5  # the same in rows of 1 ms; it grows with their square
+OPEN_SHARE = 3e-4  # of Jt: doubt of a current that is read once a sample
+OPEN_SHARE_ROWS = 3e-5  # the same at 1 ms; it grows with the square of the sample
 NO_VOLTAGE = Reason("LowExcitation", "there is no voltage, so [1] gives no R and L", "connect the voltage sensor")
 NO_K = Reason(
     "LowExcitation",
@@ -88,7 +88,7 @@ class TorqueFit:
 
 @lru_cache(maxsize=8)
 def fit(window: Window, settings: Identification) -> TorqueFit | None:
-    """Fit [2] and its terms to a window; None with hardly any samples in motion. Cached: estimate and checks share it."""
+    """Fit [2] and its terms to a window; None with hardly any samples in motion. Cached for the checks."""
     rows = torque_rows(window, settings)
     if rows is None or rows.count < LEAST_ROWS:
         return None
@@ -179,7 +179,7 @@ def told(window: Window, fitted: TorqueFit | None, known: Mapping[str, float]) -
     Without K all six are missing, and ``RATIOS`` follow them.
     """
     if fitted is None:
-        text = "hardly any row lies beyond the low-pass's reach from standstill"
+        text = "hardly any sample in motion lies beyond the low-pass's reach from standstill"
         reason = Reason("LowExcitation", text, "record a longer rapid or raise lowpass_hz")
         return empty_estimate(METHOD, Result.UNDER_EXCITED, reason)
     own = window.torque_constant_nm_per_a
@@ -207,10 +207,10 @@ def _covariance(fitted: TorqueFit) -> Float:
     meat = _summed(design * fitted.residual[:, None], round(SUMMED_SHARE * len(design)))
     meat *= (1.0 + WIDENED * SUMMED_SHARE) ** 2
     power = max(float(np.square(fitted.residual).sum()), 1e-12 * float(np.square(fitted.current).sum()))
-    alike = design.T @ design * power / max(effective_rows(fitted.residual) - design.shape[1], 1.0)
-    scale = np.sqrt(np.diag(alike))
+    correlated = design.T @ design * power / max(effective_rows(fitted.residual) - design.shape[1], 1.0)
+    scale = np.sqrt(np.diag(correlated))
     scaled = np.outer(scale, scale)
-    covariance: Float = inverse @ (larger(meat / scaled, alike / scaled) * scaled) @ inverse.T
+    covariance: Float = inverse @ (larger(meat / scaled, correlated / scaled) * scaled) @ inverse.T
     return covariance
 
 
@@ -234,7 +234,7 @@ def _with_constant(fitted: TorqueFit, given: Mapping[str, float]) -> Estimate:
     units = np.array([1.0 if name.endswith(("_speed", "_phase")) else given["K"] for name in values])
     whole = np.zeros((len(TOLD_BY_SHEET) + len(values),) * 2)
     whole[len(TOLD_BY_SHEET) :, len(TOLD_BY_SHEET) :] = covariance * np.outer(units, units)
-    # whether the data tell enough is asked of what was fitted: what is given, or missing, has no interval
+    # identifiability is checked for the fitted parameters only: given and missing ones have no interval
     sheet = [given.get(name, 1.0) for name in TOLD_BY_SHEET]
     answer = Estimate(
         method=METHOD,
@@ -279,21 +279,21 @@ def _ratios(fitted: TorqueFit) -> Estimate:
 
 def _values(fitted: TorqueFit) -> tuple[dict[str, float], Float]:
     inertia, lag, _, viscous, dry = fitted.theta[: len(BASE)]
-    told = {"Jt": float(inertia - lag / inertia * viscous), "ft": float(viscous), "Cd": float(dry)}
+    named = {"Jt": float(inertia - lag / inertia * viscous), "ft": float(viscous), "Cd": float(dry)}
     size, others = fitted.theta.size, sum(t.slope is not None for t in fitted.terms)
     rates = [np.eye(size + others)[k] for k in (0, 3, 4)]
     for term in fitted.terms:
         k, unit = _first(fitted, term), np.eye(size + others)
         if term.at is not None:
-            told |= dict(zip(term.names, (float(fitted.theta[k]), term.at), strict=True))
-            rates += [unit[k], unit[size]]  # of such terms there is one
+            named |= dict(zip(term.names, (float(fitted.theta[k]), term.at), strict=True))
+            rates += [unit[k], unit[size]]  # there is only one such term
             continue
         sine, cosine = fitted.theta[k : k + 2]
         whole = float(np.hypot(sine, cosine))
-        told |= dict(zip(term.names, (whole, float(np.arctan2(cosine, sine))), strict=True))
+        named |= dict(zip(term.names, (whole, float(np.arctan2(cosine, sine))), strict=True))
         rates.append((sine * unit[k] + cosine * unit[k + 1]) / whole)
         rates.append((sine * unit[k + 1] - cosine * unit[k]) / whole**2)
-    return told, np.array(rates)
+    return named, np.array(rates)
 
 
 def _doubts(fitted: TorqueFit, rates: Float) -> Float:

@@ -25,13 +25,13 @@ from fdhil.records import PARAMETERS, Bool, Estimate, Float, Reason, Result, Win
 
 NAME = "least_squares"
 ORDER = [1, 0, 2, 3, 4, 5]  # from L, R, K to R, L, K, and back
-# of [L, R, K, Jt, ft, Cd]: what stencils and the voltage's course within a sample leave open, however low the noise
+# of [L, R, K, Jt, ft, Cd]: doubt due to stencils and the voltage's waveform within a sample, without noise
 OPEN_SHARE = np.array([1e-3, 5e-4, 5e-5, 3e-4, 0.0, 0.0])
 
 
 @dataclass(frozen=True, slots=True)
 class Signals:
-    """A window's signals, filtered alike and at one instant per sample, (n,) each; ``usable`` marks the samples to fit."""
+    """A window's signals (n,), filtered alike and at one instant per sample; ``usable`` marks the samples to fit."""
 
     voltage: Float
     current: Float
@@ -106,7 +106,7 @@ def noise_through(windows: Sequence[Window], settings: Identification) -> tuple[
 
 def too_short(method: str, rows: int) -> Estimate:
     """Return the estimate for windows with hardly any sample in motion beyond the low-pass's reach."""
-    text = f"only {rows} rows lie beyond the low-pass's reach from standstill"
+    text = f"only {rows} samples in motion lie beyond the low-pass's reach from standstill"
     reason = Reason("LowExcitation", text, "record a longer rapid or raise lowpass_hz")
     return empty_estimate(method, Result.UNDER_EXCITED, reason)
 

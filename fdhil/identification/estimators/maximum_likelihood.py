@@ -36,9 +36,9 @@ from fdhil.records import PARAMETERS, Estimate, Float, Result, Window
 
 __all__ = ["Fit", "descend", "estimate", "fit", "fit_windows", "jacobian", "pose", "typical"]
 NAME = "maximum_likelihood"
-INSTANT_DELAY = 0.5  # of a row
-RESEMBLING = 0.5  # of a delay or a lost voltage that was found may be something else: axes d and q that are not parted
-TURNS = 2  # in which what loops do within rows follows the parameters
+INSTANT_DELAY = 0.5  # of a sample
+RESEMBLING = 0.5  # share of a delay or lost voltage that may be something else: coupled d and q axes
+TURNS = 2  # iterations of parameters and simulated loops
 FLOORS = np.array([1e-4, 1e-4, 1e-9])  # of R, K and Jt
 LEAST_TIME_CONSTANT_S = 1e-4  # of the winding: noise may drive the starting L below 0
 
@@ -243,19 +243,19 @@ def finish(result: Fit) -> Estimate:
     """Return the fit as an estimate with its covariance."""
     inverse, condition = inverse_of(result.information)
     kept = [k for k, j in enumerate(result.free) if j != DELAY]
-    told = [j for j in result.free if j != DELAY]
+    entries = [j for j in result.free if j != DELAY]
     first = result.problem.motions[0]
-    alias = np.zeros(len(told))
+    alias = np.zeros(len(entries))
     alias[: len(PARAMETERS)] = aliasing(first.voltage_sampling, first.voltage_period_s)
     systematic = doubts(result, inverse)
     held = robust_inverse(result, inverse)
     late = DELAY in result.free
     at = result.free.index(DELAY) if late else 0
     chance, beyond = (part[np.ix_(kept, kept)] for part in (inverse, held - inverse))
-    own = systematic[told]
-    if result.prior.size:  # its share is among the doubts that windows have in common
+    own = systematic[entries]
+    if result.prior.size:  # the prior is among the doubts that windows have in common
         chance = chance - inverse[kept] @ np.diag(result.prior) @ inverse[:, kept]
-    values = result.theta[told]
+    values = result.theta[entries]
     answer = Estimate(
         method=NAME,
         names=PARAMETERS,
@@ -269,12 +269,12 @@ def finish(result: Fit) -> Estimate:
     )
     if first.courses or first.speed_late is not None:
         answer, beyond = told_terms(answer, result, values, beyond)
-    # what the data can tell is the information's to say; that residuals are coloured is no lack of excitation
+    # identifiability follows from the information; coloured residuals are not a lack of excitation
     top_rad_s, top_a = (
         max(float(np.abs(getattr(m, n)).max()) for m in result.problem.motions) for n in ("speed", "current")
     )
     judged = judge(answer, condition, top_rad_s, abs(float(result.theta[K])) * top_a)
-    if judged.names != answer.names:  # nothing is told
+    if judged.names != answer.names:  # all parameters are withheld
         return judged
     assert judged.systematic is not None
     left = np.column_stack([model_doubts(result), _resembling_terms(result)])[: len(PARAMETERS)]
