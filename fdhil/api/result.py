@@ -25,8 +25,7 @@ from fdhil.records import INTERVAL_95, PARAMETERS, Estimate, Float, LoopEstimate
 
 @dataclass(frozen=True)
 class Parameter:
-    """One identified value: ``value`` and ``std`` are None where the recording does not determine it, with the
-    ``reason``.
+    """One identified value: ``value`` and ``std`` are None where it is undetermined, with the ``reason``.
 
     ``std`` is one standard deviation; ``interval`` contains the true value in 95 % of cases. A ``given`` value was not
     identified.

@@ -199,9 +199,7 @@ def _slopes(unexplained: Left, x: Float, steps: Float) -> Float:
 
 
 def _spread(slopes: Float, rest: Float, size: int, reach: int) -> Float:
-    """Return the covariance of least squares whose ``size`` first residuals correlate over ``reach`` (Newey, West
-    1987).
-    """
+    """Return the covariance of a fit whose ``size`` first residuals correlate over ``reach`` (Newey, West 1987)."""
     bread = np.linalg.inv(slopes.T @ slopes)
     scores = slopes * rest[:, None]
     part, own = scores[:size], slopes[size:]  # the prior counts with its own deviation
@@ -213,9 +211,7 @@ def _spread(slopes: Float, rest: Float, size: int, reach: int) -> Float:
 
 
 def joined(estimate: Estimate, found: Compliance) -> Estimate:
-    """Return the estimate with the resonance from the table's sensors; it replaces one identified from the motor's
-    side.
-    """
+    """Return the estimate with the resonance from the table's sensors, replacing one from the motor's side."""
     kept = [k for k, name in enumerate(estimate.names) if name not in TERMS]
     before = np.zeros((len(estimate.names), 0))
     if estimate.systematic is not None:  # covers the first names only

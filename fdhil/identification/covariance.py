@@ -29,7 +29,8 @@ def coloured_meat(blocks: Sequence[Float], gammas: Sequence[Sequence[Float]], le
     """
     sizes = np.cumsum([0, *(b.shape[1] for b in blocks)])
     meat = np.zeros((sizes[-1], sizes[-1]))
-    for start, stop in _spans(lengths):
+    stops = np.cumsum(lengths).tolist()
+    for start, stop in zip([0, *stops[:-1]], stops, strict=True):
         for a, left in enumerate(blocks):
             for b, right in enumerate(blocks):
                 pulled = through(right[start:stop], gammas[a][b][::-1])
@@ -54,11 +55,6 @@ def residual_gammas(theta: Float, impulse: Float, slope: Float, noise: Float) ->
         ]
         for one in answers
     ]
-
-
-def _spans(lengths: Sequence[int]) -> list[tuple[int, int]]:
-    stops = np.cumsum(lengths).tolist()
-    return list(zip([0, *stops[:-1]], stops, strict=True))
 
 
 def two_step(
@@ -154,9 +150,7 @@ def _coloured(slopes: Float, root: Complex) -> Float:
 
 
 def larger(one: Float, other: Float) -> Float:
-    """Return the covariance that is, in every direction, the larger of ``one`` and ``other`` (positive definite), both
-    (k, k).
-    """
+    """Return the covariance (k, k) that is, in every direction, the larger of two; ``other`` is positive definite."""
     lower = np.linalg.cholesky(other)
     inverse = np.linalg.inv(lower)
     ratios, axes = np.linalg.eigh(inverse @ one @ inverse.T)

@@ -33,8 +33,7 @@ SETTLED, LEAST_CYCLES = 8.0, 16  # time constants of the speed loop, and cycles,
 def with_current_means(
     windows: Sequence[Window], settings: Identification, axis: Axis | None, sync_period_s: float | None
 ) -> Sequence[Window]:
-    """Return the windows of one drive with mean currents where the replay of the ``axis``' loops shows a stepping
-    speed.
+    """Return the windows of one drive with mean currents, where a replay of the ``axis``' loops shows a stepping speed.
 
     The first window decides for all. Where the replay without steps is far better, readings serve as means. Where no
     loops are known, or the replay is inconclusive, the windows are returned unchanged.

@@ -91,8 +91,7 @@ class Problem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """A finished fit: ``theta`` (7 + terms,), information (k, k) of the ``free`` entries, innovations (m,), noise
-    levels.
+    """A finished fit: ``theta`` (7 + terms,), information (k, k) of the ``free`` entries, innovations (m,), noises.
 
     ``delay_doubt_s`` is the part of a delay that may be waveform within samples, or the reverse. ``prior`` (k,) is the
     information known beforehand, on the diagonal, and ``prior_std`` (k,) its standard deviation; empty: none.

@@ -82,9 +82,7 @@ class Marks(NamedTuple):
 
 
 class SlowSensor(NamedTuple):
-    """The samples (m,) of a low-rate voltage, means over ``period_s`` or instants, with ``shape_variance`` (m,) of
-    their own.
-    """
+    """The samples (m,) of a low-rate voltage, means over ``period_s`` or instants, and ``shape_variance`` (m,)."""
 
     voltage: Float
     instant: bool

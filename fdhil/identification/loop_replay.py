@@ -146,8 +146,7 @@ def _creep(position_mm: Float, dt_s: float, least_mm: float) -> float:
 
 
 def smoothed(demand_mm: Float) -> Float:
-    """Return the smoothest signal (n,) that rounds to a recorded demand, since the NC plans more finely than it
-    records.
+    """Return the smoothest signal (n,) that rounds to a recorded demand: NCs plan more finely than they record.
 
     Rounded to 1 um at 1 kHz a demand has speed jumps of 1 mm/s that the drive never received. Squared third differences
     are penalised (Whittaker 1923) as far as rounding allows.
@@ -166,7 +165,7 @@ def smoothed(demand_mm: Float) -> Float:
 
 
 def _whittaker(values: Float, weight: float) -> Float:
-    """Return the signal (n,) of least squared distance from ``values`` + ``weight`` x squared third differences."""
+    """Return the signal (n,) that minimises squared distance from ``values`` + ``weight`` x squared third differences."""
     from scipy.linalg import solveh_banded  # imported late: it is slow, and loops are rarely identified
 
     n, third = values.size, np.array([-1.0, 3.0, -3.0, 1.0])

@@ -25,9 +25,7 @@ NO_LIMIT = 1e5
 
 
 def begun_anew(problem: Problem) -> Problem:
-    """Return the problem started at the best cascade of the grid, judged by the longest rapid; limits and cycles are
-    kept.
-    """
+    """Return the problem started at the best cascade of the grid for the longest rapid; limits and cycles stay."""
     longest = int(np.argmax([np.ptp(one.demand_mm) for one in problem.rapids]))
     rapid = problem.rapids[longest]
     plant = rapid.plant
@@ -64,9 +62,7 @@ def _feedforward(rapid: Rapid, gain: float) -> float:
 
 
 def made_up_axis(window: Window, rapid: Rapid) -> Axis:
-    """Return an axis for a recording without configuration: a fast current loop, no limits, cycles that divide a
-    sample.
-    """
+    """Return an axis for a recording alone: a fast current loop, no limits, cycles that divide a sample."""
     plant, current = rapid.plant, 2 * math.pi * CURRENT_CORNER_HZ
     regulators = Regulators(
         position_gain_per_s=1.0,

@@ -78,19 +78,20 @@ def identify_loops(
     tolerance = settings.tolerance_for(following)
     problem = _problem(rapids, axis, windows[0])
     modelled = tuple(replace(rapid, plant=own, load_nm=np.zeros_like(rapid.load_nm)) for rapid, own in usable)
+    kinds = [replace(problem, rapids=r) for r in (rapids, modelled)]
     if growing:
         found = _whole_delay(_of_either(problem, modelled, tolerance, axis is not None))
     else:
-        fits = [loop_fit.fit(replace(problem, rapids=r)) for r in (rapids, modelled)]
+        fits = [loop_fit.fit(kind) for kind in kinds]
         found = _whole_delay(min(fits, key=lambda made: made.unexplained_um))
-    configured = None if axis is None else min(_left_um(replace(problem, rapids=r)) for r in (rapids, modelled))
+    left = (loop_fit.spread_of(kind, loop_fit.left_of(kind, kind.start())[0])[0] for kind in kinds)
+    configured = None if axis is None else float(min(left)) * 1e3
     verdict = _verdict(found, tolerance, following, configured)
     return _told(windows[0].axis, found, verdict, configured)
 
 
 def _of_either(problem: Problem, modelled: tuple[Rapid, ...], tolerance_um: float, configured: bool) -> Fit:
-    """Return the best fit with or without unexplained torque as a load; the search is repeated where the other is
-    better.
+    """Return the best fit with or without unexplained torque as a load; searched again where the other is better.
 
     A complete model fits better without the noise in that torque. The search uses one rapid of either direction, the
     final fit uses all.
@@ -112,10 +113,6 @@ def _of_either(problem: Problem, modelled: tuple[Rapid, ...], tolerance_um: floa
 def _both_ways(rapids: Sequence[Rapid]) -> list[int]:
     ways = [float(np.sign(rapid.demand_mm[-1] - rapid.demand_mm[0])) for rapid in rapids]
     return [j for side in (-1.0, 1.0) for j in [k for k, way in enumerate(ways) if way == side][-1:]] or [0]
-
-
-def _left_um(problem: Problem) -> float:
-    return float(loop_fit.spread_of(problem, loop_fit.left_of(problem, problem.start())[0])[0]) * 1e3
 
 
 def _problem(rapids: tuple[Rapid, ...], axis: Axis | None, window: Window) -> Problem:

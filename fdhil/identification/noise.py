@@ -17,9 +17,7 @@ ENOUGH = 0.15  # smaller steps are below the data's resolution
 
 
 def fit_noise(motion: Motion, theta: Float, start: Noise) -> Noise:
-    """Return the most likely noise levels, by Newton steps on their logarithms. ``theta`` (7,) is [R, L, K, Jt, ft, Cd,
-    delay].
-    """
+    """Return the most likely noise levels for ``theta`` (7,), by Newton steps on their logarithms."""
     lower = np.log(motion.noise.vector()) + np.log(motion.noise_floor)
     x = np.log(start.vector())
 

@@ -165,7 +165,8 @@ def _between(
 
 
 def _estimate(found: _Solution, names: Sequence[str], joined: Sequence[str], first: Estimate) -> Estimate:
-    listed = (*PARAMETERS, *(name for name in names if name not in PARAMETERS), *_told_terms(joined))
+    added = [*(["load"] * ("load" in joined)), *(["viscous_positive", "viscous_negative"] * ("viscous" in joined))]
+    listed = (*PARAMETERS, *(name for name in names if name not in PARAMETERS), *added)
     values, total, doubts = as_amplitude((*names, *joined), found.values, found.chance, found.doubts)
     known = {name: k for k, name in enumerate((*names, *joined))}
     root = np.zeros((len(listed), len(known)))
@@ -190,11 +191,6 @@ def _estimate(found: _Solution, names: Sequence[str], joined: Sequence[str], fir
         delay_std_s=None,
         systematic=frozen(systematic[:, len(PARAMETERS) :]),
     )
-
-
-def _told_terms(joined: Sequence[str]) -> tuple[str, ...]:
-    sides = ("viscous_positive", "viscous_negative") if "viscous" in joined else ()
-    return (*(("load",) if "load" in joined else ()), *sides)
 
 
 def _made_of(name: str) -> dict[str, float]:

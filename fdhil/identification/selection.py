@@ -23,7 +23,6 @@ from fdhil.identification.delay import LEAST_DELAY, MOST_DELAY, delay_direction,
 from fdhil.identification.fit import Fit, fit
 from fdhil.identification.identifiability import admissible
 from fdhil.identification.kalman import DELAY, LOAD
-from fdhil.identification.motion import Course, Motion
 from fdhil.identification.noise import fit_noise
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.slow_voltage import in_order
@@ -304,16 +303,8 @@ def _worth(bench: _Bench, scores: _Scores, k: int) -> bool:
     courses, base = candidate.courses, bench.fit
     if candidate.family == LATE or courses[0][0].kind != LOAD:
         return False
-    torque = sum(float(np.square(_torque(own, amplitudes)).sum()) for own in courses)
-    whole = sum(float(np.square(base.theta[2] * _sure(m)).sum()) for m in base.problem.motions)
+    torques = (amplitudes[: len(own)] @ np.stack([course.values for course in own]) for own in courses)
+    torque = sum(float(np.square(own).sum()) for own in torques)
+    currents = (m.current[np.abs(m.mode) == 1] for m in base.problem.motions)
+    whole = sum(float(np.square(base.theta[2] * current).sum()) for current in currents)
     return torque > WORTH**2 * whole
-
-
-def _torque(courses: Sequence[Course], amplitudes: Float) -> Float:
-    total: Float = amplitudes[: len(courses)] @ np.stack([course.values for course in courses])
-    return total
-
-
-def _sure(motion: Motion) -> Float:
-    current: Float = motion.current[np.abs(motion.mode) == 1]
-    return current

@@ -96,9 +96,7 @@ def _mended(window: Window, source: SpeedSource) -> Window:
 
 
 def lag_of(window: Window, source: SpeedSource = "auto") -> Lag | None:
-    """Return the lag of a window's speed; None without a significant lag, or where position and speed do not determine
-    it.
-    """
+    """Return the lag of a window's speed; None without a significant lag, or where it is undetermined."""
     dt = window.dt_s
     lateness = _lateness(window)
     if source == "difference":

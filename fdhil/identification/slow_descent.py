@@ -68,10 +68,8 @@ class Likelihood:
 
 
 def ascend(likelihood: Likelihood, theta: Float, free: Sequence[int], sizes: Float) -> tuple[Float, Float, Float, bool]:
-    """Step from ``theta`` (7,) until a step is negligible; return theta, innovations (m,), jacobian (m, k), and
+    """Step from ``theta`` (7,), with typical ``sizes`` (7,); return theta, innovations (m,), jacobian (m, k), and
     success.
-
-    ``sizes`` (7,) are the parameters' typical ones.
     """
     here = likelihood.at(theta)
     for _ in range(STEPS):

@@ -58,9 +58,7 @@ def with_open_course(motion: Motion, theta: Float, off_a: Float | None = None) -
 
 
 def leaves_steps_open(window: Window) -> bool:
-    """Return whether the set-points' steps are the only unknown within a window's samples: common to all of a drive's
-    windows.
-    """
+    """Return whether the set-points' steps, common to all windows of a drive, are the only unknown within samples."""
     means = window.voltage_sampling == "interval_mean" and window.slow_voltage is None
     return means and (window.current_off_a is not None or window.dt_s >= STEPPED_ROW_S) and window.dt_s < LEAST_ROW_S
 

@@ -37,9 +37,7 @@ FLOORS = 10.0 ** np.arange(-6.0, 1.01, 0.5)  # of the variance of the current's 
 
 
 def slow_start(windows: Sequence[Window], settings: Identification) -> tuple[Float, list[float], list[Motion]] | None:
-    """Return [R, L, K, Jt, ft, Cd] (6,), each window's coarse delay in s, and the prepared windows; None with too few
-    samples.
-    """
+    """Return [R, L, K, Jt, ft, Cd] (6,), coarse delays in s, and the prepared windows; None with too few samples."""
     shifts = [_coarse_shift(w, settings.lowpass_hz) for w in windows]
     rows = _rows(windows, shifts, settings)
     if rows is None:

@@ -105,8 +105,7 @@ def _line(values: Float) -> Float:
 
 
 def _place(position_mm: Float, speed_mm_s: Float, dt: float, size: int) -> tuple[Float, Float]:
-    """Return the motor's position (n,), low frequencies from the encoder and high ones from the speed, and its noise
-    power.
+    """Return the motor's position (n,), slow parts from the encoder and fast ones from the speed, and its noise power.
 
     The integrated speed drifts, so the encoder's position takes over below the frequency where both noises are equal.
     """

@@ -96,9 +96,7 @@ def find_windows(recording: Recording, rapid_speed_rad_s: float | None = None) -
 
 
 def whole_window(recording: Recording) -> Window:
-    """Return all of a recording as one window of any move; its top speed replaces the rapid speed, its direction is the
-    net one.
-    """
+    """Return all of a recording as one window of any move, with its top speed as rapid speed and its net direction."""
     speed = smooth(recording.speed_rad_s, recording.dt_s)
     top, n = float(np.max(np.abs(speed), initial=0.0)), speed.size
     run = Run(0, n, 0, n, 1 if speed.sum() >= 0.0 else -1)

@@ -99,17 +99,12 @@ def fit(window: Window, settings: Identification) -> TorqueFit | None:
     return _joined(TorqueFit(rows, design, current, solve(design, current)[0], ()))
 
 
-def _beside(fitted: TorqueFit, term: Term) -> TorqueFit:
-    design = np.column_stack([fitted.design, term.columns])
-    theta, _ = solve(design, fitted.current)
-    return replace(fitted, design=design, theta=theta, terms=(*fitted.terms, term))
-
-
 def _joined(fitted: TorqueFit) -> TorqueFit:
     news = effective_rows(fitted.residual)
     while True:
         wanted = _wanted(fitted, news)
-        worth = [other for other in wanted if _explained(other, fitted) > WORTH * rms(fitted.current)]
+        torque, least = fitted.design @ fitted.theta, WORTH * rms(fitted.current)
+        worth = [other for other in wanted if rms(other.design @ other.theta - torque) > least]
         if not worth:
             size = fitted.theta.size
             shifts = {other.terms[-1].names[0]: other.theta[:size] - fitted.theta for other in wanted}
@@ -121,7 +116,9 @@ def _wanted(fitted: TorqueFit, news: float) -> list[TorqueFit]:
     """Return the fits with one additional term that the criterion prefers, the best of each kind, best first."""
     power, found = float(np.square(fitted.residual).sum()), []
     for term in candidates(fitted):
-        tried = _beside(fitted, term)
+        design = np.column_stack([fitted.design, term.columns])
+        theta, _ = solve(design, fitted.current)
+        tried = replace(fitted, design=design, theta=theta, terms=(*fitted.terms, term))
         left = float(np.square(tried.residual).sum())
         gain = news * np.log(power / max(left, 1e-300)) - len(term.names) * np.log(news)
         if gain > 0.0:
@@ -131,10 +128,6 @@ def _wanted(fitted: TorqueFit, news: float) -> list[TorqueFit]:
     for _, tried in found:
         best.setdefault(tried.terms[-1].names, tried)
     return list(best.values())
-
-
-def _explained(other: TorqueFit, fitted: TorqueFit) -> float:
-    return rms(other.design @ other.theta - fitted.design @ fitted.theta)
 
 
 def effective_rows(e: Float) -> float:

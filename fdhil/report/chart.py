@@ -82,7 +82,7 @@ def svg(chart: Chart, width: float = 6.4, height: float = 3.6) -> str:
     from matplotlib.ticker import MaxNLocator
 
     columns, rows = legend_rows([trace.label for trace in chart.panels[0].traces], width - LEFT - RIGHT)
-    if shown := len(_labels(chart)) > 1:
+    if shown := sum(bool(trace.label) for trace in chart.panels[0].traces) > 1:
         height += max(0, rows - 1) * LEGEND_LINE
     above = rows * LEGEND_LINE + 0.15 if shown else 0.15
     with drawing(width, height, above) as made:
@@ -101,10 +101,6 @@ def svg(chart: Chart, width: float = 6.4, height: float = 3.6) -> str:
             legend_above(made.axes, columns)
         made.alt, made.data = chart.alt, told(chart)
     return made.svg
-
-
-def _labels(chart: Chart) -> list[str]:
-    return [trace.label for trace in chart.panels[0].traces if trace.label]
 
 
 def _places(chart: Chart, height: float, above: float) -> list[tuple[float, float]]:

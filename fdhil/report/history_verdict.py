@@ -42,16 +42,11 @@ def refusals_of(windows: Sequence[StoredWindow]) -> Refusals:
     counts: Counter[str] = Counter()
     for window in refused:
         time = datetime.fromtimestamp(window.stamp.wall_s, UTC).strftime("%Y-%m-%d %H:%M UTC")
-        for code, text in {_split(reason) for reason in window.reasons}:
+        for code, _, text in {reason.partition(":") for reason in window.reasons}:
             counts[code] += 1
-            last[code] = (text, time)
+            last[code] = (text.strip(), time)
     reasons = tuple((code, count, *last[code]) for code, count in counts.most_common())
     return Refusals(len(windows), len(refused), len(newest), sum(not w.accepted for w in newest), reasons)
-
-
-def _split(reason: str) -> tuple[str, str]:
-    code, _, text = reason.partition(":")
-    return code, text.strip()
 
 
 def sentences(history: AxisHistory, refused: Refusals) -> list[str]:

@@ -10,12 +10,12 @@ from typing import Any, Protocol
 import numpy as np
 
 from fdhil.identification.next_move import predict_next_moves
-from fdhil.records import INTERVAL_95, PARAMETERS, Estimate, Float, Verdict, Window, WindowOutcome, unit_of
+from fdhil.records import INTERVAL_95, PARAMETERS, Estimate, Float, Verdict, WindowOutcome, unit_of
 from fdhil.report.chart import Chart, Panel, Trace, svg, thinned
 from fdhil.report.drawing import COLOURS, INK, REFERENCE
 from fdhil.report.page import Page, Section, Table
 from fdhil.report.parameter_view import MEANING, MEANINGS, cell, head
-from fdhil.validation.simulation import Simulated, simulated
+from fdhil.validation.simulation import simulated
 
 MOST_WINDOWS = 6
 LAGS = 40
@@ -120,7 +120,7 @@ def _window(outcome: WindowOutcome) -> Section:
 def _signals(outcome: WindowOutcome) -> Chart:
     window = outcome.window
     time_s = np.arange(window.n, dtype=np.float64) * window.dt_s
-    model = _model(outcome)
+    model = None if outcome.estimate is None else simulated(window, outcome.estimate, None)
     panels = []
     if window.voltage_v is not None:
         panels.append(Panel("voltage (V)", [Trace("measured voltage", time_s, window.voltage_v, COLOURS[1])], 0.7))
@@ -136,10 +136,6 @@ def _signals(outcome: WindowOutcome) -> Chart:
         panels.append(Panel("residual (rad/s)", [Trace("measured - model", model.time_s, left, INK)], 0.6))
     fit = "" if outcome.verdict.fit_percent is None else f", fit {outcome.verdict.fit_percent:.2f} %"
     return Chart("time (s)", panels, f"Axis {window.axis}: signals of {time_s[-1]:.2f} s with the model's{fit}.")
-
-
-def _model(outcome: WindowOutcome) -> Simulated | None:
-    return None if outcome.estimate is None else simulated(outcome.window, outcome.estimate, None)
 
 
 def _whiteness(outcome: WindowOutcome) -> Iterator[Chart]:
@@ -180,7 +176,8 @@ def _correlation(estimate: Estimate | None) -> Iterator[Section]:
 
 
 def _next(found: Identified) -> Iterator[Section]:
-    estimate, window = found.pooled, _longest(found.outcomes)
+    estimate = found.pooled
+    window = max((outcome.window for outcome in found.outcomes), key=lambda window: window.n, default=None)
     if estimate is None or window is None or estimate.missing or estimate.given:
         return
     p = estimate.parameters()
@@ -198,7 +195,3 @@ def _next(found: Identified) -> Iterator[Section]:
         "the model itself leaves open remains. The table lists the smallest share of each interval that remains."
     )
     yield Section("Most informative further recording", text, [Table(("further move", *PARAMETERS), rows)])
-
-
-def _longest(outcomes: Sequence[WindowOutcome]) -> Window | None:
-    return max((o.window for o in outcomes), key=lambda window: window.n, default=None)

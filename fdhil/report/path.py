@@ -26,10 +26,11 @@ def prediction_page(name: str, machine: str, predicted: Prediction, parameters: 
     """Build the page of a prediction: the error's map, its zones, its worst positions. ``parameters`` names their
     source.
     """
+    duration_s = predicted.reference.time_s[-1] - predicted.reference.time_s[0]
     return Page(
         title=f"Path error of {name}",
         subtitle=f"Predicted for {machine} before the cut{_with(parameters)}.",
-        headline=[*_figures("predicted", predicted), ("duration", f"{_duration(predicted.reference):.2f} s")],
+        headline=[*_figures("predicted", predicted), ("duration", f"{duration_s:.2f} s")],
         sections=[_along([("predicted", predicted)]), _places([("predicted", predicted)]), _zones(predicted, None)],
     )
 
@@ -92,10 +93,6 @@ def _figures(label: str, predicted: Prediction) -> list[tuple[str, str]]:
         (f"{label}, RMS", _um(predicted.rms_um)),
         (f"{label}, largest", _um(float(predicted.contour_um.max()))),
     ]
-
-
-def _duration(reference: Trajectory) -> float:
-    return float(reference.time_s[-1] - reference.time_s[0])
 
 
 def planes(reference: Trajectory, rows: slice = slice(None)) -> list[tuple[str, str]]:

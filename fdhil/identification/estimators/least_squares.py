@@ -96,9 +96,7 @@ def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
 
 
 def noise_through(windows: Sequence[Window], settings: Identification) -> tuple[Float, Float, Float]:
-    """Return the variances (3,) of voltage, current and speed, and the responses of low-pass and operator to one
-    sample.
-    """
+    """Return variances (3,) of voltage, current and speed, and the responses of low-pass and operator to one sample."""
     impulse = impulse_response(settings.lowpass_hz, windows[0].dt_s)
     noise = np.mean([noise_levels(w).vector() ** 2 for w in windows], axis=0)
     return noise, impulse, np.nan_to_num(derivative(impulse, windows[0].dt_s))

@@ -72,7 +72,8 @@ def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | No
     if any(w.voltage_delay_s is not None for w in usable):
         return add_terms(_fit_separate(motions, start, delays), command, finish)
     start[DELAY] = float(np.median(delays))
-    return _with_terms(_fit_together(motions, start), command)
+    # without a delay of whole samples, a shorter one is a candidate like the terms, which it resembles
+    return _with_terms(fit(motions, start, range(6) if start[DELAY] == 0.0 else range(7)), command)
 
 
 def with_loops(base: Fit, window: Window, settings: Identification, axis: Axis, sync_period_s: float | None) -> Fit:
@@ -94,15 +95,6 @@ def with_loops(base: Fit, window: Window, settings: Identification, axis: Axis, 
     result = _with_terms(result, settings.voltage_source != "terminals")
     missed, missed_before = (left_at_the_table_mm(f.theta, axis, window) for f in (result, base))
     return result if missed < missed_before else base
-
-
-def _fit_together(motions: Sequence[Motion], start: Float) -> Fit:
-    """Fit windows whose voltage is sampled with current and speed, by the drive's own clock.
-
-    Without a delay of whole samples, a shorter one is a candidate like the terms, which it resembles.
-    """
-    free = range(6) if start[DELAY] == 0.0 else range(7)
-    return fit(motions, start, free)
 
 
 def _with_terms(base: Fit, command: bool) -> Fit:
@@ -138,10 +130,8 @@ def _fit_alone(motion: Motion, start: Float) -> Fit:
 
 
 def instant_doubt(motion: Motion) -> float:
-    """Return one standard deviation (s) of a delay from instants of a low-rate voltage, sampled in step with
-    regulators.
-
-    Regulators within a sample shift an instant by a part of the voltage's rise over the sample, always alike.
+    """Return the standard deviation (s) of a delay from instants of a low-rate voltage, due to regulators in step with
+    them.
     """
     return INSTANT_DELAY * motion.dt_s if motion.slow is not None and motion.voltage_sampling == "instant" else 0.0
 
