@@ -165,7 +165,7 @@ def smoothed(demand_mm: Float) -> Float:
 
 
 def _whittaker(values: Float, weight: float) -> Float:
-    """Return the signal (n,) that minimises squared distance from ``values`` + ``weight`` x squared third differences."""
+    """Return the signal (n,) of least squared distance to ``values`` + ``weight`` x squared third differences."""
     from scipy.linalg import solveh_banded  # imported late: it is slow, and loops are rarely identified
 
     n, third = values.size, np.array([-1.0, 3.0, -3.0, 1.0])
