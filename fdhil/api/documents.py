@@ -1,7 +1,5 @@
 """Builds the JSON that ``fdhil identify --json`` writes (schema fdhil-identify-1)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """Compares a drive's identified loops with the configured ones, and lists equivalent controllers."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

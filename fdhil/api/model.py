@@ -1,7 +1,5 @@
 """The physical model of a drive, and its simulation from a voltage."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Identifies drives from recordings, and presents the results."""
 
-from __future__ import annotations
-
 import html
 import json
 import math

@@ -6,8 +6,6 @@ scatter beyond their own covariance as well, where the drive does something that
 windows (Patterson, Thompson 1971) and by a prior that favours no variation. The pool uses the weighted mean variance.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

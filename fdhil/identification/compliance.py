@@ -4,8 +4,6 @@ An encoder shows how the table follows the motor and how the torque bends the sc
 motor held, and the table's share of the inertia. An accelerometer shows how the torque accelerates the table.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Adds fitted terms to a window's load and voltage: theta is [R, L, K, Jt, ft, Cd, delay, terms]."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from fdhil.identification.kalman import CD, DELAY, LOAD, VOLTAGE

@@ -1,7 +1,5 @@
 """Computes covariances that remain valid when residuals are coloured and regressors are noisy."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
@@ -70,8 +68,7 @@ def two_step(
     excess = [max(1.0, float(np.mean(e * e) / g)) for e, g in zip(residuals, expected, strict=True)]
     scaled = [[gammas[a][b] * np.sqrt(excess[a] * excess[b]) for b in (0, 1)] for a in (0, 1)]
     bread = _bread(phi_1, phi_2, mechanical[:, 0])
-    covariance: Float = bread @ coloured_meat([phi_1, phi_2], scaled, lengths) @ bread.T
-    return covariance
+    return bread @ coloured_meat([phi_1, phi_2], scaled, lengths) @ bread.T
 
 
 def suspicious(innovations: Float) -> bool:
@@ -107,8 +104,7 @@ def robust(information: Float, scores: Sequence[Float], rows: Sequence[tuple[Flo
         foretold += _coloured(slopes @ root, _spectrum(innovations, quick_size(2 * len(slopes))))
     share = SUMMED_LAGS / sum(len(own) for own in scores)
     power *= (1.0 + 2.9694 / 1.96 * min(share, 1.0)) ** 2
-    sandwich: Float = root @ larger(foretold, larger(power, np.eye(len(power)))) @ root.T
-    return sandwich
+    return root @ larger(foretold, larger(power, np.eye(len(power)))) @ root.T
 
 
 def summed(scores: Float) -> Float:
@@ -118,8 +114,7 @@ def summed(scores: Float) -> Float:
     np.cumsum(scores, axis=0, out=sums[span : span + len(scores)])
     sums[span + len(scores) :] = sums[span + len(scores) - 1]
     moving = sums[span:] - sums[:-span]  # the mean square of moving sums has these weights
-    meat: Float = moving.T @ moving / span
-    return meat
+    return moving.T @ moving / span
 
 
 def _spectrum(innovations: Float, size: int) -> Complex:
@@ -197,5 +192,4 @@ def attenuation(
     pull[:2, :2] = noise[1] * np.array([[dd, df], [df, ff]])
     pull[2, 2] = noise[2] * ff
     pull[3:5, 3:5] = noise[2] * np.array([[dd, df], [df, ff]])
-    bias: Float = -_bread(electrical[:, 1:], mechanical[:, 1:], mechanical[:, 0]) @ pull @ theta
-    return bias
+    return -_bread(electrical[:, 1:], mechanical[:, 1:], mechanical[:, 0]) @ pull @ theta

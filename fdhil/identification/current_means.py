@@ -5,8 +5,6 @@ speed, and the current responds to each step after it was read. The difference b
 simulation of the speed loop on the staircase of a constant acceleration.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Estimates the delay of the voltage against current and speed: whole samples from [1], fractions from innovations."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -4,8 +4,6 @@ An NC's trace shows the NC's own set-point, some cycles before the drive's. Take
 and filters that do not exist.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Differentiates by stencils: Dx(t) = 1/h sum_j b_j x(t + j h). Operator [4] of [DES] is zero forcing #1."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

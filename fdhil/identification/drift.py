@@ -5,8 +5,6 @@ One rapid yields the friction of its own direction, including a constant load; f
 Pure: the same estimates in the same order give the same notices, without a clock.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ The same low-pass on every signal keeps the identification unbiased ([DES] eq. 8
 importing scipy.signal takes a second, too long for the daemon's start.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np
@@ -32,8 +30,7 @@ def zero_phase(values: Float, lowpass_hz: float, dt_s: float) -> Float:
     extended = np.concatenate([before, values, after], axis=-1)
     size = quick_size(extended.shape[-1])
     spectrum = np.fft.rfft(_lengthened(extended, size)) * _gain(size, lowpass_hz, dt_s)
-    filtered: Float = np.fft.irfft(spectrum, size)[..., pad : pad + n]
-    return filtered
+    return np.fft.irfft(spectrum, size)[..., pad : pad + n]
 
 
 def _lengthened(values: Float, size: int) -> Float:
@@ -72,8 +69,7 @@ def impulse_response(lowpass_hz: float, dt_s: float) -> Float:
     """Return the centred impulse response of the low-pass (odd length)."""
     half = max(8, round(SPAN_PERIODS / lowpass_hz / dt_s))
     size = 2 * half + 1
-    response: Float = np.roll(np.fft.irfft(_gain(size, lowpass_hz, dt_s), size), half)
-    return response
+    return np.roll(np.fft.irfft(_gain(size, lowpass_hz, dt_s), size), half)
 
 
 @lru_cache(maxsize=32)
@@ -108,5 +104,4 @@ def through(columns: Float, kernel: Float) -> Float:
     rows, half = columns.shape[0], kernel.size // 2
     size = quick_size(rows + kernel.size - 1)
     spectrum = np.fft.rfft(columns, size, axis=0) * np.fft.rfft(kernel, size)[:, None]
-    passed: Float = np.fft.irfft(spectrum, size, axis=0)[half : half + rows]
-    return passed
+    return np.fft.irfft(spectrum, size, axis=0)[half : half + rows]

@@ -4,8 +4,6 @@ The entries of theta are [R, L, K, Jt, ft, Cd, delay], then one for each term of
 which the innovations are linear.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -44,8 +42,7 @@ class Problem:
 
     def residuals(self, theta: Float) -> Float:
         """Return the whitened innovations (m,) of all windows, with the filter matched to ``theta`` (k,)."""
-        column: Float = self.columns(theta[None])[:, 0]
-        return column
+        return self.columns(theta[None])[:, 0]
 
     @property
     def slow(self) -> bool:

@@ -1,7 +1,5 @@
 """Refines the Stribeck speed from the nearest one on the grid: Gauss-Newton jointly with all free entries."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

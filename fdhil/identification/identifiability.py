@@ -1,7 +1,5 @@
 """Withholds parameters that the data do not determine: each gets a reason instead of a value."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

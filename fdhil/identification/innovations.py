@@ -4,8 +4,6 @@ Each filter belongs to its parameters and noise levels. Its response is linear i
 filter for many changes of them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

@@ -3,8 +3,6 @@
 The current computed from R, L and the measured voltage is fitted to the measured one ([LJU] ch. 4, output error).
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -5,8 +5,6 @@ is a known load. Levenberg-Marquardt on the compiled kernel; both signals are sc
 the rounds.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Replays a rapid through the closed loop from its recorded demand."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

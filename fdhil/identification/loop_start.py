@@ -4,8 +4,6 @@ In a well-tuned cascade each loop is slower than its inner loop by a factor of a
 two such factors span the drives, and the lag at constant speed determines the feed-forward.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import product

@@ -6,8 +6,6 @@ structures compete with the cascade by the same measure. With full feed-forward 
 position_gain_per_s and speed_ki / speed_kp changes nothing: the one nearer to the start is reported.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

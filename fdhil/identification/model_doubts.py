@@ -5,8 +5,6 @@ linear in speed. A deviation shaped like a parameter's own regressor leaves no r
 deviation of the parameter, common to all windows of a drive.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

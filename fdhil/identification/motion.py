@@ -116,8 +116,7 @@ class Motion:
             return course
         begins = self.slow.begin_s + self.slow.period_s * np.arange(self.slow.voltage_v.size)
         begins = begins if self.slow.late_s is None else begins + self.slow.late_s
-        sampled: Float = np.interp(begins, np.arange(self.n) * self.dt_s, course)
-        return sampled
+        return np.interp(begins, np.arange(self.n) * self.dt_s, course)
 
     def aligned(self, delay_s: float) -> Motion:
         """Return the motion with its voltage earlier by ``delay_s``."""
@@ -137,8 +136,7 @@ class Motion:
             shifted[-whole:], rise[-whole:] = self.voltage_mean[-1], 0.0
         elif whole < 0:
             shifted[:-whole], rise[:-whole] = self.voltage_mean[0], 0.0
-        moved: Float = shifted + (rows - whole) * rise
-        return moved
+        return shifted + (rows - whole) * rise
 
 
 def surely_moving(speed: Float, rapid_rad_s: float) -> Bool:
@@ -187,8 +185,7 @@ def prepare(window: Window) -> Motion:
 def _angle(window: Window) -> Float:
     if not np.isfinite(window.position_mm).any():
         return np.zeros(0)
-    angle: Float = bridged(window.position_mm) * (2 * math.pi / window.pitch_mm)
-    return angle
+    return bridged(window.position_mm) * (2 * math.pi / window.pitch_mm)
 
 
 def _majority(side: Modes, sure: Bool) -> Modes:

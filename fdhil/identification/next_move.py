@@ -4,8 +4,6 @@ Each sample adds the information of its regressors, divided by the variance of t
 ch. 13). Moves are simulated with the estimated model, within the voltage of the recording.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 

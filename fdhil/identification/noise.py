@@ -1,7 +1,5 @@
 """Fits the noise levels of voltage, current and speed for given parameters, by the likelihood of the innovations."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

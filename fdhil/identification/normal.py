@@ -5,8 +5,6 @@ ten times more, and a library with its own threads would disturb the bus's recei
 library call is overhead, so the small matrix is diagonalised here.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from fdhil.model.compiled import compiled

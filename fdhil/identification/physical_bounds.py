@@ -4,8 +4,6 @@ Where chance took an estimate beyond a bound, the constrained maximum of its nor
 the covariance onto the active bounds. The covariance is kept: the interval is that of the data.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -160,8 +160,7 @@ def _between(
     )
     # two windows share the walk from the newer of them to the newest
     total = np.where(np.equal.outer(which, which), walk * np.minimum.outer(back, back), 0.0)
-    together: Float = total + np.diag(scatter)
-    return together
+    return total + np.diag(scatter)
 
 
 def _estimate(found: _Solution, names: Sequence[str], joined: Sequence[str], first: Estimate) -> Estimate:
@@ -225,8 +224,7 @@ def difference_covariance(one: tuple[Window, Estimate], other: tuple[Window, Est
     apart = systematic - its_systematic
     part, its_part = _unshared(one[0], systematic), _unshared(other[0], its_systematic)
     unshared = part @ part.T + its_part @ its_part.T + np.diag(alias**2 + its_alias**2)
-    covariance: Float = own + its_own + apart @ apart.T + np.diag((alias - its_alias) ** 2) + UNSHARED**2 * unshared
-    return covariance
+    return own + its_own + apart @ apart.T + np.diag((alias - its_alias) ** 2) + UNSHARED**2 * unshared
 
 
 def change_covariance(window: Window, estimate: Estimate) -> Float:
@@ -236,8 +234,7 @@ def change_covariance(window: Window, estimate: Estimate) -> Float:
     """
     own, systematic, alias = _of_six(*_parts(window, estimate))
     part = _unshared(window, systematic)
-    covariance: Float = own + part @ part.T + np.diag(alias**2)
-    return covariance
+    return own + part @ part.T + np.diag(alias**2)
 
 
 def _unshared(window: Window, systematic: Float) -> Float:

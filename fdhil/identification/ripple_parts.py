@@ -4,8 +4,6 @@ A sin(k a + phase) = A cos(phase) sin(k a) + A sin(phase) cos(k a): amplitudes o
 their parts can. The parts take the positions of amplitude and phase.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 

@@ -162,8 +162,7 @@ def _chosen(base: Fit, left: Sequence[Candidate], delayed: bool) -> tuple[_Bench
 
 
 def _price(freedom: Float, rows: float | Float, number: int) -> Float:
-    price: Float = freedom * np.log(np.maximum(rows, 2.0)) + 2.0 * math.log(number)
-    return price
+    return freedom * np.log(np.maximum(rows, 2.0)) + 2.0 * math.log(number)
 
 
 class _Scores(NamedTuple):

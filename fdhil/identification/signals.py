@@ -5,8 +5,6 @@ The recorded position has none and reveals the lag. It is removed from the speed
 position: a filter by its inverse, a mean by a stencil.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -157,20 +155,17 @@ def _lateness(window: Window) -> tuple[float, float] | None:
 def _moving(window: Window) -> Bool:
     known = np.isfinite(window.speed_rad_s) & np.isfinite(window.position_mm)
     whole = np.convolve(known, np.ones(2 * REACH + 1), "same") > 2 * REACH + 0.5
-    sure: Bool = whole & surely_moving(window.speed_rad_s, window.rapid_speed_rad_s)
-    return sure
+    return whole & surely_moving(window.speed_rad_s, window.rapid_speed_rad_s)
 
 
 def _angle(window: Window) -> Float:
-    turned: Float = bridged(window.position_mm) * (2 * math.pi / window.pitch_mm)
-    return turned
+    return bridged(window.position_mm) * (2 * math.pi / window.pitch_mm)
 
 
 def _left(speed: Float, seen: Float, rows: Bool) -> Float:
     columns = np.column_stack([seen, np.ones(seen.size)])[rows]
     inverse, _ = inverse_gram(columns)
-    rest: Float = speed[rows] - columns @ (inverse @ (columns.T @ speed[rows]))
-    return rest
+    return speed[rows] - columns @ (inverse @ (columns.T @ speed[rows]))
 
 
 def _explained(left: Float, window: Window, rows: Bool) -> bool:

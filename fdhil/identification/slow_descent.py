@@ -5,8 +5,6 @@ the ends of its samples, times L / T. The full likelihood is used, including the
 innovations' squares and their variances.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -13,8 +13,6 @@ The case depends on the drive and is the same in all its windows. With known loo
 decides: [2] needs the mean current of a sample for the speeds at its ends.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

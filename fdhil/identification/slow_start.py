@@ -1,7 +1,5 @@
 """Starts the fit of windows with a low-rate voltage: [5] over the sensor's samples, with the delay to some ms."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -11,8 +11,6 @@ Current and speed are processed one after the other, so every innovation is scal
 voltage moves the ends of its samples among the drive's: it is a parameter like the others.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,8 +40,7 @@ class Innovations:
     @property
     def whitened(self) -> Float:
         """The innovations, each in its own standard deviations."""
-        white: Float = self.values / np.sqrt(self.variance)
-        return white
+        return self.values / np.sqrt(self.variance)
 
     @property
     def logdet(self) -> float:

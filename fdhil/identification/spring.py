@@ -4,8 +4,6 @@ The spring's torque is linearised in the resonance f and in the table's share s 
 values, so both are entries of the fit, over a few iterations.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -158,8 +156,7 @@ def _bent(plain: Motion, theta: Float, spring: Spring) -> Motion:
 def _surely(motion: Motion) -> Modes:
     reach = math.ceil(NEAR_REST_S / motion.dt_s)
     near = np.convolve(motion.mode == UNKNOWN, np.ones(2 * reach + 1), "same") > 0.0
-    mode: Modes = np.where(near & (motion.mode != BROKEN), UNKNOWN, motion.mode).astype(np.int8)
-    return mode
+    return np.where(near & (motion.mode != BROKEN), UNKNOWN, motion.mode).astype(np.int8)
 
 
 def _with_prior(made: Fit, spring: Spring, expected: Told) -> Fit:

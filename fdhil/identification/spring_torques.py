@@ -186,8 +186,7 @@ class Torques:
 
     def back(self, spectrum: Spectrum) -> Float:
         """Return the signal (n,) of a spectrum."""
-        course: Float = np.fft.irfft(spectrum, 2 * (self.p.size - 1))[: self.n]
-        return course
+        return np.fft.irfft(spectrum, 2 * (self.p.size - 1))[: self.n]
 
 
 def of_motor(course: Course) -> bool:
@@ -201,8 +200,7 @@ def _spectrum(values: Float, size: int) -> Spectrum:
     whole = np.zeros(size)
     whole[:n] = values - values[0]
     whole[n:] = whole[n - 1] * (0.5 + 0.5 * np.cos(np.linspace(0.0, math.pi, size - n)))
-    spectrum: Spectrum = np.fft.rfft(whole).astype(np.complex128)
-    return spectrum
+    return np.fft.rfft(whole).astype(np.complex128)
 
 
 def _means(values: Float) -> Float:

@@ -87,8 +87,7 @@ class Motor:
         return self._rows(self.pushes * gain, rows) + float(gain[0].real) * _line(self.push)[rows]
 
     def _rows(self, spectrum: Complex, rows: Bool) -> Float:
-        values: Float = np.fft.irfft(spectrum, 2 * (self.omega.size - 1))[: rows.size][rows]
-        return values
+        return np.fft.irfft(spectrum, 2 * (self.omega.size - 1))[: rows.size][rows]
 
     def time(self, rows: Bool) -> Float:
         """Return (m,) seconds since the first of some samples."""
@@ -155,8 +154,7 @@ def left(seen: Float, columns: Float, power: Float) -> Float:
     both = np.column_stack([columns, seen])
     white = np.fft.irfft(np.fft.rfft(both, size, axis=0) * undone[:, None], size, axis=0)[: seen.size]
     q, _ = np.linalg.qr(white[:, :-1] / np.linalg.norm(white[:, :-1], axis=0))
-    out: Float = white[:, -1] - q @ (q.T @ white[:, -1])
-    return out
+    return white[:, -1] - q @ (q.T @ white[:, -1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,8 +183,7 @@ class Encoder:
     def power(self, w: float, z: float) -> Float:
         """Return the power of its noise and of the motor position's through the response, a sample."""
         pulled = (2j * z * w * self.motor.omega + w * w) * flexible(self.motor.omega, w, z)
-        power: Float = np.abs(pulled) ** 2 * self.motor.place_noise + self.own**2
-        return power
+        return np.abs(pulled) ** 2 * self.motor.place_noise + self.own**2
 
     def bends(self, w: float, z: float, q: float) -> Float:
         """Return the residuals of a table bent by the torque; ``w`` and ``z`` with the motor free."""
@@ -226,8 +223,7 @@ class Accelerometer:
     def power(self, w: float, z: float) -> Float:
         """Return the power of its noise and of the current's through the response, a sample."""
         pulled = (2j * z * w * self.motor.omega + w * w) * flexible(self.motor.omega, w, z)
-        power: Float = np.abs(pulled) ** 2 * noise_of(self.motor.push) ** 2 + self.own**2
-        return power
+        return np.abs(pulled) ** 2 * noise_of(self.motor.push) ** 2 + self.own**2
 
     def _left(self, gain: Complex, more: list[Float], power: Float) -> Float:
         motor, rows = self.motor, self.rows

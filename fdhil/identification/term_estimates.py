@@ -4,8 +4,6 @@ The Stribeck speed is found next to the fit, a speed's lag before it. Both have 
 added to their covariance.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -4,8 +4,6 @@ Stribeck friction, falling or rising, is tried at a grid of speeds; a ripple is 
 angle; of a commanded voltage the inverter's dead time, and a bus that sags under power, subtract a part.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -94,8 +92,7 @@ def bus_sag(motion: Motion) -> Course:
 
 
 def _side(motion: Motion) -> Float:
-    side: Float = np.where(np.abs(motion.mode) == 1, motion.mode, 0).astype(np.float64)
-    return side
+    return np.where(np.abs(motion.mode) == 1, motion.mode, 0).astype(np.float64)
 
 
 def _smoothed(motion: Motion, values: Float) -> Float:

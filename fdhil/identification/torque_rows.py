@@ -8,8 +8,6 @@ Samples at standstill, or lost, are zeroed on both sides of [2] before the low-p
 does not leak into their neighbours.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -50,8 +48,7 @@ class TorqueRows:
 
     def through(self, courses: Float) -> Float:
         """Return torque regressors (q, n) through the same low-pass, at the samples to fit (m, q)."""
-        filtered: Float = zero_phase(courses, self.lowpass_hz, self.dt_s)[:, self.usable].T
-        return filtered
+        return zero_phase(courses, self.lowpass_hz, self.dt_s)[:, self.usable].T
 
 
 def torque_rows(window: Window, settings: Identification) -> TorqueRows | None:

@@ -1,7 +1,5 @@
 """Analyses a parameter's history: its slope, its steps, when it reaches a limit, each with an interval."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -115,8 +113,7 @@ def slope(points: Float, against: Float, stds: Float | None = None, covariate: F
 
 def _without(other: Float, column: Float) -> Float:
     length = float(other @ other)
-    rest: Float = column - other * (float(other @ column) / length if length > 0 else 0.0)
-    return rest
+    return column - other * (float(other @ column) / length if length > 0 else 0.0)
 
 
 def without_direction(points: Float, direction: Float) -> Float:
@@ -131,8 +128,7 @@ def without_direction(points: Float, direction: Float) -> Float:
     if turns.size < LEAST_TURNS:
         return points
     load = float(np.median(side[turns] * (y[turns] - y[turns + 1]) / 2))
-    freed: Float = points - load * direction
-    return freed
+    return points - load * direction
 
 
 def crossing(line: Slope, limit: float) -> Crossing | None:

@@ -4,8 +4,6 @@ A window is a maximal run in which the smoothed speed is at least 2 % of the rap
 whose peak stays below 60 % of the rapid speed is a feed move and is left out.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from itertools import islice, pairwise

@@ -11,8 +11,6 @@ of the scores (Newey and West 1987), widened for its own scatter (Kiefer and Vog
 reported.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -77,8 +75,7 @@ class TorqueFit:
     @property
     def residual(self) -> Float:
         """The residual of the current (m,), A."""
-        left: Float = self.current - self.design @ self.theta
-        return left
+        return self.current - self.design @ self.theta
 
     @property
     def unexplained(self) -> float:

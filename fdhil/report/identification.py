@@ -1,7 +1,5 @@
 """Draws an identification: measured and modelled signals, residuals' whiteness, parameters and their correlation."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -74,7 +74,12 @@ def test_picture_and_page_are_written(trace: Path, tmp_path: Path) -> None:
     assert result.return_value == 0, result.output
     assert trace.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     text = page.read_text("utf-8")
-    for title in ("Parameters", "Correlation of the residuals", "Correlation of the estimates", "Most informative further recording"):
+    for title in (
+        "Parameters",
+        "Correlation of the residuals",
+        "Correlation of the estimates",
+        "Most informative further recording",
+    ):
         assert title in text
 
 

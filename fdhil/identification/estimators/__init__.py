@@ -1,7 +1,5 @@
 """One file per estimator, each with ``estimate(windows, settings) -> Estimate``; ``fdhil.tables`` lists them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Protocol
 

@@ -5,8 +5,6 @@ interval means. [6] is fitted as K i = Jt Dw + ft w + Cd sign(w) with K from [5]
 sandwich over both equations, because filtered residuals are coloured and share their noise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -6,8 +6,6 @@ parameters: held fixed, it would mistake noise for voltage and make L too large 
 levels are renewed between the Gauss-Newton steps, whose information matrix yields the covariance.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache

@@ -8,8 +8,6 @@ so no derivative and no initial state appears, and the integral itself is the lo
 sample (the reinitialisation), and least squares is solved over all of them, as in [5] and [6].
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -84,8 +82,7 @@ def moments(window: Window, steps: int) -> tuple[Float, Float]:
     rows = np.flatnonzero(usable > steps + 0.5)
 
     def through(values: Float, weights: Float) -> Float:
-        taken: Float = np.correlate(values, weights, "valid")[rows]
-        return taken
+        return np.correlate(values, weights, "valid")[rows]
 
     mean_current, mean_speed = through(current, moment), through(speed, moment)
     electrical = [through(carried(window.voltage_v), over), through(current, slope), mean_current, mean_speed]
