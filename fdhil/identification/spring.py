@@ -22,8 +22,8 @@ from fdhil.records import Float
 RESONANCE, SHARE, DAMPING = "resonance", "resonance_share", "resonance_damping"
 USUAL_DAMPING, DAMPING_DOUBT = 0.03, 0.02  # of ordinary screws: the data hardly show it
 USUAL_SHARE, SHARE_DOUBT = 0.5, 0.15  # prior of the inertia behind the spring
-TOLD_DOUBT = 0.05  # relative, of a configured resonance
-FOUND_DOUBT = 1.0  # relative, of a searched one
+CONFIGURED_DOUBT = 0.05  # relative, of a configured resonance
+SEARCHED_DOUBT = 1.0  # relative, of a searched one
 GRID = np.geomspace(40.0, 320.0, 24)  # Hz, of the search
 AROUND = np.array([0.92, 0.96, 1.0, 1.04, 1.08])  # of a configured resonance: starts of the fit
 FAR, FIRM = 0.35, 1e4  # relative distance from the configured resonance; factor of the prior that fixes it
@@ -56,7 +56,7 @@ class Told:
 
     def allows(self, spring: Spring) -> bool:
         """Return whether a spring is plausible: one far from the prior stands for something else."""
-        near = abs(spring.hertz / self.hertz - 1.0) < (FAR if self.hertz_std < self.hertz else FOUND_DOUBT)
+        near = abs(spring.hertz / self.hertz - 1.0) < (FAR if self.hertz_std < self.hertz else SEARCHED_DOUBT)
         return near and LEAST_SHARE < spring.share < MOST_SHARE
 
     def away(self, spring: Spring) -> Float:
@@ -78,7 +78,7 @@ def sprung(base: Fit, axis: Axis | None) -> Fit | None:
         return None
     expected = None
     if axis is not None and axis.resonance_hz is not None:
-        expected = Told(axis.resonance_hz, TOLD_DOUBT * axis.resonance_hz, axis.resonance_damping)
+        expected = Told(axis.resonance_hz, CONFIGURED_DOUBT * axis.resonance_hz, axis.resonance_damping)
     grid = GRID if expected is None else AROUND * expected.hertz
     # a configured resonance above the samples' band still acts below it
     grid = grid[grid * motion.dt_s < MOST_OF_ROWS * (1 if expected is None else 2)]
@@ -88,7 +88,7 @@ def sprung(base: Fit, axis: Axis | None) -> Fit | None:
     best = float(grid[int(np.argmax(scores))])
     if expected is None and scores.max() < SURE:
         return None
-    known = expected or Told(best, FOUND_DOUBT * best)
+    known = expected or Told(best, SEARCHED_DOUBT * best)
     found = _turned(base, Spring(best, USUAL_SHARE, known.damping), known)
     if expected is not None:
         if found is None:

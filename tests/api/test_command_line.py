@@ -1,4 +1,4 @@
-"""``fdhil identify`` for laboratories: any move, proposed maps, pictures, pages; and how to cite."""
+"""``fdhil identify`` for laboratories: any move, proposed maps, pictures, pages; and the citation."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture
 def trace(tmp_path: Path) -> Path:
-    """Return a scope's file of steps of the voltage."""
+    """Return an oscilloscope's file of voltage steps."""
     return write_csv(tmp_path / "scope.csv", "Time [s],CH1,CH2,Speed [rpm]", "tuiw", rpm=True)
 
 

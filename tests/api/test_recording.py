@@ -1,4 +1,4 @@
-"""Arrays as recordings: what is taken, and what is refused with its cause and remedy."""
+"""Arrays as recordings: what is accepted, and what is refused with cause and action."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ GIVEN: dict[str, Any] = {
 
 
 class Column:
-    """A column of another library: it becomes an array on request, as those of pandas, polars and xarray do."""
+    """A column of another library that converts to an array on request, like those of pandas, polars and xarray."""
 
     def __init__(self, values: Any) -> None:
         self._values = np.asarray(values)
