@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fdhil.identification.windows import longest
 from fdhil.records import Float
 from fdhil.report.drawing import COLOURS, INK, LEGEND_LINE, REFERENCE, SHADES, drawing, legend_above, legend_rows
 
@@ -104,7 +105,7 @@ def corner(
         axes.set_xlabel(f"{names[0]} (mm)")
         axes.set_ylabel(f"{names[1]} (mm)")
         inside = np.all(np.abs(reference - centre) < [half_width_mm, TALL * half_width_mm], axis=1)
-        _arrow(axes, reference[_longest_run(inside)], 0.3)
+        _arrow(axes, reference[slice(*longest(inside))], 0.3)
         legend_above(axes, columns)
         shown = ", ".join(curve.label for curve in curves)
         made.alt = f"The path around {names[0]} {x:.1f} mm, {names[1]} {y:.1f} mm: {shown}."
@@ -117,15 +118,6 @@ def _near(curves: Sequence[Curve], centre_mm: Float, distance_mm: float) -> Iter
     for curve in curves:
         inside = np.all(np.abs(curve.path_mm - centre_mm) < distance_mm, axis=1, keepdims=True)
         yield Curve(curve.label, np.where(inside, curve.path_mm, np.nan), curve.dashed)
-
-
-def _longest_run(inside: np.ndarray[Any, Any]) -> slice:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8)))
-    if edges.size == 0:
-        return slice(0, 0)
-    runs = edges.reshape(-1, 2)
-    first, last = runs[np.argmax(np.diff(runs, axis=1))]
-    return slice(int(first), int(last))
 
 
 def error_map(
