@@ -63,9 +63,9 @@ def compliance(window: Window, parameters: Parameters) -> Compliance | None:
     if motor is None:
         return None
     encoder, accelerometer = _seen(window, motor)
-    eye = encoder or accelerometer
-    fit = None if eye is None else _fitted(eye, motor.dt_s)
-    if eye is None or fit is None:
+    sensor = encoder or accelerometer
+    fit = None if sensor is None else _fitted(sensor, motor.dt_s)
+    if sensor is None or fit is None:
         return None
     values, spread = fit
     w, z = math.exp(values[0]), math.exp(values[1])
@@ -91,42 +91,42 @@ def _seen(window: Window, motor: Motor) -> tuple[Encoder | None, Accelerometer |
     return encoder, accelerometer
 
 
-def _fitted(eye: Encoder | Accelerometer, dt: float) -> tuple[Float, Float] | None:
-    late = _late(eye)
+def _fitted(sensor: Encoder | Accelerometer, dt: float) -> tuple[Float, Float] | None:
+    late = _late(sensor)
     trials = 2 * math.pi * np.geomspace(*BAND_HZ, TRIALS)
-    shown = [_evidence(eye, w, DAMPING[0], late) for w in trials]
+    shown = [_evidence(sensor, w, DAMPING[0], late) for w in trials]
     best = int(np.argmax(shown))
     if best in (0, TRIALS - 1):  # a resonance beyond the band, or none
         return None
     start = np.array([math.log(trials[best]), math.log(DAMPING[0]), late])
     weak = np.array([0.0, 1.0 / DAMPING[1], 1.0 / LATE_STD_S])
     expected = start.copy()
-    scale = max(1.0, rms(eye.follows(trials[best], DAMPING[0], late)))
+    scale = max(1.0, rms(sensor.follows(trials[best], DAMPING[0], late)))
     low, high = np.log(2 * math.pi * np.array(BAND_HZ))
 
     def unexplained(x: Float) -> Float:
         w, z = math.exp(min(max(x[0], low), high)), min(math.exp(x[1]), 0.9)
-        return np.concatenate([eye.follows(w, z, x[2]) / scale, (x - expected) * weak])
+        return np.concatenate([sensor.follows(w, z, x[2]) / scale, (x - expected) * weak])
 
     values, rest, slopes = _least(unexplained, start, np.array([1e-4, 1e-2, 1e-5]))
-    at = [_evidence(eye, math.exp(values[0]) * off, math.exp(values[1]), values[2]) for off in (1.0, *ELSEWHERE)]
+    at = [_evidence(sensor, math.exp(values[0]) * off, math.exp(values[1]), values[2]) for off in (1.0, *ELSEWHERE)]
     if at[0] - max(0.0, *at[1:]) < EVIDENCE:
         return None
     if not (low < values[0] < high and values[1] < math.log(0.9)):
         return None
-    spread = _spread(slopes, rest, eye.seen.size, round(CORRELATED_S / dt))
+    spread = _spread(slopes, rest, sensor.readings.size, round(CORRELATED_S / dt))
     return (values, spread) if np.isfinite(spread).all() and spread[0, 0] < LARGEST_STD**2 else None
 
 
-def _late(eye: Encoder | Accelerometer) -> float:
-    """Return the lag of a sensor, s, found with a stiff screw."""
-    tried = np.linspace(-2.0, 6.0, 17) * 1e-3 if isinstance(eye, Accelerometer) else np.zeros(1)
-    return float(min(tried, key=lambda late: float(np.square(eye.stiff(late)).sum())))
+def _late(sensor: Encoder | Accelerometer) -> float:
+    """Return the lag of a sensor, s, found with a rigid screw."""
+    tried = np.linspace(-2.0, 6.0, 17) * 1e-3 if isinstance(sensor, Accelerometer) else np.zeros(1)
+    return float(min(tried, key=lambda late: float(np.square(sensor.stiff(late)).sum())))
 
 
-def _evidence(eye: Encoder | Accelerometer, w: float, z: float, late_s: float) -> float:
+def _evidence(sensor: Encoder | Accelerometer, w: float, z: float, late_s: float) -> float:
     """Return the rise of twice the log likelihood by a spring, counted in independent samples and with equal noise."""
-    sprung, stiff = eye.follows(w, z, late_s), eye.stiff(late_s, eye.power(w, z))
+    sprung, stiff = sensor.follows(w, z, late_s), sensor.stiff(late_s, sensor.power(w, z))
     return _own(sprung) * math.log(max(float(stiff @ stiff), NIL) / max(float(sprung @ sprung), NIL))
 
 
@@ -208,7 +208,7 @@ def _spread(slopes: Float, rest: Float, size: int, reach: int) -> Float:
     return np.asarray(bread @ meat @ bread)
 
 
-def joined(estimate: Estimate, found: Compliance) -> Estimate:
+def joined(estimate: Estimate, identified: Compliance) -> Estimate:
     """Return the estimate with the resonance from the table's sensors, replacing one from the motor's side."""
     kept = [k for k, name in enumerate(estimate.names) if name not in TERMS]
     before = np.zeros((len(estimate.names), 0))
@@ -217,9 +217,9 @@ def joined(estimate: Estimate, found: Compliance) -> Estimate:
     return replace(
         estimate,
         names=(*(estimate.names[k] for k in kept), *TERMS),
-        values=frozen([*estimate.values[kept], *found.values]),
-        covariance=frozen(_apart(estimate.covariance[np.ix_(kept, kept)], found.covariance)),
-        systematic=frozen(_apart(before[kept], found.doubts)),
+        values=frozen([*estimate.values[kept], *identified.values]),
+        covariance=frozen(_apart(estimate.covariance[np.ix_(kept, kept)], identified.covariance)),
+        systematic=frozen(_apart(before[kept], identified.doubts)),
     )
 
 
@@ -228,11 +228,11 @@ def _apart(one: Float, other: Float) -> Float:
     return np.block([[one, upper], [lower, other]])
 
 
-def beside_the_config(found: Compliance, axis: Axis | None) -> list[Reason]:
+def beside_the_config(identified: Compliance, axis: Axis | None) -> list[Reason]:
     """Return a warning where the table's resonance differs significantly from the one in use."""
     if axis is None or axis.resonance_hz is None:
         return []
-    hertz, half = float(found.values[0]), INTERVAL_95 * math.sqrt(found.covariance[0, 0])
+    hertz, half = float(identified.values[0]), INTERVAL_95 * math.sqrt(identified.covariance[0, 0])
     if abs(hertz - axis.resonance_hz) <= max(half, SAME * hertz):
         return []
     text = f"the table resonates at {hertz:.1f} ± {half:.1f} Hz, not at {axis.resonance_hz:.4g} Hz as configured or "

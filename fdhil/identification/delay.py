@@ -64,16 +64,16 @@ def delay_direction(result: Fit) -> Float:
     return jacobian(result.problem, result.theta, result.residuals, [DELAY], sizes)[:, 0]
 
 
-def with_delay_doubt(made: Fit) -> Fit:
+def with_delay_doubt(fitted: Fit) -> Fit:
     """Return the fit with its doubt about a delay of the voltage.
 
     Regulators act several times within a sample. That resembles a delay of a few per cent of it, but shifts L
     differently. A small delay is therefore not corrected: its effect counts as a doubt, and likewise the uncertainty of
     a larger one.
     """
-    if DELAY in made.free:
-        return replace(made, delay_doubt_s=LEAST_DELAY / 2 * min(m.dt_s for m in made.problem.motions))
-    if not (made.converged and np.isfinite(made.residuals).all()):
-        return made
-    delay, std = delay_score(made)
-    return replace(made, delay_doubt_s=float(np.sqrt(max(0.0, delay**2 - (CHANCE * std) ** 2))))
+    if DELAY in fitted.free:
+        return replace(fitted, delay_doubt_s=LEAST_DELAY / 2 * min(m.dt_s for m in fitted.problem.motions))
+    if not (fitted.converged and np.isfinite(fitted.residuals).all()):
+        return fitted
+    delay, std = delay_score(fitted)
+    return replace(fitted, delay_doubt_s=float(np.sqrt(max(0.0, delay**2 - (CHANCE * std) ** 2))))

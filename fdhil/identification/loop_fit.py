@@ -109,22 +109,22 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """The minimum: coordinates, the residuals ``left`` (2, n) of each rapid in mm and A, and their scale (2,)."""
+    """The minimum: coordinates, ``residuals`` (2, n) of each rapid in mm and A, and their scale (2,)."""
 
     problem: Problem
     coordinates: Float
-    left: tuple[Float, ...]
+    residuals: tuple[Float, ...]
     scale: Float
 
     @property
     def unexplained_um(self) -> float:
         """RMS residual of the position."""
-        return float(spread_of(self.problem, self.left)[0]) * 1e3
+        return float(spread_of(self.problem, self.residuals)[0]) * 1e3
 
     @property
     def deviance(self) -> float:
         """Minus twice the log likelihood per sample, without the constant that all fits of the rapids share."""
-        scale, spread = scale_of(self.problem, self.left), spread_of(self.problem, self.left)
+        scale, spread = scale_of(self.problem, self.residuals), spread_of(self.problem, self.residuals)
         return float((2.0 * np.log(scale) + (spread / scale) ** 2).sum())
 
     @property
@@ -139,13 +139,13 @@ class Fit:
 
     def squares(self, scale: Float) -> float:
         """Return the sum of squares at some scale."""
-        pairs = zip(self.left, self.problem.rapids, strict=True)
-        return float(sum(np.square((left / scale[:, None])[:, one.known]).sum() for left, one in pairs))
+        pairs = zip(self.residuals, self.problem.rapids, strict=True)
+        return float(sum(np.square((own / scale[:, None])[:, one.known]).sum() for own, one in pairs))
 
     def answers(self) -> list[Float]:
         """Return the closed loop's position and current (2, n) for each rapid."""
-        pairs = zip(self.problem.rapids, self.left, strict=True)
-        return [np.stack((rapid.position_mm, rapid.current_a)) - left for rapid, left in pairs]
+        pairs = zip(self.problem.rapids, self.residuals, strict=True)
+        return [np.stack((rapid.position_mm, rapid.current_a)) - own for rapid, own in pairs]
 
 
 def left_of(problem: Problem, coordinates: Float) -> tuple[tuple[Float, ...], list[Float]]:
@@ -155,52 +155,52 @@ def left_of(problem: Problem, coordinates: Float) -> tuple[tuple[Float, ...], li
     return tuple(m - a for m, a in zip(measured, answers, strict=True)), answers
 
 
-def spread_of(problem: Problem, left: Sequence[Float]) -> Float:
+def spread_of(problem: Problem, residuals: Sequence[Float]) -> Float:
     """Return the RMS (2,) of the residuals, in mm and A."""
-    whole = np.concatenate([r[:, one.known] for r, one in zip(left, problem.rapids, strict=True)], axis=1)
+    whole = np.concatenate([r[:, one.known] for r, one in zip(residuals, problem.rapids, strict=True)], axis=1)
     return np.asarray(np.sqrt((whole**2).mean(axis=1)))
 
 
-def scale_of(problem: Problem, left: Sequence[Float]) -> Float:
+def scale_of(problem: Problem, residuals: Sequence[Float]) -> Float:
     """Return the scale (2,) of the residuals: their RMS, but at least the rounding."""
-    return np.maximum(spread_of(problem, left), (LEAST_POSITION_MM, LEAST_CURRENT_A))
+    return np.maximum(spread_of(problem, residuals), (LEAST_POSITION_MM, LEAST_CURRENT_A))
 
 
 def fit(problem: Problem, start: Float | None = None) -> Fit:
     """Fit the regulators to position and current, from the axis' present ones or from ``start``."""
     at = problem.start() if start is None else start
-    left, _ = left_of(problem, at)
-    made, prior = Fit(problem, at, left, scale_of(problem, left)), at.copy()
+    residuals, _ = left_of(problem, at)
+    fitted, prior = Fit(problem, at, residuals, scale_of(problem, residuals)), at.copy()
     for _ in range(ROUNDS):
-        before = made.unexplained_um
-        made = _descend(made, prior)
-        made = replace(made, scale=scale_of(problem, made.left))
-        if abs(made.unexplained_um - before) < SETTLED * before:
+        before = fitted.unexplained_um
+        fitted = _descend(fitted, prior)
+        fitted = replace(fitted, scale=scale_of(problem, fitted.residuals))
+        if abs(fitted.unexplained_um - before) < SETTLED * before:
             break
-    return made
+    return fitted
 
 
-def _descend(made: Fit, prior: Float) -> Fit:
-    problem, damping, answers = made.problem, 1e-3, made.answers()
+def _descend(fitted: Fit, prior: Float) -> Fit:
+    problem, damping, answers = fitted.problem, 1e-3, fitted.answers()
     weights, (low, high) = 1.0 / problem.doubt() ** 2, problem.bounds()
 
     def cost(of: Fit) -> float:
-        return of.squares(made.scale) + float(weights @ (of.coordinates - prior) ** 2)
+        return of.squares(fitted.scale) + float(weights @ (of.coordinates - prior) ** 2)
 
-    now, slopes, fresh = cost(made), problem.slopes(made.coordinates, answers), True
+    now, slopes, fresh = cost(fitted), problem.slopes(fitted.coordinates, answers), True
     for _ in range(STEPS):
-        information, score = normal(made, slopes)
-        score = score - weights * (made.coordinates - prior)
-        before = made, now, answers
+        information, score = normal(fitted, slopes)
+        score = score - weights * (fitted.coordinates - prior)
+        before = fitted, now, answers
         for _ in range(TRIALS if fresh else 1):
             matrix = information + np.diag(weights + damping * np.diag(information))
-            step = _free_step(matrix, score, made.coordinates, low, high)
-            at = np.clip(made.coordinates + step, low, high)
-            left, reached = left_of(problem, at)
-            trial = replace(made, coordinates=at, left=left)
+            step = _free_step(matrix, score, fitted.coordinates, low, high)
+            at = np.clip(fitted.coordinates + step, low, high)
+            residuals, reached = left_of(problem, at)
+            trial = replace(fitted, coordinates=at, residuals=residuals)
             value = cost(trial)
             if np.isfinite(value) and value < now:
-                now, made, answers, damping = value, trial, reached, max(damping / 10, 1e-9)
+                now, fitted, answers, damping = value, trial, reached, max(damping / 10, 1e-9)
                 break
             damping *= 8
         gained = before[1] - now
@@ -208,10 +208,10 @@ def _descend(made: Fit, prior: Float) -> Fit:
             break
         fresh = gained < ENOUGH * before[1]
         if fresh:
-            slopes = problem.slopes(made.coordinates, answers)
+            slopes = problem.slopes(fitted.coordinates, answers)
         else:
-            slopes = _turned(slopes, made.coordinates - before[0].coordinates, answers, before[2], information)
-    return made
+            slopes = _turned(slopes, fitted.coordinates - before[0].coordinates, answers, before[2], information)
+    return fitted
 
 
 def _turned(
@@ -231,46 +231,46 @@ def _free_step(matrix: Float, score: Float, at: Float, low: Float, high: Float) 
     return step
 
 
-def normal(made: Fit, slopes: Sequence[Float]) -> tuple[Float, Float]:
+def normal(fitted: Fit, slopes: Sequence[Float]) -> tuple[Float, Float]:
     """Return information (k, k) and score (k,) of a fit with the ``slopes`` (2, n, k) of each rapid."""
     k = slopes[0].shape[2]
     information, score = np.zeros((k, k)), np.zeros(k)
-    for phi, rest in _weighed(made, slopes):
+    for phi, rest in _weighed(fitted, slopes):
         flat = phi.reshape(-1, k)
         information += flat.T @ flat
         score += flat.T @ rest.ravel()
     return information, score
 
 
-def _weighed(made: Fit, slopes: Sequence[Float]) -> Iterator[tuple[Float, Float]]:
+def _weighed(fitted: Fit, slopes: Sequence[Float]) -> Iterator[tuple[Float, Float]]:
     """Yield scaled slopes (2, m, k) and residuals (2, m) of each rapid's complete samples."""
-    for rapid, left, slope in zip(made.problem.rapids, made.left, slopes, strict=True):
+    for rapid, own, slope in zip(fitted.problem.rapids, fitted.residuals, slopes, strict=True):
         known = rapid.known
-        yield slope[:, known] / made.scale[:, None, None], left[:, known] / made.scale[:, None]
+        yield slope[:, known] / fitted.scale[:, None, None], own[:, known] / fitted.scale[:, None]
 
 
-def covariance_of(made: Fit) -> Float:
+def covariance_of(fitted: Fit) -> Float:
     """Return the covariance (k, k) of the coordinates: the larger of inverse information and sandwich."""
-    slopes = made.problem.slopes(made.coordinates, made.answers())
-    information, _ = normal(made, slopes)
+    slopes = fitted.problem.slopes(fitted.coordinates, fitted.answers())
+    information, _ = normal(fitted, slopes)
     # unmodelled dynamics are coloured (Newey and West 1987)
-    meat = sum(summed(np.einsum("cnk,cn->nk", phi, rest)) for phi, rest in _weighed(made, slopes))
-    inverse = np.linalg.inv(information + np.diag(1.0 / made.problem.doubt() ** 2))
+    meat = sum(summed(np.einsum("cnk,cn->nk", phi, rest)) for phi, rest in _weighed(fitted, slopes))
+    inverse = np.linalg.inv(information + np.diag(1.0 / fitted.problem.doubt() ** 2))
     sandwich = inverse @ meat @ inverse
     wider = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(inverse), 1.0))
-    floor = np.diag([(SYSTEMATIC if KEYS[name].scale == 0.0 else 0.0) ** 2 for name in made.problem.names])
+    floor = np.diag([(SYSTEMATIC if KEYS[name].scale == 0.0 else 0.0) ** 2 for name in fitted.problem.names])
     return np.asarray((inverse * np.outer(wider, wider)) + floor)
 
 
-def likeliest(made: Fit, options: Sequence[tuple[str, ...]]) -> list[Fit]:
+def likeliest(fitted: Fit, options: Sequence[tuple[str, ...]]) -> list[Fit]:
     """Return the starts of fits with additional keys, the likeliest first.
 
     Each of the ``options`` is extrapolated linearly, from the end of the fit without it and from that fit's start,
     because a missing key distorts the others.
     """
-    begun = made.problem.start()
-    left, _ = left_of(made.problem, begun)
-    starts = (made, Fit(made.problem, begun, left, scale_of(made.problem, left)))
+    begun = fitted.problem.start()
+    residuals, _ = left_of(fitted.problem, begun)
+    starts = (fitted, Fit(fitted.problem, begun, residuals, scale_of(fitted.problem, residuals)))
     found = [one for start in starts for one in _ahead(start, options)]
     return sorted((one for one in found if math.isfinite(one.deviance)), key=lambda one: one.deviance)
 
@@ -280,12 +280,12 @@ def _ahead(start: Fit, options: Sequence[tuple[str, ...]]) -> Iterator[Fit]:
     for option in options:
         wider = replace(start.problem, names=(*start.problem.names, *option))
         at = np.append(start.coordinates, [KEYS[name].usual for name in option])
-        left, answers = left_of(wider, at)
+        residuals, answers = left_of(wider, at)
         own = replace(wider, axis=start.axis(), names=option).slopes(at[-len(option) :], answers)
         both = [np.concatenate(pair, axis=2) for pair in zip(slopes, own, strict=True)]
-        information, score = normal(Fit(wider, at, left, scale_of(wider, left)), both)
+        information, score = normal(Fit(wider, at, residuals, scale_of(wider, residuals)), both)
         low, high = wider.bounds()
         at = np.clip(at + np.linalg.solve(information + np.diag(1.0 / wider.doubt() ** 2), score), low, high)
         if (at[-len(option) :] > 0.0).all():
-            left, _ = left_of(wider, at)
-            yield Fit(wider, at, left, scale_of(wider, left))
+            residuals, _ = left_of(wider, at)
+            yield Fit(wider, at, residuals, scale_of(wider, residuals))

@@ -132,8 +132,8 @@ def _load(position_mm: Float, current_a: Float, plant: Parameters, window: Windo
     rows = np.flatnonzero(all_about(moving, 2 * width + 1, beyond=False))
     if not rows.size or width == 1:  # in such long samples instants of the current are not its mean
         return np.zeros(window.n)
-    left = torque - friction - plant.Jt * acceleration
-    return np.asarray(np.interp(np.arange(window.n), rows, left[rows]))
+    unexplained = torque - friction - plant.Jt * acceleration
+    return np.asarray(np.interp(np.arange(window.n), rows, unexplained[rows]))
 
 
 def _creep(position_mm: Float, dt_s: float, least_mm: float) -> float:

@@ -44,8 +44,8 @@ def begun_anew(problem: Problem) -> Problem:
             current_delay_cycles=0,
         )
         trial = Problem((rapid,), start, CASCADE)
-        left, _ = left_of(trial, trial.start())
-        cost = float(np.log(scale_of(trial, left)).sum())
+        residuals, _ = left_of(trial, trial.start())
+        cost = float(np.log(scale_of(trial, residuals)).sum())
         if cost < least:
             best, least = replace(problem, axis=start, names=CASCADE), cost
     return best

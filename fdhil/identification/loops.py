@@ -58,7 +58,7 @@ def identify_loops(
     *,
     growing: bool = True,
 ) -> LoopEstimate | None:
-    """Return the loops of the drive that made the rapids; None where no window has demand, position and current.
+    """Return the loops of the drive that fitted the rapids; None where no window has demand, position and current.
 
     ``mechanics`` are the parameters identified from each window, ``axis`` is the machine's section; without it the
     search starts from the demand alone. Set-points come every ``sync_period_s`` (default: every sample). Without
@@ -81,9 +81,9 @@ def identify_loops(
         found = _whole_delay(_of_either(problem, modelled, tolerance, axis is not None))
     else:
         fits = [loop_fit.fit(kind) for kind in kinds]
-        found = _whole_delay(min(fits, key=lambda made: made.unexplained_um))
-    left = (loop_fit.spread_of(kind, loop_fit.left_of(kind, kind.start())[0])[0] for kind in kinds)
-    configured = None if axis is None else float(min(left)) * 1e3
+        found = _whole_delay(min(fits, key=lambda fitted: fitted.unexplained_um))
+    residuals_mm = (loop_fit.spread_of(kind, loop_fit.left_of(kind, kind.start())[0])[0] for kind in kinds)
+    configured = None if axis is None else float(min(residuals_mm)) * 1e3
     verdict = _verdict(found, tolerance, following, configured)
     return _told(windows[0].axis, found, verdict, configured)
 
@@ -141,34 +141,34 @@ def _best(begun: Fit, tolerance_um: float, configured: bool) -> Fit:
     return best
 
 
-def _grown(made: Fit, tolerance_um: float) -> Fit:
-    begun = made.problem.names
-    while beyond_rounding_um(made) > enough_um(tolerance_um):
-        options = [option for option in (*SINGLE_KEYS, *FILTERS) if not {*option} & {*made.problem.names}]
-        starts = loop_fit.likeliest(made, options)[:MOST_TRIED] if options else []
+def _grown(fitted: Fit, tolerance_um: float) -> Fit:
+    begun = fitted.problem.names
+    while beyond_rounding_um(fitted) > enough_um(tolerance_um):
+        options = [option for option in (*SINGLE_KEYS, *FILTERS) if not {*option} & {*fitted.problem.names}]
+        starts = loop_fit.likeliest(fitted, options)[:MOST_TRIED] if options else []
         fits = (loop_fit.fit(start.problem, start.coordinates) for start in starts)
-        grown = min(fits, key=lambda f: f.deviance, default=made)
-        if not made.unexplained_um - grown.unexplained_um > worth_um(made, tolerance_um):
+        grown = min(fits, key=lambda f: f.deviance, default=fitted)
+        if not fitted.unexplained_um - grown.unexplained_um > worth_um(fitted, tolerance_um):
             break
-        made = grown
-    return _without_spare_keys(made, [name for name in made.problem.names if name not in begun], tolerance_um)
+        fitted = grown
+    return _without_spare_keys(fitted, [name for name in fitted.problem.names if name not in begun], tolerance_um)
 
 
-def _without_spare_keys(made: Fit, joined: Sequence[str], tolerance_um: float) -> Fit:
-    for name in joined if len(joined) > 1 else ():
-        problem, place = made.problem, made.problem.names.index(name)
+def _without_spare_keys(fitted: Fit, added: Sequence[str], tolerance_um: float) -> Fit:
+    for name in added if len(added) > 1 else ():
+        problem, place = fitted.problem, fitted.problem.names.index(name)
         names = tuple(other for other in problem.names if other != name)
         fewer = replace(problem, axis=with_regulators(problem.axis, **{name: 0}), names=names)
-        without = loop_fit.fit(fewer, np.delete(made.coordinates, place))
-        if without.unexplained_um - made.unexplained_um <= worth_um(without, tolerance_um):
-            made = without
-    return made
+        without = loop_fit.fit(fewer, np.delete(fitted.coordinates, place))
+        if without.unexplained_um - fitted.unexplained_um <= worth_um(without, tolerance_um):
+            fitted = without
+    return fitted
 
 
-def beyond_rounding_um(made: Fit) -> float:
+def beyond_rounding_um(fitted: Fit) -> float:
     """Return the residual of the position beyond the rounding of its recording."""
-    rounding = max(rapid.resolution_mm for rapid in made.problem.rapids) * 1e3
-    return math.sqrt(max(made.unexplained_um**2 - rounding**2 / 12, 0.0))
+    rounding = max(rapid.resolution_mm for rapid in fitted.problem.rapids) * 1e3
+    return math.sqrt(max(fitted.unexplained_um**2 - rounding**2 / 12, 0.0))
 
 
 def enough_um(tolerance_um: float) -> float:
@@ -176,15 +176,15 @@ def enough_um(tolerance_um: float) -> float:
     return min(NOTHING_UM, WELL * tolerance_um)
 
 
-def worth_um(made: Fit, tolerance_um: float) -> float:
+def worth_um(fitted: Fit, tolerance_um: float) -> float:
     """Return by how much another key, or another structure, must lower the residual of this fit."""
-    return max(LEAST_UM, min(WORTH * tolerance_um, WORTH_LEFT * made.unexplained_um))
+    return max(LEAST_UM, min(WORTH * tolerance_um, WORTH_LEFT * fitted.unexplained_um))
 
 
-def _other_structure(made: Fit) -> Problem | None:
+def _other_structure(fitted: Fit) -> Problem | None:
     """Return the other structure, started at its nearest equivalent: a cascade is a PID except for a filter."""
-    problem = made.problem
-    found = made.axis()
+    problem = fitted.problem
+    found = fitted.axis()
     g = found.regulators
     keep = tuple(n for n in problem.names if n in SINGLE and n not in ("speed_filter_s", "position_ki_per_s2"))
     if g.structure == "pid":
@@ -211,48 +211,48 @@ def _other_structure(made: Fit) -> Problem | None:
     return replace(problem, axis=axis, names=(*PID, *keep))
 
 
-def _whole_delay(made: Fit) -> Fit:
-    problem = made.problem
+def _whole_delay(fitted: Fit) -> Fit:
+    problem = fitted.problem
     if DELAY not in problem.names:
-        return made
+        return fitted
     place = problem.names.index(DELAY)
-    cycles = round(made.coordinates[place])
+    cycles = round(fitted.coordinates[place])
     axis = with_regulators(problem.axis, **{DELAY: cycles})
     fewer = replace(problem, axis=axis, names=tuple(n for n in problem.names if n != DELAY))
-    again = loop_fit.fit(fewer, np.delete(made.coordinates, place))
+    again = loop_fit.fit(fewer, np.delete(fitted.coordinates, place))
     return replace(again, problem=replace(problem, axis=axis), coordinates=np.insert(again.coordinates, place, cycles))
 
 
-def _told(name: str, made: Fit, verdict: Verdict, configured_um: float | None) -> LoopEstimate:
-    names = made.problem.names
-    values = made.values
+def _told(name: str, fitted: Fit, verdict: Verdict, configured_um: float | None) -> LoopEstimate:
+    names = fitted.problem.names
+    values = fitted.values
     slope = [KEYS[n].scale or v for n, v in values.items()]
-    covariance = loop_fit.covariance_of(made) * np.outer(slope, slope)
-    structure = made.problem.axis.regulators.structure
+    covariance = loop_fit.covariance_of(fitted) * np.outer(slope, slope)
+    structure = fitted.problem.axis.regulators.structure
     if structure != "pid":
         structure = "double_pi" if values.get("position_ki_per_s2", 0.0) > 0.0 else "p_pi_pi"
     return LoopEstimate(name, structure, names, frozen([*values.values()]), frozen(covariance), verdict, configured_um)
 
 
-def _verdict(made: Fit, tolerance_um: float, following_um: float, configured_um: float | None) -> Verdict:
-    left = made.unexplained_um
+def _verdict(fitted: Fit, tolerance_um: float, following_um: float, configured_um: float | None) -> Verdict:
+    residual_um = fitted.unexplained_um
     reasons, warnings = [], []
-    if not left <= tolerance_um:
-        text = f"the best loops leave {left:.3g} um of a following error of {following_um:.3g} um unexplained"
+    if not residual_um <= tolerance_um:
+        text = f"the best loops leave {residual_um:.3g} um of a following error of {following_um:.3g} um unexplained"
         advice = (
             "the drive has an unknown structure or filter; check its regulators, or raise identification.tolerance_um"
         )
         reasons.append(Reason("LoopsUnexplained", f"{text}, more than {tolerance_um:.3g} um", advice))
-    elif configured_um is not None and configured_um - left > WORTH * tolerance_um:
+    elif configured_um is not None and configured_um - residual_um > WORTH * tolerance_um:
         text = f"the configured regulators leave {configured_um:.3g} um of a following error of {following_um:.3g} um"
         advice = "write the identified values to [axis.X.regulators]"
-        warnings.append(Reason(DIFFER, f"{text}, the identified ones {left:.3g} um", advice))
-    doubts = np.sqrt(np.diag(loop_fit.covariance_of(made)))
-    for n, doubt in zip(made.problem.names, doubts, strict=True):
+        warnings.append(Reason(DIFFER, f"{text}, the identified ones {residual_um:.3g} um", advice))
+    doubts = np.sqrt(np.diag(loop_fit.covariance_of(fitted)))
+    for n, doubt in zip(fitted.problem.names, doubts, strict=True):
         if KEYS[n].scale == 0.0 and doubt > LOOSE:
             text = f"the standard deviation of {n} is {100 * doubt:.0f} %, limit {100 * LOOSE:.0f} %"
             warnings.append(Reason("LoopsUndetermined", text, "record rapids with a higher acceleration"))
-    return Verdict(not reasons, None, tuple(reasons), left, tuple(warnings))
+    return Verdict(not reasons, None, tuple(reasons), residual_um, tuple(warnings))
 
 
 def better_loops(loops: LoopEstimate) -> bool:

@@ -37,28 +37,28 @@ def member(window: Window, estimate: Estimate, place: int = 0) -> Member:
     return Member(names, values, own, doubts, place, window.direction)
 
 
-def pooled(members: Sequence[Member], first: Estimate, apart: Between, *, joining: bool = True) -> Estimate:
+def pooled(members: Sequence[Member], first: Estimate, variance: Between, *, joining: bool = True) -> Estimate:
     """Pool the estimates of windows given in order, as of the newest of them.
 
-    ``apart`` is the variance between windows. With ``joining`` a load, and viscous friction by direction, are added
+    ``variance`` is the variance between windows. With ``joining`` a load, and viscous friction by direction, are added
     where significant. Method, and parameters that no window determines, are those of ``first``.
     """
     names = _common(members)
-    joined: list[str] = []
-    stack = _Stack.of(members, names, apart)
-    answer = _solved(stack, joined)
+    added: list[str] = []
+    stack = _Stack.of(members, names, variance)
+    answer = _solved(stack, added)
     if _is_beyond_all(answer, stack):
         members = [replace(m, own=np.diag(np.diag(m.own))) for m in members]
-        stack = _Stack.of(members, names, apart)
-        answer = _solved(stack, joined)
+        stack = _Stack.of(members, names, variance)
+        answer = _solved(stack, added)
     while joining:
-        trials = {term: _solved(stack, [*joined, term]) for term in _open(members, names, joined)}
+        trials = {term: _solved(stack, [*added, term]) for term in _open(members, names, added)}
         surest = max(trials, key=lambda term: trials[term].surety(), default=None)
         if surest is None or trials[surest].surety() < JOINS:
             break
-        joined.append(surest)
+        added.append(surest)
         answer = trials[surest]
-    return _estimate(answer, names, joined, first)
+    return _estimate(answer, names, added, first)
 
 
 def _is_beyond_all(answer: _Solution, stack: _Stack) -> bool:
@@ -82,9 +82,9 @@ def _common(members: Sequence[Member]) -> tuple[str, ...]:
     return (*known, *terms)
 
 
-def _open(members: Sequence[Member], names: Sequence[str], joined: Sequence[str]) -> list[str]:
+def _open(members: Sequence[Member], names: Sequence[str], added: Sequence[str]) -> list[str]:
     both = len({m.direction for m in members}) == 2
-    return [term for term, of in BY_DIRECTION.items() if both and of in names and term not in joined]
+    return [term for term, of in BY_DIRECTION.items() if both and of in names and term not in added]
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,8 +99,8 @@ class _Solution:
         return abs(float(self.values[-1])) / float(np.sqrt(self.chance[-1, -1]))
 
 
-def _solved(stack: _Stack, joined: Sequence[str]) -> _Solution:
-    of = [stack.names.index(BY_DIRECTION[term]) for term in joined]
+def _solved(stack: _Stack, added: Sequence[str]) -> _Solution:
+    of = [stack.names.index(BY_DIRECTION[term]) for term in added]
     columns = np.equal.outer(stack.which, np.arange(len(stack.names))).astype(np.float64)
     columns = np.column_stack([columns, *(np.where(stack.which == k, stack.side, 0.0) for k in of)])
     unit = np.concatenate([stack.unit, stack.unit[of]])
@@ -127,7 +127,7 @@ class _Stack:
     weight: Float
 
     @classmethod
-    def of(cls, members: Sequence[Member], names: tuple[str, ...], apart: Between) -> _Stack:
+    def of(cls, members: Sequence[Member], names: tuple[str, ...], variance: Between) -> _Stack:
         kept = [[k for k, name in enumerate(m.names) if name in names] for m in members]
         which = np.array([names.index(m.names[k]) for m, own in zip(members, kept, strict=True) for k in own])
         values = np.concatenate([m.values[own] for m, own in zip(members, kept, strict=True)])
@@ -135,7 +135,7 @@ class _Stack:
         shared = np.zeros((which.size, max(m.shared.shape[1] for m in members)))
         unit = np.array([float(np.abs(values[which == k]).max()) for k in range(len(names))])
         unit[unit == 0.0] = 1.0
-        total, start = _between(members, kept, which, names, apart), 0
+        total, start = _between(members, kept, which, names, variance), 0
         for m, own in zip(members, kept, strict=True):
             rows = slice(start, start + len(own))
             total[rows, rows] += m.own[own][:, own]
@@ -149,25 +149,25 @@ class _Stack:
 
 
 def _between(
-    members: Sequence[Member], kept: Sequence[Sequence[int]], which: Int, names: Sequence[str], apart: Between
+    members: Sequence[Member], kept: Sequence[Sequence[int]], which: Int, names: Sequence[str], variance: Between
 ) -> Float:
     """Return the covariance (m, m) due to variation between windows, relative to the newest."""
     place = np.repeat([float(m.place) for m in members], [len(own) for own in kept])
     back = place.max() - place
     walk, scatter = (
-        np.array([shares.get(name, 0.0) * apart.sizes.get(name, 0.0) ** 2 for name in names])[which]
-        for shares in (apart.walk, apart.scatter)
+        np.array([shares.get(name, 0.0) * variance.sizes.get(name, 0.0) ** 2 for name in names])[which]
+        for shares in (variance.walk, variance.scatter)
     )
     # two windows share the walk from the newer of them to the newest
     total = np.where(np.equal.outer(which, which), walk * np.minimum.outer(back, back), 0.0)
     return total + np.diag(scatter)
 
 
-def _estimate(found: _Solution, names: Sequence[str], joined: Sequence[str], first: Estimate) -> Estimate:
-    added = [*(["load"] * ("load" in joined)), *(["viscous_positive", "viscous_negative"] * ("viscous" in joined))]
-    listed = (*PARAMETERS, *(name for name in names if name not in PARAMETERS), *added)
-    values, total, doubts = as_amplitude((*names, *joined), found.values, found.chance, found.doubts)
-    known = {name: k for k, name in enumerate((*names, *joined))}
+def _estimate(found: _Solution, names: Sequence[str], added: Sequence[str], first: Estimate) -> Estimate:
+    extra = [*(["load"] * ("load" in added)), *(["viscous_positive", "viscous_negative"] * ("viscous" in added))]
+    listed = (*PARAMETERS, *(name for name in names if name not in PARAMETERS), *extra)
+    values, total, doubts = as_amplitude((*names, *added), found.values, found.chance, found.doubts)
+    known = {name: k for k, name in enumerate((*names, *added))}
     root = np.zeros((len(listed), len(known)))
     for row, name in enumerate(listed):
         for of, share in _made_of(name).items():
@@ -221,10 +221,10 @@ def difference_covariance(one: tuple[Window, Estimate], other: tuple[Window, Est
     (own, systematic, alias), (its_own, its_systematic, its_alias) = (_of_six(*_parts(*pair)) for pair in (one, other))
     wide = max(systematic.shape[1], its_systematic.shape[1])
     systematic, its_systematic = (np.pad(s, ((0, 0), (0, wide - s.shape[1]))) for s in (systematic, its_systematic))
-    apart = systematic - its_systematic
+    difference = systematic - its_systematic
     part, its_part = _unshared(one[0], systematic), _unshared(other[0], its_systematic)
     unshared = part @ part.T + its_part @ its_part.T + np.diag(alias**2 + its_alias**2)
-    return own + its_own + apart @ apart.T + np.diag((alias - its_alias) ** 2) + UNSHARED**2 * unshared
+    return own + its_own + difference @ difference.T + np.diag((alias - its_alias) ** 2) + UNSHARED**2 * unshared
 
 
 def change_covariance(window: Window, estimate: Estimate) -> Float:

@@ -266,18 +266,18 @@ class _Bench:
         amplitudes = (powers[::-1] * s - both * s[::-1]) / determinant
         return _Scores(shares, powers, amplitudes, (amplitudes * s).sum(axis=0), seen.sum(axis=0) * 1.0)
 
-    def colour(self, scores: _Scores, asked: Rows) -> Float:
-        """Return by how much the scores of the candidates ``asked`` (c,) vary more than with independent innovations.
+    def colour(self, scores: _Scores, tried: Rows) -> Float:
+        """Return by how much the scores of the candidates ``tried`` (c,) vary more than with independent innovations.
 
         After Newey and West (1987), of the residuals including the candidate, so that what it explains does not count
         as colour. Bartlett's weights over lags are the mean square of moving sums.
         """
         basis = self.columns[:, self.free]
         rest = self.fit.residuals - basis @ (self.inverse @ self.pulls[self.free])
-        amplitudes, left = scores.amplitudes[:, asked], rest[:, None]
+        amplitudes, left = scores.amplitudes[:, tried], rest[:, None]
         beyond = []
-        for own, place in enumerate(self.places[:, self.left[asked]]):
-            beyond.append(self.columns[:, place] - basis @ scores.shares[:, own, asked])
+        for own, place in enumerate(self.places[:, self.left[tried]]):
+            beyond.append(self.columns[:, place] - basis @ scores.shares[:, own, tried])
             left = left - beyond[own] * amplitudes[own]
         meat = np.zeros(amplitudes.shape)
         for own, signal in enumerate(beyond):
@@ -286,7 +286,7 @@ class _Bench:
                 sums = np.cumsum(np.pad(by_row, ((SUMMED_LAGS + 1, SUMMED_LAGS), (0, 0))), axis=0)
                 moving = sums[SUMMED_LAGS + 1 :] - sums[: -SUMMED_LAGS - 1]
                 meat[own] += np.einsum("mc,mc->c", moving, moving) / (SUMMED_LAGS + 1)
-        colour: Float = np.maximum(1.0, (meat / scores.powers[:, asked]).max(axis=0, initial=1.0))
+        colour: Float = np.maximum(1.0, (meat / scores.powers[:, tried]).max(axis=0, initial=1.0))
         return colour
 
 

@@ -114,19 +114,19 @@ def _turned(base: Fit, spring: Spring, expected: Told) -> tuple[Fit, float] | No
     free = (*base.free, theta.size, theta.size + 1)
     noises: Sequence[Noise] = ()
     for _ in range(TURNS):
-        made = fit([_bent(plain, theta, spring)], np.append(theta, [0.0, 0.0]), free, noises)
-        if not made.converged or not np.isfinite(made.residuals).all():
+        fitted = fit([_bent(plain, theta, spring)], np.append(theta, [0.0, 0.0]), free, noises)
+        if not fitted.converged or not np.isfinite(fitted.residuals).all():
             return None
-        made, noises = _with_prior(made, spring, expected), made.problem.noises
-        theta, before = made.theta[:-2], spring
-        spring = spring.moved(*made.theta[-2:])
+        fitted, noises = _with_prior(fitted, spring, expected), fitted.problem.noises
+        theta, before = fitted.theta[:-2], spring
+        spring = spring.moved(*fitted.theta[-2:])
         if not expected.allows(spring):
             return None
         if (np.abs([spring.hertz / before.hertz - 1, spring.share - before.share]) < SETTLED).all():
             break
     torques = Torques.of(plain, theta)
-    cost = _cost(made) + expected.cost(spring) + torques.squeezed(torques.answer(spring))
-    return replace(made, delay_doubt_s=base.delay_doubt_s), cost
+    cost = _cost(fitted) + expected.cost(spring) + torques.squeezed(torques.answer(spring))
+    return replace(fitted, delay_doubt_s=base.delay_doubt_s), cost
 
 
 def _bent(plain: Motion, theta: Float, spring: Spring) -> Motion:
@@ -159,23 +159,23 @@ def _surely(motion: Motion) -> Modes:
     return np.where(near & (motion.mode != BROKEN), UNKNOWN, motion.mode).astype(np.int8)
 
 
-def _with_prior(made: Fit, spring: Spring, expected: Told) -> Fit:
-    prior, std = np.zeros((2, len(made.free)))
+def _with_prior(fitted: Fit, spring: Spring, expected: Told) -> Fit:
+    prior, std = np.zeros((2, len(fitted.free)))
     prior[-2:], std[-2:] = expected.precision(), expected.std
-    information = made.information + np.diag(prior)
-    theta, pull = made.theta.copy(), np.zeros(len(made.free))
+    information = fitted.information + np.diag(prior)
+    theta, pull = fitted.theta.copy(), np.zeros(len(fitted.free))
     pull[-2:] = prior[-2:] * (expected.away(spring) - theta[-2:])
-    theta[list(made.free)] += inverse_of(information)[0] @ pull
-    problem = pose(made.problem.motions, theta, made.problem.noises)
+    theta[list(fitted.free)] += inverse_of(information)[0] @ pull
+    problem = pose(fitted.problem.motions, theta, fitted.problem.noises)
     residuals = problem.residuals(theta)
-    made = replace(made, theta=theta, information=information, residuals=residuals, problem=problem)
-    return replace(made, prior=prior, prior_std=std)
+    fitted = replace(fitted, theta=theta, information=information, residuals=residuals, problem=problem)
+    return replace(fitted, prior=prior, prior_std=std)
 
 
-def _cost(made: Fit) -> float:
-    motion = made.problem.motions[0]
-    variances = np.maximum(made.problem.noises[0].vector(), LEAST_NOISE * motion.noise.vector()) ** 2
+def _cost(fitted: Fit) -> float:
+    motion = fitted.problem.motions[0]
+    variances = np.maximum(fitted.problem.noises[0].vector(), LEAST_NOISE * motion.noise.vector()) ** 2
     if not any(course.name == RESONANCE for course in motion.courses):
         motion = replace(motion, mode=_surely(motion))
-    white, logdet = whiten(motion, made.theta[None], variances[None])
+    white, logdet = whiten(motion, fitted.theta[None], variances[None])
     return float(np.square(white).sum() + logdet[0])

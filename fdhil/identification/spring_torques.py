@@ -90,7 +90,7 @@ class Torques:
     """Spectra (w,) of a window's torques, N.m, and the noise power of the motor's torque.
 
     ``motor`` is the current's torque less viscous friction, ``table`` the dry friction, both of the six alone, and
-    ``..._whole`` with the terms; ``inertial`` is the torque of the acceleration. ``seen`` is the visible share of a
+    ``..._whole`` with the terms; ``inertial`` is the torque of the acceleration. ``visible`` is the visible share of a
     vibration at the sampling rate.
     """
 
@@ -103,7 +103,7 @@ class Torques:
     inertial: Spectrum
     noise_current: Float
     noise_speed: Float
-    seen: Float
+    visible: Float
 
     @classmethod
     def of(cls, motion: Motion, theta: Float) -> Torques:
@@ -130,7 +130,7 @@ class Torques:
             inertial=_spectrum(theta[JT] * np.diff(motion.speed, append=motion.speed[-1]) / dt_s, size),
             noise_current=np.square(theta[K] * motion.noise.current_a * np.cos(turn / 2)),
             noise_speed=np.square(theta[JT] * motion.noise.speed_rad_s * 2 * np.sin(turn / 2) / dt_s),
-            seen=np.asarray(1.0 / (1.0 + (turn / (2 * math.pi * MOST_OF_ROWS)) ** SEEN_ORDER), dtype=np.float64),
+            visible=np.asarray(1.0 / (1.0 + (turn / (2 * math.pi * MOST_OF_ROWS)) ** SEEN_ORDER), dtype=np.float64),
         )
 
     def answer(self, spring: Spring) -> Answer:
@@ -142,7 +142,7 @@ class Torques:
 
     def _swing(self, spring: Spring) -> Spectrum:
         w, square = 2 * math.pi * spring.hertz, self.p**2
-        return self.seen * square / (square + (2 * spring.damping * w) * self.p + w**2)
+        return self.visible * square / (square + (2 * spring.damping * w) * self.p + w**2)
 
     def best(self, answer: Answer) -> Spectrum:
         """Return the torque on the motor, combined from current and acceleration."""

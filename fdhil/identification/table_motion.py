@@ -141,7 +141,7 @@ def swings(time_s: Float, w: float, z: float) -> Float:
     return np.column_stack([fades * np.cos(turning), fades * np.sin(turning)])
 
 
-def left(seen: Float, columns: Float, power: Float) -> Float:
+def left(readings: Float, columns: Float, power: Float) -> Float:
     """Return the residuals (m,) after regression on columns (m, k), in deviations of noise of this power.
 
     They are whitened by the inverse of the noise's minimum-phase factor, computed by its cepstrum (Oppenheim and
@@ -151,26 +151,26 @@ def left(seen: Float, columns: Float, power: Float) -> Float:
     cepstrum = np.fft.irfft(np.log(power), size)[: size // 2]
     cepstrum[0] *= 0.5
     undone = np.exp(-np.fft.rfft(cepstrum, size))
-    both = np.column_stack([columns, seen])
-    white = np.fft.irfft(np.fft.rfft(both, size, axis=0) * undone[:, None], size, axis=0)[: seen.size]
+    both = np.column_stack([columns, readings])
+    white = np.fft.irfft(np.fft.rfft(both, size, axis=0) * undone[:, None], size, axis=0)[: readings.size]
     q, _ = np.linalg.qr(white[:, :-1] / np.linalg.norm(white[:, :-1], axis=0))
     return white[:, -1] - q @ (q.T @ white[:, -1])
 
 
 @dataclass(frozen=True, slots=True)
 class Encoder:
-    """An encoder at the table: ``seen`` (m,) mm at its ``rows``, with its ``own`` noise."""
+    """An encoder at the table: ``readings`` (m,) mm at its ``rows``, with the deviation ``noise_std`` of its noise."""
 
     motor: Motor
-    seen: Float
+    readings: Float
     rows: Bool
-    own: float
+    noise_std: float
 
     def stiff(self, late_s: float, power: Float | None = None) -> Float:
         """Return the residuals with a rigid screw, in its own noise or of another ``power``."""
         moved = self.motor.place_mm[self.rows] - self.motor.way(self._late(late_s), late_s, self.rows)
-        own = self.motor.place_noise + self.own**2
-        return left(self.seen - moved, self._linear(), own if power is None else power)
+        own = self.motor.place_noise + self.noise_std**2
+        return left(self.readings - moved, self._linear(), own if power is None else power)
 
     def follows(self, w: float, z: float, late_s: float) -> Float:
         """Return the residuals of a table that follows the motor; ``w`` and ``z`` are those with the motor held."""
@@ -178,20 +178,20 @@ class Encoder:
         pulled = (2j * z * w * motor.omega + w * w) * flexible(motor.omega, w, z)
         lags = motor.way(1.0 - pulled * (1.0 - self._late(late_s)), late_s, rows)
         columns = np.column_stack([swings(motor.time(rows), w, z), self._linear()])
-        return left(self.seen - motor.place_mm[rows] + lags, columns, self.power(w, z))
+        return left(self.readings - motor.place_mm[rows] + lags, columns, self.power(w, z))
 
     def power(self, w: float, z: float) -> Float:
         """Return the power of its noise and of the motor position's through the response, a sample."""
         pulled = (2j * z * w * self.motor.omega + w * w) * flexible(self.motor.omega, w, z)
-        return np.abs(pulled) ** 2 * self.motor.place_noise + self.own**2
+        return np.abs(pulled) ** 2 * self.motor.place_noise + self.noise_std**2
 
     def bends(self, w: float, z: float, q: float) -> Float:
         """Return the residuals of a table bent by the torque; ``w`` and ``z`` with the motor free."""
         motor, rows = self.motor, self.rows
         gain = flexible(motor.omega, w, z) / (1.0 - q)
         columns = np.column_stack([swings(motor.time(rows), w, z), self._linear()])
-        power = np.abs(gain) ** 2 * noise_of(motor.push) ** 2 + motor.place_noise + self.own**2
-        return left(motor.place_mm[rows] - self.seen - motor.pushed(gain, rows), columns, power)
+        power = np.abs(gain) ** 2 * noise_of(motor.push) ** 2 + motor.place_noise + self.noise_std**2
+        return left(motor.place_mm[rows] - self.readings - motor.pushed(gain, rows), columns, power)
 
     def _late(self, late_s: float) -> Complex:
         return np.asarray(1.0 - np.exp(-1j * self.motor.omega * late_s), dtype=np.complex128)
@@ -202,16 +202,16 @@ class Encoder:
 
 @dataclass(frozen=True, slots=True)
 class Accelerometer:
-    """An accelerometer at the table, ``seen`` (m,) mm/s2 at its ``rows``; its gain is known to a few per cent."""
+    """An accelerometer at the table, ``readings`` (m,) mm/s2 at its ``rows``; its gain is known to a few per cent."""
 
     motor: Motor
-    seen: Float
+    readings: Float
     rows: Bool
-    own: float
+    noise_std: float
 
     def stiff(self, late_s: float, power: Float | None = None) -> Float:
         """Return the residuals with a rigid screw, in its own noise or of another ``power``."""
-        own = np.full(self.motor.omega.size, self.own**2)
+        own = np.full(self.motor.omega.size, self.noise_std**2)
         return self._left(np.exp(-1j * self.motor.omega * late_s), [], own if power is None else power)
 
     def follows(self, w: float, z: float, late_s: float) -> Float:
@@ -223,14 +223,14 @@ class Accelerometer:
     def power(self, w: float, z: float) -> Float:
         """Return the power of its noise and of the current's through the response, a sample."""
         pulled = (2j * z * w * self.motor.omega + w * w) * flexible(self.motor.omega, w, z)
-        return np.abs(pulled) ** 2 * noise_of(self.motor.push) ** 2 + self.own**2
+        return np.abs(pulled) ** 2 * noise_of(self.motor.push) ** 2 + self.noise_std**2
 
     def _left(self, gain: Complex, more: list[Float], power: Float) -> Float:
         motor, rows = self.motor, self.rows
         turns, speed = motor.turns[rows], motor.speed_mm_s[rows]
         waves = [speed**2 * np.sin(turns), speed**2 * np.cos(turns)]
         columns = np.column_stack([motor.pushed(gain, rows), *more, *motor.beside(rows), *waves])
-        return left(self.seen, columns, power)
+        return left(self.readings, columns, power)
 
 
 def shaft(motor: Motor, w: float, z: float, q: float) -> Float:
