@@ -1,9 +1,8 @@
 """Estimates how much a drive's parameters vary from window to window, from the drive's own history.
 
-R, ft and Cd drift with temperature and follow a random walk over the windows, in shares of their size. Windows may
-scatter beyond their own covariance as well, where the drive does something that no model describes: a random effect
-(Paule, Mandel 1982). Each pair of walk and scatter on a grid is weighted by the restricted likelihood of the newest
-windows (Patterson, Thompson 1971) and by a prior that favours no variation. The pool uses the weighted mean variance.
+R, ft and Cd follow a random walk with temperature; windows also scatter beyond their own covariance (Paule, Mandel
+1982). The sizes on a grid are weighted by the restricted likelihood of the newest windows (Patterson, Thompson 1971)
+and by a prior that favours no variation.
 """
 
 import math

@@ -1,7 +1,7 @@
 """Identifies the spring between motor and table from sensors at the table and the motor's own signals.
 
-An encoder shows how the table follows the motor and how the torque bends the screw: resonance and damping with the
-motor held, and the table's share of the inertia. An accelerometer shows how the torque accelerates the table.
+An encoder shows how the table follows the motor and how the torque bends the screw; an accelerometer, how the torque
+accelerates the table.
 """
 
 import math

@@ -90,11 +90,10 @@ def robust(information: Float, scores: Sequence[Float], rows: Sequence[tuple[Flo
     """Return the covariance (k, k) of a fit with ``information`` (k, k) whose windows have ``scores`` (n, k) by sample.
 
     ``rows`` has, for each window whose voltage is sampled with its other signals, the slopes (n, 2, k) of the
-    innovations and the innovations (m, 2) at known friction. The sandwich uses the variance of the scores, estimated
-    twice. By the scores themselves (Newey and West 1987, with the cost of its own scatter after Kiefer and Vogelsang
-    2005): valid for uneven variance, but blind to correlation over a large part of the window, which the fit has
-    absorbed. By an autoregression of the innovations, which extends a colour to low frequencies. The larger of both
-    counts in every direction, and never less than the inverse information.
+    innovations and the innovations (m, 2) at known friction. The variance of the scores is estimated by the scores
+    (Newey and West 1987, with the cost of its own scatter after Kiefer and Vogelsang 2005), which is blind to
+    correlation over a large part of the window, and by an autoregression of the innovations. The larger counts in every
+    direction, at least the information.
     """
     root = root_of(information)
     power, foretold = np.zeros((2, root.shape[1], root.shape[1]))

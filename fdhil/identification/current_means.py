@@ -1,8 +1,7 @@
 """Corrects current readings to means where a drive feeds forward a speed that steps at every SYNC.
 
-Such a drive differentiates its set-points: the speed set-point is a staircase half a cycle behind the interpolated
-speed, and the current responds to each step after it was read. The difference between reading and mean follows from a
-simulation of the speed loop on the staircase of a constant acceleration.
+Such a speed set-point is a staircase half a cycle late, and the current responds to each step after it was read. The
+difference between reading and mean follows from a simulation of the speed loop on the staircase.
 """
 
 import math

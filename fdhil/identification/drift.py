@@ -1,8 +1,6 @@
 """Tracks the parameters from rapid to rapid: holds back jumps, reports a changed load, raises maintenance alarms.
 
-One rapid yields the friction of its own direction, including a constant load; friction is compared per direction.
-
-Pure: the same estimates in the same order give the same notices, without a clock.
+Friction, which includes a constant load, is compared per direction. Pure: without a clock.
 """
 
 from collections import deque

@@ -1,8 +1,7 @@
 """Fits a drive's loops by output error: the closed loop's response to the demand against position and current.
 
-The demand is the drive's own input and free of noise, so sensor noise causes no bias; what the mechanics do not explain
-is a known load. Levenberg-Marquardt on the compiled kernel; both signals are scaled by their residuals, renewed between
-the rounds.
+The demand is free of noise, so sensor noise causes no bias; what the mechanics do not explain is a known load. Both
+signals are scaled by their residuals, renewed between rounds of Levenberg-Marquardt.
 """
 
 import math

@@ -1,7 +1,7 @@
 """Starts the search for a drive's loops without a usable configuration: a coarse grid.
 
-In a well-tuned cascade each loop is slower than its inner loop by a factor of a few. The corner of the speed loop and
-two such factors span the drives, and the lag at constant speed determines the feed-forward.
+In a well-tuned cascade each loop is slower than its inner loop by a factor of a few. The lag at constant speed
+determines the feed-forward.
 """
 
 import math

@@ -1,8 +1,7 @@
 """Identifies a drive's loops from its rapids: gains, feed-forward, filters, computing delay, structure.
 
-The four gains of a cascade are fitted first. Further keys are added one at a time, the likeliest first, while each
-explains a tenth of the tolerance at the table or of the residual: over hundreds of samples chance does neither. Other
-structures compete with the cascade by the same measure. With full feed-forward and no filter, exchanging
+The four gains of a cascade are fitted first; further keys are added one at a time, and other structures tried, while
+each explains a tenth of the tolerance or of the residual. With full feed-forward and no filter, exchanging
 position_gain_per_s and speed_ki / speed_kp changes nothing: the one nearer to the start is reported.
 """
 

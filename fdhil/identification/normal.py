@@ -1,8 +1,8 @@
 """Solves linear least squares by scaled normal equations: small, fast, on one thread.
 
-The regressions have a handful of well-scaled columns and thousands of samples. An orthogonal factorisation would cost
-ten times more, and a library with its own threads would disturb the bus's receive thread. At six columns most of a
-library call is overhead, so the small matrix is diagonalised here.
+An orthogonal factorisation of some thousand samples would cost ten times more, and a library's own threads would
+disturb the bus's receive thread. At six columns a library call is mostly overhead, so the small matrix is diagonalised
+here.
 """
 
 import numpy as np

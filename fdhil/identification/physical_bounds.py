@@ -1,7 +1,6 @@
-"""Bounds estimates to physically possible drives: the likeliest values that respect all bounds.
+"""Bounds estimates to physically possible drives, by the constrained maximum of their normal likelihood.
 
-Where chance took an estimate beyond a bound, the constrained maximum of its normal likelihood replaces it: a step along
-the covariance onto the active bounds. The covariance is kept: the interval is that of the data.
+The covariance is kept: the interval is that of the data.
 """
 
 from collections.abc import Sequence

@@ -1,10 +1,9 @@
 """Adds significant terms to the six parameters: forward selection on a fit's own innovations.
 
-The innovations are linear in the terms and nearly so in the six, so one Gram matrix yields what each term would explain
-beyond all free entries, without another fit. A term is added where minus twice the log likelihood falls by more than
-its price (the Bayesian criterion, extended by the number of terms tried, Chen and Chen 2008, with the number of
-independent samples), where it is worthwhile, and where the six stay identifiable. All are then fitted once more, from
-the linear prediction.
+One Gram matrix yields what each term would explain beyond all free entries, without another fit. A term is added where
+minus twice the log likelihood falls by more than its price (the Bayesian criterion extended by the number of terms
+tried, Chen and Chen 2008, with the number of independent samples), where it is worthwhile, and where the six stay
+identifiable.
 """
 
 from __future__ import annotations

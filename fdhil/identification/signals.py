@@ -1,8 +1,7 @@
 """Aligns a late recorded speed to its samples: what drives report as speed is often not a direct reading.
 
-A difference of encoder positions is the mean of the sample before, so half a sample late; a filter adds its own lag.
-The recorded position has none and reveals the lag. It is removed from the speed itself, which is usually finer than the
-position: a filter by its inverse, a mean by a stencil.
+A difference of encoder positions is half a sample late; a filter adds its own lag. The position reveals the lag, which
+is removed from the speed itself: a filter by its inverse, a mean by a stencil.
 """
 
 import math

@@ -1,8 +1,6 @@
 """Maximises the likelihood of windows with a low-rate voltage, by Fisher scoring on all innovations.
 
-The variance of an innovation depends on the parameters too: half the deviation of a low-rate voltage is the current at
-the ends of its samples, times L / T. The full likelihood is used, including the determinant; steps combine the
-innovations' squares and their variances.
+The variance of an innovation depends on the parameters too, through L / T, so the determinant is included.
 """
 
 from collections.abc import Sequence

@@ -1,16 +1,13 @@
 """Models what is unknown of voltage and current within samples longer than a current regulator needs.
 
 * A current interpolated between readings requires, by [1], a voltage that rises over a sample by R times the current's
-  change and by L times the change of its slope, in addition to the back-EMF's. So it is with smooth set-points; with a
-  kink at every sample, the current is ahead of that. The whole rise counts as one standard deviation.
-* Where the speed feed-forward steps at every SYNC, the current responds after its reading: its mean is higher while the
-  table accelerates, and inertia seems smaller (5 % at 1 ms, 17 % at 2 ms).
-* Where a drive interpolates linearly between set-points, an accelerating table is ahead of the line by a T^2 / 8 in the
-  middle, and the regulators respond in every sample: readings at the ends deviate from the mean current by a share of
-  the accelerating one that grows with the square of the sample.
+  change and by L times the change of its slope; with a kink at every sample, the current is ahead of that.
+* Where the speed feed-forward steps at every SYNC, the mean current is higher than its reading while the table
+  accelerates, and inertia seems smaller (5 % at 1 ms, 17 % at 2 ms).
+* Where a drive interpolates set-points linearly, an accelerating table is ahead of the line by a T^2 / 8 in the middle,
+  and readings deviate from the mean current by a share that grows with the square of the sample.
 
-The case depends on the drive and is the same in all its windows. With known loops, a simulation along the demand
-decides: [2] needs the mean current of a sample for the speeds at its ends.
+The case is the same in all windows of a drive; a simulation of known loops along the demand decides it.
 """
 
 from dataclasses import replace

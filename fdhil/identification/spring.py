@@ -1,7 +1,6 @@
 """Adds a spring between motor and table to a window's fit, from the resonance in the motor's own encoder.
 
-The spring's torque is linearised in the resonance f and in the table's share s of the inertia about their present
-values, so both are entries of the fit, over a few iterations.
+Its torque is linearised in the resonance f and in the table's share s of the inertia, over a few iterations.
 """
 
 import math

@@ -1,7 +1,6 @@
 """Adds the terms of a fit to the estimate: ripples as amplitude and phase, and values that were fixed during the fit.
 
-The Stribeck speed is found next to the fit, a speed's lag before it. Both have an error, whose effect on the others is
-added to their covariance.
+The errors of the Stribeck speed and of a speed's lag add to the covariance of the others.
 """
 
 from dataclasses import replace

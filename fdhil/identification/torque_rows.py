@@ -1,11 +1,8 @@
 """Prepares a window for [2] alone: current, speed, acceleration and its derivatives through the same filter.
 
-The position is used where its noise disturbs the acceleration less than the speed's does: a drive's speed may be a
-difference of positions, half a sample late, or filtered. The position's second difference is exactly the acceleration's
-mean weighted by a triangle two samples wide, so the current is averaged by the same triangle.
-
-Samples at standstill, or lost, are zeroed on both sides of [2] before the low-pass, so that unknown static friction
-does not leak into their neighbours.
+The acceleration comes from the position or the speed, whichever is less noisy. The position's second difference is the
+acceleration's mean weighted by a triangle two samples wide, so the current is averaged by the same triangle. Samples at
+standstill, or lost, are zeroed on both sides of [2] before the low-pass: unknown static friction must not leak.
 """
 
 import math

@@ -1,14 +1,11 @@
 """Fits [2] alone where there is no voltage: Jt, ft and Cd from current and position, with a given K.
 
-Least squares on K i = Jt dw/dt + ft w + Cd sign(w), through one filter, and on additional terms: Stribeck friction, a
-ripple with the screw's turn. A term is added by the Bayesian information criterion (Schwarz 1978) at the number of
-effective samples, where it is worthwhile. The current may be late: the torque's slope -tau (Jt dj/dt + ft dw/dt) is
-always fitted, to avoid its bias. So is the acceleration's second derivative, the first-order effect of a compliant
-screw. A constant load is part of the friction of its direction; windows of both directions separate it.
+Least squares on K i = Jt dw/dt + ft w + Cd sign(w) through one filter, and on Stribeck friction and screw ripples that
+the Bayesian information criterion prefers (Schwarz 1978). The torque's slope (a late current) and the acceleration's
+second derivative (a compliant screw, to first order) are always fitted, to avoid their bias.
 
-Residuals are dominated by unmodelled, coloured friction, not by sensor noise. The intervals therefore use the variance
-of the scores (Newey and West 1987), widened for its own scatter (Kiefer and Vogelsang 2005). Without K, ratios to K are
-reported.
+Residuals are dominated by unmodelled, coloured friction, not by sensor noise: the intervals use the variance of the
+scores (Newey and West 1987), widened for its own scatter (Kiefer and Vogelsang 2005).
 """
 
 from collections.abc import Mapping, Sequence

@@ -15,7 +15,6 @@ from fdhil.report.parameter_view import DISPLAY, cell, half_of, spoken
 MANY = 200  # estimates: more are shown by their daily medians
 BAND = (5.0, 95.0)  # percentiles of a day's estimates
 IN_VIEW = 4.0  # of the estimates' range: a farther limit would flatten the curve
-LEVELS_APART = 0.1
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,7 @@
 """Estimates by the paper's method: one low-pass on every signal, operator [4], least squares on [5] and [6] of [DES].
 
-Each interval mean of voltage belongs to the middle of its interval; current and speed are converted to the same
-interval means. [6] is fitted as K i = Jt Dw + ft w + Cd sign(w) with K from [5]. Standard deviations come from one
-sandwich over both equations, because filtered residuals are coloured and share their noise.
+Current and speed are converted to interval means like the voltage's. [6] is fitted as K i = Jt Dw + ft w + Cd sign(w)
+with K from [5]. One sandwich over both equations yields the standard deviations: filtered residuals are coloured.
 """
 
 from collections.abc import Sequence

@@ -1,9 +1,8 @@
 """Estimates all six parameters together from noisy signals: maximum likelihood by Kalman innovations.
 
-The voltage is noisy too, so the model's response contains noise filtered by the drive. The innovations undo that
-filter: they are white, and the sum of their squares is the exponent of the likelihood. The filter depends on the
-parameters: held fixed, it would mistake noise for voltage and make L too large wherever the demand is smooth. Noise
-levels are renewed between the Gauss-Newton steps, whose information matrix yields the covariance.
+The voltage is noisy too. The innovations undo the drive's filtering of that noise: they are white, and the sum of their
+squares is the exponent of the likelihood. The filter depends on the parameters: held fixed, it would mistake noise for
+voltage and make L too large wherever the demand is smooth.
 """
 
 from collections.abc import Sequence
