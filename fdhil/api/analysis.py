@@ -1,4 +1,4 @@
-"""Analyses recordings as the command line and the Python interface do: windows, estimates, pool, verdict."""
+"""Analyses recordings for the command line and the Python interface: windows, estimates, pool, verdict."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,15 +31,15 @@ Progress = Callable[[float], None]
 
 
 def ignore_progress(share: float) -> None:
-    """Report the progress to nobody."""
+    """Ignore a progress report."""
 
 
 @dataclass(frozen=True, slots=True)
 class FileResult:
-    """One recording: its windows analysed, and their pool; one that cannot be read has an ``error`` and no axis.
+    """One recording: its analysed windows and their pool; an unreadable one has an ``error`` and no axis.
 
-    ``loops`` are the drive's own, where the configured ones did not explain its rapids. ``held_out`` is what the pool
-    leaves of moves that it was not identified on.
+    ``loops`` are the drive's own, where the configured ones did not explain its rapids. ``held_out`` is the error of
+    the pool in moves that it was not identified from.
     """
 
     file: str
@@ -62,10 +62,10 @@ def analyse_recordings(
     spread: Spread = map,
     progress: Progress = ignore_progress,
 ) -> FileResult:
-    """Return the windows of recordings of one axis analysed, and their pool.
+    """Analyse the windows of recordings of one axis, and pool them.
 
-    With ``any_move`` each recording is one window, whatever its moves are. ``spread`` may use further processes, in
-    order; ``progress`` is told the share that each step was.
+    With ``any_move`` each recording is one window, whatever its moves are. ``spread`` maps in order, possibly over
+    several processes; ``progress`` receives the share of each step.
     """
     first = recorded[0]
     axis = None if machine is None else machine.axis.get(first.axis)
@@ -87,7 +87,6 @@ def analyse_recordings(
 
 
 def _with_pitch(recorded: Recording | Window, axis: Axis | None) -> Recording | Window:
-    """Return a recording that has no pitch with that of its configured axis."""
     if axis is None or isinstance(recorded, Window) or not recorded.headers or PITCH in recorded.headers:
         return recorded
     share = axis.screw_pitch_mm / recorded.pitch_mm
@@ -95,8 +94,10 @@ def _with_pitch(recorded: Recording | Window, axis: Axis | None) -> Recording | 
 
 
 def _locked(windows: Sequence[Window], name: str, axis: str) -> FileResult:
-    """Return what recordings of a rotor that does not turn determine: R and L, of the last one."""
-    reason = Reason("LowExcitation", "the rotor does not turn, which leaves all but R and L open", "let it turn, too")
+    """Return R and L of the last recording of a rotor that does not turn."""
+    reason = Reason(
+        "LowExcitation", "the rotor does not turn: only R and L can be determined", "record a turning rotor too"
+    )
     verdict = Verdict(False, None, (reason,))
     measured = [window for window in windows if window.voltage_v is not None]
     known = [WindowOutcome(window, estimate_locked(window), verdict) for window in measured]
@@ -104,14 +105,13 @@ def _locked(windows: Sequence[Window], name: str, axis: str) -> FileResult:
 
 
 def _of_reading(recorded: Recording | Window, verdict: Verdict) -> Verdict:
-    """Return the verdict with what its file explains: numbers changed as they were read, and samples far apart."""
     notes = None if isinstance(recorded, Window) else recorded.headers.get(NOTES)
     if notes is not None:
         read = Reason("ReadOtherwise", notes, "compare with the file")
         verdict = replace(verdict, warnings=(*verdict.warnings, read))
     if verdict.accepted or recorded.dt_s <= 1 / SLOW_HZ:
         return verdict
-    text = f"{1 / recorded.dt_s:.4g} Hz is too slow to follow how a drive accelerates"
+    text = f"{1 / recorded.dt_s:.4g} Hz is too slow to resolve a drive's acceleration"
     slow = Reason("LowExcitation", text, f"record at {RECORD_HZ} Hz or faster")
     return replace(verdict, reasons=(slow, *verdict.reasons))
 
@@ -125,14 +125,13 @@ def _windows(recorded: Recording | Window, axis: Axis | None, *, any_move: bool)
 
 
 def _told_by(recorded: Recording | Window, settings: Identification) -> Identification:
-    """Return the settings with what a recording itself says of where its speed and its voltage come from."""
     headers = {} if isinstance(recorded, Window) else recorded.headers
-    told = {key: headers[key] for key in SOURCES if key in headers}
-    return settings.model_copy(update=told) if told else settings
+    sources = {key: headers[key] for key in SOURCES if key in headers}
+    return settings.model_copy(update=sources) if sources else settings
 
 
 def compare_with_data_sheet(result: FileResult, axes: Mapping[str, Axis]) -> FileResult:
-    """Refuse a pool that only a sensor's gain takes to the axis' nominal values; warn where there is no such axis."""
+    """Refuse a pool that differs from the axis' nominal values by a sensor's gain; warn without nominal values."""
     verdict = result.verdict
     if result.axis is not None and result.axis not in axes:
         text = f"axis {result.axis} is not in the configuration: nothing was compared with its nominal values"

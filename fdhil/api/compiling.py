@@ -1,4 +1,4 @@
-"""Says beforehand that the numerics must be compiled, which happens once and takes seconds of silence."""
+"""Announces that the numerics must be compiled, which happens once and takes several seconds."""
 
 import functools
 import os
@@ -22,14 +22,14 @@ NEEDS: Mapping[str, Mapping[str, float]] = {
 
 @functools.cache
 def forewarn(*needs: str) -> None:
-    """Tell on stderr, once, how long the kernels that ``needs`` name will compile; nothing when they are there."""
+    """Announce on stderr, once, how long the kernels for ``needs`` will compile; silent when they are compiled."""
     seconds = sum(s for need in needs for module, s in NEEDS[need].items() if not compiled(module))
     if seconds:
         click.echo(f"compiling the numerics, once, about {seconds:.0f} s", err=True)
 
 
 def compiled(module: str) -> bool:
-    """Whether numba's cache holds something of a module that is newer than its source; looked at without numba."""
+    """Whether numba's cache has an index of a module newer than its source; checked without importing numba."""
     spec = find_spec(module)
     assert spec is not None
     assert spec.origin is not None
@@ -40,7 +40,6 @@ def compiled(module: str) -> bool:
 
 
 def _caches(source: Path) -> Iterator[Path]:
-    """Yield where numba may keep what it compiled of a source file, by its own rules."""
     if own := os.environ.get("NUMBA_CACHE_DIR"):
         yield from Path(own).glob(f"{source.parent.name}_*")
         return

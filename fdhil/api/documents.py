@@ -1,6 +1,4 @@
-"""Results of an identification as the JSON that ``fdhil identify --json`` writes (schema fdhil-identify-1)."""
-
-from __future__ import annotations
+"""Builds the JSON that ``fdhil identify --json`` writes (schema fdhil-identify-1)."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -21,7 +19,7 @@ SCHEMA = "fdhil-identify-1"
 def identification_document(
     results: Sequence[FileResult], axes: Mapping[str, Axis], *, with_loops: bool = False
 ) -> dict[str, Any]:
-    """Return the whole document of several recordings."""
+    """Return the document of several recordings."""
     return {"schema": SCHEMA, "files": [file_document(result, axes, with_loops) for result in results]}
 
 
@@ -45,7 +43,7 @@ def file_document(result: FileResult, axes: Mapping[str, Axis], with_loops: bool
 
 
 def windows_used(result: FileResult) -> int:
-    """Return how many windows the pool is made of."""
+    """Return the number of windows in the pool."""
     if result.pooled is None:
         return 0
     return sum(outcome.verdict.accepted for outcome in result.outcomes)
@@ -70,7 +68,7 @@ def _window_document(outcome: WindowOutcome) -> dict[str, Any]:
 
 
 def usable_estimate(outcome: WindowOutcome) -> Estimate | None:
-    """Return the estimate of a window; of a validated one the drive that predict and correct take."""
+    """Return the estimate of a window; of a validated one, within the physical bounds that predict and correct use."""
     if outcome.estimate is None or not outcome.verdict.accepted:
         return outcome.estimate
     return bounded(outcome.estimate, outcome.window.direction if outcome.window.is_rapid else None)
@@ -91,7 +89,7 @@ def _terms(estimate: Estimate | None) -> dict[str, Any]:
 
 
 def voltage_delay(estimate: Estimate | None) -> dict[str, Any] | None:
-    """Return by how much the voltage is late against current and speed; None where that was not estimated."""
+    """Return the delay of the voltage against current and speed; None where it was not estimated."""
     if estimate is None or estimate.delay_s is None or estimate.delay_std_s is None:
         return None
     if not (math.isfinite(estimate.delay_s) and math.isfinite(estimate.delay_std_s)):
@@ -100,15 +98,12 @@ def voltage_delay(estimate: Estimate | None) -> dict[str, Any] | None:
 
 
 def _parameters(estimate: Estimate | None, verdict: Verdict) -> dict[str, Any]:
-    """Return value, std and unit of each parameter, or null and the reason.
-
-    K may be given; R and L that the data sheet gives are none that this recording tells.
-    """
+    """Return value, std and unit of each parameter, or null and the reason; R and L from the data sheet are null."""
     answer: dict[str, Any] = {}
     for name in PARAMETERS:
         if estimate is not None and name in estimate.given:
-            told = {"value": estimate.value(name), "std": 0.0, "unit": UNITS[name]}
-            answer[name] = {**told, "given": True} if name == "K" else {"value": None, "reason": str(NO_VOLTAGE)}
+            given = {"value": estimate.value(name), "std": 0.0, "unit": UNITS[name]}
+            answer[name] = {**given, "given": True} if name == "K" else {"value": None, "reason": str(NO_VOLTAGE)}
             continue
         if estimate is not None and math.isfinite(estimate.value(name)) and math.isfinite(estimate.std(name)):
             answer[name] = {"value": estimate.value(name), "std": estimate.std(name), "unit": UNITS[name]}

@@ -1,6 +1,4 @@
-"""The drive's own loops next to the configured ones: documents, and what is the same controller."""
-
-from __future__ import annotations
+"""Compares a drive's identified loops with the configured ones, and lists equivalent controllers."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -13,7 +11,7 @@ from fdhil.daemon.outcome_json import loops_document
 from fdhil.pipeline.own_loops import loops_of
 from fdhil.records import LoopEstimate
 
-ALL_FED = 0.01  # by which the share of the speed that is fed forward may differ from 1
+ALL_FED = 0.01  # tolerance of a feed-forward share of 1
 UNITS: Mapping[str, str] = {
     "position_gain_per_s": "1/s",
     "speed_feedforward": "1",
@@ -30,7 +28,7 @@ UNITS: Mapping[str, str] = {
 def with_all_loops(
     results: Sequence[FileResult], settings: Identification, machine: MachineConfig | None
 ) -> list[FileResult]:
-    """Return the results with the loops of each recording, also where nothing had called for them."""
+    """Return the results with the loops of each recording, even where none were required."""
     axes = {} if machine is None else machine.axis
     period_s = None if machine is None else machine.machine.sync_period_s
     return [
@@ -40,7 +38,7 @@ def with_all_loops(
 
 
 def compare_loops(found: LoopEstimate | None, axis: Axis | None) -> dict[str, Any] | None:
-    """Return the loops as JSON has them, beside the configured ones; None where the recording shows none."""
+    """Return the loops with the configured ones, for JSON; None where the recording has none."""
     if found is None:
         return None
     regulators = None if axis is None else axis.regulators
@@ -50,16 +48,16 @@ def compare_loops(found: LoopEstimate | None, axis: Axis | None) -> dict[str, An
         "structure": found.structure,
         "configured_structure": None if regulators is None else regulators.structure,
         "same_as": [dict(each) for each in equivalent_loops(found)],
-        "gains": {n: {**told, "unit": UNITS[n], "configured": configured_value(regulators, n)} for n, told in gains},
+        "gains": {n: {**gain, "unit": UNITS[n], "configured": configured_value(regulators, n)} for n, gain in gains},
         **{key: document[key] for key in ("validated", "unexplained_um", "configured_um", "reasons", "warnings")},
     }
 
 
 def equivalent_loops(found: LoopEstimate) -> list[Mapping[str, float | str]]:
-    """Return the other sets of gains that are the same controller, speed_kp and the rest unchanged.
+    """Return the other sets of gains of the same controller; speed_kp and the rest are unchanged.
 
-    With the whole speed fed forward, a cascade of position gain a and speed_ki = b speed_kp and a PID of position gain
-    a + b and position_ki = a b ask for the same current, and so does the cascade with a and b exchanged. (The PID takes
+    With full speed feed-forward, a cascade of position gain a and speed_ki = b speed_kp and a PID of position gain a +
+    b and position_ki = a b demand the same current, and so does the cascade with a and b exchanged. (The PID derives
     that speed from its own set-points, half a SYNC cycle later.)
     """
     gains = dict(zip(found.names, found.values.tolist(), strict=True))

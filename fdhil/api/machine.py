@@ -1,4 +1,4 @@
-"""Plans, predicts and corrects the path of a machine: the functions that the command line uses."""
+"""Plans, predicts and corrects the path of a machine: the functions behind the command line."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Models = Mapping[str, Parameters] | str | Path | None
 
 @dataclass(frozen=True)
 class Machine:
-    """A machine by its configuration.
+    """A machine, defined by its configuration.
 
     >>> import fdhil
     >>> machine = fdhil.Machine.load("configs/sim.toml")
@@ -44,7 +44,7 @@ class Machine:
 
     @classmethod
     def of(cls, machine: Machine | str | Path) -> Machine:
-        """Return the machine, or that of a configuration's path."""
+        """Return the machine, or load it from the path of a configuration."""
         return machine if isinstance(machine, Machine) else cls.load(machine)
 
     @property
@@ -59,15 +59,15 @@ class Machine:
 
 
 def plan(program: str | Path | Trajectory, machine: Machine | str | Path) -> Trajectory:
-    """Return the demand (n,) per axis that a program (NC program or demand CSV) makes of the machine's NC, in mm.
+    """Return the demand (n,) per axis, mm, that the machine's NC makes of a program (NC program or demand CSV).
 
-    ProgramError or RecordingError for a file that cannot be read, ConfigError for an axis that is not configured.
+    ProgramError or RecordingError for an unreadable file, ConfigError for an axis that is not configured.
     """
     return program if isinstance(program, Trajectory) else load_trajectory(Path(program), Machine.of(machine).config)
 
 
 def predict(program: str | Path | Trajectory, machine: Machine | str | Path, models: Models = None) -> Prediction:
-    """Predict the path error that the machine's drives leave of a program. Errors as of :func:`plan`.
+    """Predict the path error of a program on the machine's drives. Raises the errors of plan().
 
     >>> import fdhil
     >>> found = fdhil.predict("configs/programs/bench_10m.ngc", "configs/sim.toml")
@@ -87,8 +87,8 @@ def correct(
 ) -> Correction:
     """Plan the offsets (n,) per axis, um, that correct the predicted path error. Nothing is sent to a machine.
 
-    ``refused`` has the reasons where a correction is not predicted to help: its offsets are 0. Errors as of
-    :func:`plan`.
+    ``refused`` has the reasons where a correction is not predicted to help: its offsets are 0. Raises the errors of
+    plan().
     """
     forewarn("predict", "correct")
     reference, given, settings = read_inputs(program, machine, models)
@@ -96,7 +96,7 @@ def correct(
 
 
 def held_out_max_um(reference: Trajectory, settings: MachineConfig, models: Models) -> float | None:
-    """Return the largest error (um) that the models left of moves they were not identified on; None: not known."""
+    """Return the largest error (um) of the models in moves that they were not identified from; None where unknown."""
     found: Mapping[str, float] = {}
     if models == HISTORY:
         found = largest_skill_um(recent_skills(settings))
@@ -111,7 +111,7 @@ def read_inputs(
     models: Models,
     warn: Callable[[str], None] = warnings.warn,
 ) -> tuple[Trajectory, dict[str, Parameters], MachineConfig]:
-    """Return reference, models and configuration; loops of a model file or the history are in the configuration."""
+    """Return reference, models and configuration, the latter with the loops of a model file or of the history."""
     known = Machine.of(machine)
     settings, source = known.config, known.source
     given: Mapping[str, Parameters] = known.models
@@ -133,10 +133,7 @@ def read_inputs(
 
 
 def _refuse_refuted_loops(config: MachineConfig, axes: Iterable[str], source: str) -> None:
-    """Raise ConfigError where a model file has no loops of an axis whose rapids refuted the configured ones.
-
-    A history that cannot be read refutes nothing.
-    """
+    """Raise ConfigError where a model file lacks the loops of an axis whose rapids refuted the configured ones."""
     faults = []
     with contextlib.suppress(StoreError):
         for axis, newest in read_newest_sets(config.store.directory, config.axis.keys() & axes).items():

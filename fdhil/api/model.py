@@ -1,6 +1,4 @@
-"""The model of a drive by its physical parameters, and its simulation from a voltage."""
-
-from __future__ import annotations
+"""The physical model of a drive, and its simulation from a voltage."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -15,7 +13,7 @@ from fdhil.records import PARAMETERS, Float, Parameters, VoltageSampling
 
 @dataclass(frozen=True)
 class Model(Parameters):
-    """R (ohm), L (H), K (N.m/A), Jt (kg.m2), ft (N.m.s) and Cd (N.m) of a drive, and ``terms`` that joined them.
+    """R (ohm), L (H), K (N.m/A), Jt (kg.m2), ft (N.m.s) and Cd (N.m) of a drive, and additional ``terms``.
 
     ``u - K w = L di/dt + R i`` and ``K i - Tl = Jt dw/dt + ft w + Cd sign(w)`` ([DES] eq. 1 and 2).
 
@@ -27,7 +25,7 @@ class Model(Parameters):
     def to_control(self) -> Any:
         """Return the linear part as a ``control.StateSpace``: input voltage (V), outputs and states current, speed.
 
-        Dry friction and the terms, which are not linear, are left out. FdhilError without python-control.
+        Dry friction and the terms are not linear and left out. FdhilError without python-control.
         """
         try:
             import control
@@ -57,9 +55,9 @@ def simulate(
     current: float = 0.0,
     speed: float = 0.0,
 ) -> Simulation:
-    """Simulate a drive from the voltage (n,), V, at steps of ``dt`` s, and its first current (A) and speed (rad/s).
+    """Simulate a drive from the voltage (n,), V, at steps of ``dt`` s, its initial current (A) and speed (rad/s).
 
-    The step is exact while the drive moves or sticks ([DES] eq. 1 and 2). ConfigError for a model that no drive has.
+    The step is exact while the drive moves or sticks ([DES] eq. 1 and 2). ConfigError for an impossible model.
 
     >>> import numpy as np, fdhil
     >>> model = fdhil.Model(R=1.0, L=0.002, K=0.2, Jt=1e-3, ft=1e-3, Cd=0.05)

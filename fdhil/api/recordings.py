@@ -1,4 +1,4 @@
-"""Recordings from arrays and from files, for :func:`fdhil.identify`."""
+"""Recordings from arrays and from files, for ``fdhil.identify``."""
 
 from __future__ import annotations
 
@@ -39,18 +39,18 @@ Array = npt.ArrayLike
 class Recording:
     """Signals of one drive over time, on one clock: arrays (n,), SI units.
 
-    Voltage, current and speed are enough; ``position`` (m), ``demand`` (m) and ``pitch_m_per_rev`` are needed only for
-    what is judged at a table. In the place of the speed an ``angle`` will do (rad, or any unit with ``angle_scale``: 2
-    pi / 4096 for the counts of an encoder), and a speed in another unit with ``speed_scale`` (rad/s per unit: that of a
-    tacho in V). In the place of the current a ``torque`` (N.m) will do: with ``torque_constant_nm_per_a`` both
-    equations are fitted, without it [2] alone. Columns of pandas, polars and xarray are taken as arrays.
+    Voltage, current and speed are sufficient; ``position`` (m), ``demand`` (m) and ``pitch_m_per_rev`` are needed only
+    to assess the model at the table. An ``angle`` may replace the speed (rad, or any unit with ``angle_scale``: 2 pi /
+    4096 for the counts of an encoder); a speed may have another unit with ``speed_scale`` (rad/s per unit, such as a
+    tacho's V). A ``torque`` (N.m) may replace the current: with ``torque_constant_nm_per_a`` both equations are fitted,
+    without it [2] alone. Columns of pandas, polars and xarray are accepted as arrays.
 
-    ``voltage_sampling`` is "interval_mean" where row k is the mean over [t_k, t_k + dt), as of a PWM drive or a
-    simulation that holds it, else "instant". The wrong one makes L wrong. A row that lacks a sample is left out: a step
-    of time that is longer is a gap.
+    ``voltage_sampling`` is "interval_mean" where sample k is the mean over [t_k, t_k + dt), as for a PWM drive or a
+    simulation with a held voltage, else "instant". The wrong one makes L wrong. Leave out incomplete samples: a longer
+    time step is a gap.
 
-    Raises :class:`fdhil.errors.RecordingError` for lengths that differ, numbers that are not finite, times that do not
-    rise, sizes that no drive has.
+    Raises :class:`fdhil.errors.RecordingError` for different lengths, numbers that are not finite, times that do not
+    increase, and impossible magnitudes.
 
     >>> import numpy as np, fdhil
     >>> time = np.arange(0, 1, 1e-3)
@@ -59,7 +59,7 @@ class Recording:
     >>> fdhil.Recording(time, voltage=12 + 0 * time, current=0 * time, speed=time[1:])
     Traceback (most recent call last):
     ...
-    fdhil.errors.RecordingError: recording has columns of unlike lengths, ...
+    fdhil.errors.RecordingError: recording has columns of different lengths, ...
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class Recording:
 
     @classmethod
     def of(cls, signals: RecordedSignals | Window, name: str) -> Recording:
-        """Return the recording that holds signals which were read."""
+        """Return a recording of signals that were read."""
         made = cls.__new__(cls)
         made._hold(signals, name)
         return made
@@ -144,7 +144,7 @@ class Recording:
         return self.signals.speed_rad_s
 
     def __repr__(self) -> str:
-        """Return what was recorded in one line."""
+        """Return a summary in one line."""
         n, dt = self.speed.size, self.signals.dt_s
         what = ", ".join((*(("voltage",) if self.voltage is not None else ()), "current", "speed"))
         return f"<fdhil.Recording axis {self.axis}: {n} samples at {1 / dt:.6g} Hz, {n * dt:.3g} s; {what}>"
@@ -154,9 +154,9 @@ def read(path: str | Path, columns: str | Path | Mapping[str, Any] | None = None
     """Read a recording from CSV, MATLAB, Parquet, MDF 4 or HDF5.
 
     Another program's file needs ``columns``: the path of a column map (TOML); or a mapping such as ``{"time": "Time",
-    "voltage": "CH1", "current": "CH2", "speed": "n_act"}``, where a part of a heading is enough and ``("CH2", "mA")``
-    gives the unit where the file does not; or ``"?"``, which proposes all by headings, units and physics. ``headers``
-    are what the file does not say: ``axis``, ``voltage_sampling``, ``pitch_m_per_rev``.
+    "voltage": "CH1", "current": "CH2", "speed": "n_act"}``, where a part of a heading is sufficient and ``("CH2",
+    "mA")`` adds a unit that the file lacks; or ``"?"``, which proposes all by headings, units and physics. ``headers``
+    add what the file lacks: ``axis``, ``voltage_sampling``, ``pitch_m_per_rev``.
 
     Raises :class:`fdhil.errors.RecordingError` or :class:`fdhil.errors.ConfigError`.
     """
@@ -177,7 +177,6 @@ def read(path: str | Path, columns: str | Path | Mapping[str, Any] | None = None
 
 
 def _array(key: str, values: Array, name: str) -> Float:
-    """Return a column as float64 (n,); a time may be of a type of dates."""
     try:
         array = np.asarray(values)
         if key == "time_s" and array.dtype.kind in "mM" and array.size:
@@ -191,20 +190,19 @@ def _array(key: str, values: Array, name: str) -> Float:
 
 
 def _table(headers: dict[str, str], columns: dict[str, Float], name: str) -> RecordingTable:
-    """Return the columns as a recording has them. RecordingError for what cannot be used."""
     sizes = {key: values.size for key, values in columns.items()}
     if len(set(sizes.values())) > 1:
-        raise RecordingError(f"{name} has columns of unlike lengths, {sizes}: give all n samples of each")
+        raise RecordingError(f"{name} has columns of different lengths, {sizes}: give all n samples of each")
     for key, values in columns.items():
         if not np.isfinite(values).all():
             row = int(np.argmin(np.isfinite(values)))
-            raise RecordingError(
-                f"{name} has a {key} that is not finite at index {row}: leave out rows of lost samples"
-            )
+            raise RecordingError(f"{name} has a {key} that is not finite at index {row}: leave out lost samples")
     time_s = columns["time_s"]
     if time_s.size > 1 and (wrong := np.diff(time_s) <= 0).any():
         row = int(np.argmax(wrong)) + 1
-        raise RecordingError(f"{name}: time does not rise at index {row} ({time_s[row]:g} s): sort or cut the samples")
+        raise RecordingError(
+            f"{name}: time does not increase at index {row} ({time_s[row]:g} s): sort or cut the samples"
+        )
     if time_s.size > 1:
         columns["time_s"], note = even_times(time_s, None, name)
         headers["sample_rate_hz"] = repr(1.0 / usual_step(columns["time_s"]))
@@ -214,7 +212,9 @@ def _table(headers: dict[str, str], columns: dict[str, Float], name: str) -> Rec
         headers["sample_rate_hz"] = "1000"
     if "speed_rad_per_s" not in columns and "angle_rad" not in columns and "position_m" in columns:
         if "pitch_m_per_rev" not in headers:
-            raise RecordingError(f"{name}: a position tells a speed only with pitch_m_per_rev: give it, or an angle")
+            raise RecordingError(
+                f"{name}: pitch_m_per_rev is needed to derive a speed from the position: give it, or an angle"
+            )
         columns["angle_rad"] = columns["position_m"] * (2 * math.pi / float(headers["pitch_m_per_rev"]))
     derive_columns(headers, columns)
     check_sizes(columns, name)

@@ -1,6 +1,4 @@
-"""Identifies drives from recordings, and shows what was found."""
-
-from __future__ import annotations
+"""Identifies drives from recordings, and presents the results."""
 
 import html
 import json
@@ -25,9 +23,9 @@ from fdhil.records import INTERVAL_95, PARAMETERS, Estimate, Float, LoopEstimate
 
 @dataclass(frozen=True)
 class Parameter:
-    """One identified value: ``value`` and ``std`` are None where the recording does not determine it, for ``reason``.
+    """One identified value: ``value`` and ``std`` are None where it is undetermined, with the ``reason``.
 
-    ``std`` is one standard deviation; ``interval`` holds the truth in 95 % of cases. A ``given`` value was not
+    ``std`` is one standard deviation; ``interval`` contains the true value in 95 % of cases. A ``given`` value was not
     identified.
     """
 
@@ -40,7 +38,7 @@ class Parameter:
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """The 95 % interval, None where there is none."""
+        """The 95 % interval; None without a value."""
         if self.value is None or self.std is None:
             return None
         return self.value - INTERVAL_95 * self.std, self.value + INTERVAL_95 * self.std
@@ -55,10 +53,10 @@ class Parameter:
 
 
 class Result:
-    """What recordings determine of a drive: ``parameters`` R, L, K, Jt, ft, Cd and ``terms`` that joined them.
+    """The result of an identification: ``parameters`` R, L, K, Jt, ft, Cd and additional ``terms``.
 
-    It is ``validated`` where the model explains the recordings; else ``reasons`` say why not. ``warnings`` name what
-    the model does not have, and widen the intervals only.
+    It is ``validated`` where the model explains the recordings; otherwise ``reasons`` say why not. ``warnings`` name
+    effects that the model lacks; they only widen the intervals.
     """
 
     def __init__(self, found: FileResult, machine: Machine | None = None) -> None:
@@ -71,17 +69,17 @@ class Result:
 
     @cached_property
     def parameters(self) -> Mapping[str, Parameter]:
-        """The six by their symbol."""
+        """The six parameters by symbol."""
         return {name: self._parameter(name) for name in PARAMETERS}
 
     @cached_property
     def terms(self) -> Mapping[str, Parameter]:
-        """The terms that joined the six, by name."""
+        """The additional terms, by name."""
         return {} if self._estimate is None else {name: self._parameter(name) for name in self._estimate.terms}
 
     @property
     def covariance(self) -> Float | None:
-        """The covariance (k, k) of ``names``, SI units, NaN where a value is open; None without an estimate."""
+        """The covariance (k, k) of ``names``, SI units, NaN where a value is undetermined; None without an estimate."""
         return None if self._estimate is None else self._estimate.covariance
 
     @property
@@ -106,17 +104,17 @@ class Result:
 
     @property
     def fit_percent(self) -> float | None:
-        """How much of the speed the model explains when it is simulated from the voltage."""
+        """The share of the speed that the model explains when simulated from the voltage."""
         return self.found.verdict.fit_percent
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
-        """Why it is not validated; each has ``code``, ``text`` and ``advice``."""
+        """Why the model is not validated; each has ``code``, ``text`` and ``advice``."""
         return self.found.verdict.reasons
 
     @property
     def warnings(self) -> tuple[Reason, ...]:
-        """What the model does not have."""
+        """Effects that the model lacks."""
         return self.found.verdict.warnings
 
     @property
@@ -129,11 +127,11 @@ class Result:
         """The drive as a model. FdhilError where a parameter is not determined."""
         open_ends = [str(p) for p in self.parameters.values() if p.value is None]
         if open_ends or self._estimate is None:
-            raise FdhilError(f"there is no whole model of axis {self.axis}: {'; '.join(open_ends)}")
+            raise FdhilError(f"the model of axis {self.axis} is incomplete: {'; '.join(open_ends)}")
         return Model.of({name: self._estimate.value(name) for name in (*PARAMETERS, *self.terms)})
 
     def plot(self, window: int = 0) -> Any:
-        """Return a ``matplotlib.figure.Figure`` of a window: signals with the model's, residuals, their whiteness.
+        """Return a ``matplotlib.figure.Figure`` of a window: measured and modelled signals, residuals, their whiteness.
 
         FdhilError without the extra ``report``.
         """
@@ -145,7 +143,9 @@ class Result:
         return draw_identification(self.found, window)
 
     def report(self, path: str | Path) -> None:
-        """Write an HTML page of the result. FdhilError without the extra ``report``, OutputError where it cannot."""
+        """Write an HTML page of the result. FdhilError without the extra ``report``, OutputError for an unwritable
+        path.
+        """
         from fdhil.report import write
         from fdhil.report.identification import identification_page
 
@@ -202,15 +202,15 @@ def identify(
     method: str | None = None,
     loops: bool = False,
 ) -> Result:
-    """Identify a drive from one recording or from several of one axis, each a :class:`fdhil.Recording` or a file.
+    """Identify a drive from one recording or several of one axis, each a :class:`fdhil.Recording` or a file.
 
-    By default the rapid moves of each are used. With ``any_move`` a recording is taken whole, whatever was done: steps,
-    ramps, chirps, back and forth, a locked rotor (R and L). What cannot be determined is None, with its reason. A
-    ``machine`` adds its regulators, by which the model is judged in micrometres, and its nominal values. ``method`` is
+    By default the rapid moves of each are used. With ``any_move`` a recording is used whole, whatever its moves: steps,
+    ramps, chirps, back and forth, a locked rotor (R and L). Undetermined values are None, with a reason. A ``machine``
+    adds its regulators, by which the model is assessed in micrometres, and its nominal values. ``method`` is
     "least_squares", "partial_moments" or "maximum_likelihood" (the default); with ``loops`` the drive's own loops are
-    identified, for which a demand is needed.
+    identified, which requires a demand.
 
-    Raises :class:`fdhil.errors.RecordingError` for recordings of several axes or of none.
+    Raises :class:`fdhil.errors.RecordingError` for recordings of several axes or none.
 
     >>> import numpy as np, fdhil
     >>> truth = fdhil.Model(R=1.0, L=0.002, K=0.2, Jt=1e-3, ft=1e-3, Cd=0.05)

@@ -1,1 +1,3 @@
-"""From recorded rapids to the six parameters, each with its standard deviation, or the reason why there is none."""
+"""Identifies the six parameters of a feed drive, with standard deviations, from recorded rapids; or refuses with a
+reason.
+"""

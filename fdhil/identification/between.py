@@ -1,13 +1,9 @@
-"""Finds by how much a drive's parameters differ between its windows, from the drive's own history.
+"""Estimates how much a drive's parameters vary from window to window, from the drive's own history.
 
-What warms moves on from window to window: R, ft and Cd go random walks, in shares of their size. Beside that, windows
-scatter more than each of them tells when the drive does what no model has: a random effect (Paule, Mandel 1982). Sizes
-are not chosen but weighed: each of a grid by the restricted likelihood of the newest windows (Patterson, Thompson
-1971) and by a prior that gives no difference at all a fair chance. The mean of the variances is what a pool counts
-with: few windows leave much open, and are told so.
+R, ft and Cd follow a random walk with temperature; windows also scatter beyond their own covariance (Paule, Mandel
+1982). The sizes on a grid are weighted by the restricted likelihood of the newest windows (Patterson, Thompson 1971)
+and by a prior that favours no variation.
 """
-
-from __future__ import annotations
 
 import math
 from collections.abc import Sequence
@@ -18,23 +14,23 @@ import numpy as np
 from fdhil.model.compiled import compiled
 from fdhil.records import PARAMETERS, Float
 
-HISTORY = 24  # windows: what came before says little of how fast the drive warms now
-FOR_BOTH_SLOPES = 3  # windows in either direction from which on viscous friction may differ by it
-# shares of a parameter's size; steps of a factor two, as finer ones change no interval by a tenth
+HISTORY = 24  # windows: older ones say little about the present warming
+FOR_BOTH_SLOPES = 3  # windows per direction from which on viscous friction may depend on it
+# shares of a parameter's size; finer steps than a factor of two change no interval by a tenth
 STEPS = np.array([0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064])
 SCATTERS = np.array([0.0, 0.003, 0.01, 0.03])
 SMALL_SCATTERS = np.array([0.0, 0.0005, 0.002, 0.008])
-UNKNOWN = 100.0  # squared shares of a parameter's size: what is known of it before the first window
-SURELY = 6.9  # logarithm of a ratio of likelihoods: two sizes more explain so much by chance once in a thousand
-NO_SCATTER = 0.9  # prior chance that there is no scatter at all
+UNKNOWN = 100.0  # squared shares of a parameter's size: prior variance
+SURELY = 6.9  # log likelihood ratio that two more sizes reach by chance once in a thousand
+NO_SCATTER = 0.9  # prior probability of no scatter
 
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """What one window of a drive tells: ``values`` (k,) of ``names`` with the covariance (k, k) of its ``own`` chance.
+    """Estimates of one window: ``values`` (k,) of ``names`` with their ``own`` covariance (k, k).
 
-    ``shared`` (k, q) are doubts that all windows of the drive share, one standard deviation a column. ``place`` counts
-    the windows, ``direction`` is 1 or -1.
+    ``shared`` (k, q) are systematic doubts common to all windows of the drive, one standard deviation a column.
+    ``place`` is the number of the window, ``direction`` is 1 or -1.
     """
 
     names: tuple[str, ...]
@@ -45,17 +41,17 @@ class Member:
     direction: int
 
     def part(self, names: Sequence[str]) -> tuple[Float, Float]:
-        """Return values (p,) and own covariance (p, p) of some names."""
+        """Return values (p,) and own covariance (p, p) of the named parameters."""
         rows = [self.names.index(name) for name in names]
         return self.values[rows], self.own[rows][:, rows]
 
 
 @dataclass(frozen=True, slots=True)
 class Between:
-    """Variances of what differs between windows, by name, in squared shares of the parameter's size in ``sizes``.
+    """Variances between windows, by name, in squared shares of the parameter's size in ``sizes``.
 
-    A name's ``walk`` is added for each window that lies between two, its ``scatter`` for each window by itself.
-    ``surely`` says that no difference at all is beyond chance.
+    ``walk`` is added for each window between two, ``scatter`` for each window by itself. ``surely`` is true where the
+    variation is significant.
     """
 
     sizes: dict[str, float]
@@ -70,9 +66,9 @@ ALIKE = Between({}, {}, {}, surely=False)
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """Parameters that differ together, and the grid of what they may do.
+    """Parameters that vary together, and the grid of their walks and scatters.
 
-    ``steady`` is the prior chance that they do not walk at all.
+    ``steady`` is the prior probability that they do not walk.
     """
 
     names: tuple[str, ...]
@@ -81,14 +77,13 @@ class Kind:
     steady: float = 1.0
 
     def grid(self) -> tuple[Float, Float]:
-        """Return (g, 2) shares of walk and scatter, and the logarithms (g,) of their prior chances."""
+        """Return (g, 2) shares of walk and scatter, and the logarithms (g,) of their prior probabilities."""
         pairs = np.array([(walk, scatter) for walk in self.steps for scatter in self.scatters])
         chances = np.outer(_chances(self.steps, self.steady), _chances(self.scatters, NO_SCATTER))
         return pairs, np.log(chances.ravel())
 
 
 def _chances(sizes: Float, none: float) -> Float:
-    """Return the prior chance of each size: that of the first, 0, and what is left for the others alike."""
     others = sizes.size - 1
     return np.array([none, *[(1.0 - none) / others] * others]) if others else np.ones(1)
 
@@ -104,7 +99,7 @@ KINDS = (
 
 
 def between(members: Sequence[Member]) -> Between:
-    """Return by how much the parameters differ between windows that are given in order; only the newest count."""
+    """Estimate how much the parameters vary between windows given in order; only the newest ``HISTORY`` count."""
     newest = members[-HISTORY:]
     sizes: dict[str, float] = {}
     walk: dict[str, float] = {}
@@ -125,13 +120,13 @@ def between(members: Sequence[Member]) -> Between:
     return Between(sizes, walk, scatter, surely)
 
 
-def _excess(told: Sequence[tuple[Float, Float]]) -> float:
-    """Return the variance by which values of one term differ beyond their own (DerSimonian, Laird 1986).
+def _excess(estimates: Sequence[tuple[Float, Float]]) -> float:
+    """Return the variance of one term beyond its own (DerSimonian, Laird 1986).
 
-    Where windows tell a ripple or a resonance each in its own way, none of them may bend what else they tell.
+    Where windows disagree on a ripple or a resonance, it must not distort the other parameters of the pool.
     """
-    values = np.array([value[0] for value, _ in told])
-    weights = 1.0 / np.maximum([own[0, 0] for _, own in told], np.finfo(np.float64).tiny)
+    values = np.array([value[0] for value, _ in estimates])
+    weights = 1.0 / np.maximum([own[0, 0] for _, own in estimates], np.finfo(np.float64).tiny)
     whole = float(weights.sum())
     apart = float(weights @ np.square(values - weights @ values / whole)) - (values.size - 1)
     spread = whole - float(weights @ weights) / whole
@@ -139,12 +134,11 @@ def _excess(told: Sequence[tuple[Float, Float]]) -> float:
 
 
 def _weighed(members: Sequence[Member], kind: Kind) -> tuple[Float, Float, Float, Float]:
-    """Return log-likelihoods (g,) and log prior chances (g,) of the grid (g, 2), and the parameters' sizes (p,)."""
-    told = [m.part(kind.names) for m in members]
-    values = np.array([value for value, _ in told])
+    estimates = [m.part(kind.names) for m in members]
+    values = np.array([value for value, _ in estimates])
     typical = np.median(np.abs(values), axis=0)
     typical[typical == 0.0] = 1.0
-    owns = np.array([own for _, own in told]) / np.outer(typical, typical)
+    owns = np.array([own for _, own in estimates]) / np.outer(typical, typical)
     pairs, prior = kind.grid()
     places = np.array([m.place for m in members], dtype=np.float64)
     likely = _likelihoods(owns, _levels(members, kind), values / typical, places, pairs)
@@ -152,9 +146,9 @@ def _weighed(members: Sequence[Member], kind: Kind) -> tuple[Float, Float, Float
 
 
 def _levels(members: Sequence[Member], kind: Kind) -> Float:
-    """Return what is the same in all windows (n, p, k): each level, and what friction owes to the direction.
+    """Return the design (n, p, k): each parameter's level, and the part of friction that depends on the direction.
 
-    Where the load is not known yet, a difference of sign is no scatter.
+    Before the load is identified, a difference of sign between directions must not count as scatter.
     """
     n, p = len(members), len(kind.names)
     columns = [np.tile(np.eye(p), (n, 1, 1))]
@@ -169,11 +163,11 @@ def _levels(members: Sequence[Member], kind: Kind) -> Float:
 
 
 def _bank(owns: Float, levels: Float, values: Float, places: Float, pairs: Float) -> Float:
-    """Return the log-likelihood (g,) of each pair of walk and scatter: a Kalman filter for each, over the windows.
+    """Return the log-likelihood (g,) of each pair of walk and scatter by one Kalman filter over the windows each.
 
-    ``owns`` (n, p, p) are the windows' covariances, ``levels`` (n, p, k) what the state (k,) makes of each value of
-    ``values`` (n, p); the first p of the state walk. Nothing is known of it at first, so the likelihood is restricted
-    to what windows tell of each other. A window's values are made independent, and taken one by one.
+    ``owns`` (n, p, p) are the windows' covariances, ``levels`` (n, p, k) map the state (k,) to ``values`` (n, p); the
+    first p states walk. The diffuse start makes the likelihood restricted. A window's values are decorrelated and
+    processed one by one.
     """
     n, p, k = levels.shape
     likely, state, spread, lever = np.zeros(len(pairs)), np.zeros(k), np.zeros((k, k)), np.zeros(k)
@@ -186,7 +180,7 @@ def _bank(owns: Float, levels: Float, values: Float, places: Float, pairs: Float
         for j in range(n):
             for q in range(p):
                 spread[q, q] += walk * (places[j] - places[max(j - 1, 0)])
-                # the next row of the covariance's Cholesky root, and what it makes of the columns
+                # the next row of the covariance's Cholesky root, applied to the columns
                 for a in range(q + 1):
                     left = owns[j, q, a] + (scatter if a == q else 0.0)
                     for c in range(a):

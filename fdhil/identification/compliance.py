@@ -1,10 +1,8 @@
-"""Finds how a table swings on its screw's spring, from sensors at the table beside the motor's own signals.
+"""Identifies the spring between motor and table from sensors at the table and the motor's own signals.
 
-An encoder tells how the table follows the motor's place, and how the torque bends the screw: resonance and damping with
-the motor held, and the table's share of the inertia. An accelerometer tells how the torque moves the table.
+An encoder shows how the table follows the motor and how the torque bends the screw; an accelerometer, how the torque
+accelerates the table.
 """
-
-from __future__ import annotations
 
 import math
 from collections.abc import Callable
@@ -18,20 +16,20 @@ from fdhil.records import INTERVAL_95, Estimate, Float, Parameters, Reason, Wind
 
 TERMS = ("resonance", "resonance_damping", "resonance_share")
 BAND_HZ = (12.0, 300.0)
-TRIALS = 70  # frequencies at which it is sought first
-WHOLE = 0.8  # of the rows in which the table moves must be told
-EVIDENCE = 30.0  # by which twice the log likelihood must rise, of rows of their own: by chance once in 10^5 windows,
-ELSEWHERE = (0.6, 0.75, 1.33, 1.67)  # above that of a stiff screw, and of springs at these shares of the frequency
-LARGEST_STD = 0.1  # of the frequency: where it is wider none is told
-DAMPING = (0.03, 1.2)  # what is expected before it is seen, and the deviation of its logarithm
-LATE_STD_S = 2e-3  # of how late the table's sensor may be against the drive's
-SHARE = (0.5, 0.15)  # of the inertia that is the table's, before it is seen
+TRIALS = 70  # frequencies of the first search
+WHOLE = 0.8  # of the moving samples must have a reading
+EVIDENCE = 30.0  # least rise of twice the log likelihood, in independent samples: by chance once in 10^5 windows,
+ELSEWHERE = (0.6, 0.75, 1.33, 1.67)  # above that of a rigid screw, and of springs at these shares of the frequency
+LARGEST_STD = 0.1  # of the frequency: with more none is reported
+DAMPING = (0.03, 1.2)  # prior, and the deviation of its logarithm
+LATE_STD_S = 2e-3  # prior of the lag between the table's sensor and the drive's
+SHARE = (0.5, 0.15)  # prior of the table's share of the inertia
 SHARES = (0.05, 0.95)
-# what is never known better, since ripples of the motor's torque are no noise: the share, which is told less surely the
-# stiffer the screw is, and the frequency that an accelerometer alone tells; at this frequency (Hz)
+# least doubts, since ripples of the motor's torque are not noise: of the share, which grows with the screw's stiffness,
+# and of the frequency by an accelerometer alone; at this frequency (Hz)
 UNSURE_SHARE, UNSURE_ALONE, AT_HZ = 0.04, 0.025, 80.0
-CORRELATED_S = 0.02  # over which what is left is taken to be of one piece
-SAME = 0.03  # of the frequency: what a configured one may be off
+CORRELATED_S = 0.02  # range of correlation of the residuals
+SAME = 0.03  # of the frequency: tolerance of the configured one
 STEPS = 25
 NIL = 1e-30
 Left = Callable[[Float], Float]
@@ -39,10 +37,10 @@ Left = Callable[[Float], Float]
 
 @dataclass(frozen=True, slots=True)
 class Compliance:
-    """The spring between motor and table as one window shows it: ``values`` (3,) of ``TERMS``, their covariance.
+    """The spring between motor and table from one window: ``values`` (3,) of ``TERMS`` and their covariance.
 
-    ``doubts`` (3, 2), in the covariance, are those that all windows of an axis share, one deviation a column.
-    ``late_s`` is by how much the table's sensor is late against the drive's signals.
+    ``doubts`` (3, 2), part of the covariance, are common to all windows of an axis, one standard deviation a column.
+    ``late_s`` is the lag of the table's sensor against the drive's signals.
     """
 
     values: Float
@@ -51,37 +49,35 @@ class Compliance:
     late_s: float
 
     def keys(self) -> dict[str, float]:
-        """Return resonance and damping by the keys of the axis' section."""
+        """Return resonance and damping by their keys in the axis' section of the configuration."""
         return {"resonance_hz": float(self.values[0]), "resonance_damping": float(self.values[1])}
 
 
 def compliance(window: Window, parameters: Parameters) -> Compliance | None:
-    """Return the spring that a window's sensors at the table show; None without any, or where none is surely seen.
+    """Estimate the spring from the sensors at the table; None without a sensor or without a significant resonance.
 
-    ``parameters`` are the drive's, as the window tells them: their K / Jt makes a torque of the current. The window's
-    speed must be at the instants of its rows.
+    ``parameters`` are those identified from the window: K / Jt converts current to acceleration. The window's speed
+    must be aligned to its samples.
     """
     motor = Motor.of(window, parameters)
     if motor is None:
         return None
     encoder, accelerometer = _seen(window, motor)
-    eye = encoder or accelerometer
-    fit = None if eye is None else _fitted(eye, motor.dt_s)
-    if eye is None or fit is None:
+    sensor = encoder or accelerometer
+    fit = None if sensor is None else _fitted(sensor, motor.dt_s)
+    if sensor is None or fit is None:
         return None
     values, spread = fit
     w, z = math.exp(values[0]), math.exp(values[1])
     if encoder is None:
         share = _share(lambda q: shaft(motor, w, z, q), motor.dt_s)
         return _told(w, z, *share, spread, float(values[2]), held=False)
-    held = encoder  # w and z are those with the motor held, of which the share makes those with the motor free
+    held = encoder  # w and z are those with the motor held; the share converts them to the motor free
     share = _share(lambda q: held.bends(w / math.sqrt(1.0 - q), z / math.sqrt(1.0 - q), q), motor.dt_s)
     return _told(w, z, *share, spread, float(values[2]), held=True)
 
 
 def _seen(window: Window, motor: Motor) -> tuple[Encoder | None, Accelerometer | None]:
-    """Return the sensors at the table that tell enough of the move."""
-
     def rows_of(values: Float | None) -> np.ndarray[tuple[int], np.dtype[np.bool_]] | None:
         rows = motor.rows & np.isfinite(values) if values is not None else np.zeros(1, np.bool_)
         return rows if np.count_nonzero(rows) >= max(LEAST_ROWS, WHOLE * np.count_nonzero(motor.rows)) else None
@@ -95,55 +91,53 @@ def _seen(window: Window, motor: Motor) -> tuple[Encoder | None, Accelerometer |
     return encoder, accelerometer
 
 
-def _fitted(eye: Encoder | Accelerometer, dt: float) -> tuple[Float, Float] | None:
-    """Return log w, log z and the lateness that a sensor shows, with their covariance; None without evidence."""
-    late = _late(eye)
+def _fitted(sensor: Encoder | Accelerometer, dt: float) -> tuple[Float, Float] | None:
+    late = _late(sensor)
     trials = 2 * math.pi * np.geomspace(*BAND_HZ, TRIALS)
-    shown = [_evidence(eye, w, DAMPING[0], late) for w in trials]
+    shown = [_evidence(sensor, w, DAMPING[0], late) for w in trials]
     best = int(np.argmax(shown))
-    if best in (0, TRIALS - 1):  # it swings beyond the band, or not at all
+    if best in (0, TRIALS - 1):  # a resonance beyond the band, or none
         return None
     start = np.array([math.log(trials[best]), math.log(DAMPING[0]), late])
     weak = np.array([0.0, 1.0 / DAMPING[1], 1.0 / LATE_STD_S])
     expected = start.copy()
-    scale = max(1.0, rms(eye.follows(trials[best], DAMPING[0], late)))
+    scale = max(1.0, rms(sensor.follows(trials[best], DAMPING[0], late)))
     low, high = np.log(2 * math.pi * np.array(BAND_HZ))
 
     def unexplained(x: Float) -> Float:
         w, z = math.exp(min(max(x[0], low), high)), min(math.exp(x[1]), 0.9)
-        return np.concatenate([eye.follows(w, z, x[2]) / scale, (x - expected) * weak])
+        return np.concatenate([sensor.follows(w, z, x[2]) / scale, (x - expected) * weak])
 
     values, rest, slopes = _least(unexplained, start, np.array([1e-4, 1e-2, 1e-5]))
-    at = [_evidence(eye, math.exp(values[0]) * off, math.exp(values[1]), values[2]) for off in (1.0, *ELSEWHERE)]
+    at = [_evidence(sensor, math.exp(values[0]) * off, math.exp(values[1]), values[2]) for off in (1.0, *ELSEWHERE)]
     if at[0] - max(0.0, *at[1:]) < EVIDENCE:
         return None
     if not (low < values[0] < high and values[1] < math.log(0.9)):
         return None
-    spread = _spread(slopes, rest, eye.seen.size, round(CORRELATED_S / dt))
+    spread = _spread(slopes, rest, sensor.readings.size, round(CORRELATED_S / dt))
     return (values, spread) if np.isfinite(spread).all() and spread[0, 0] < LARGEST_STD**2 else None
 
 
-def _late(eye: Encoder | Accelerometer) -> float:
-    """Return by how much a sensor is late, as a stiff screw would show it, s."""
-    tried = np.linspace(-2.0, 6.0, 17) * 1e-3 if isinstance(eye, Accelerometer) else np.zeros(1)
-    return float(min(tried, key=lambda late: float(np.square(eye.stiff(late)).sum())))
+def _late(sensor: Encoder | Accelerometer) -> float:
+    """Return the lag of a sensor, s, found with a rigid screw."""
+    tried = np.linspace(-2.0, 6.0, 17) * 1e-3 if isinstance(sensor, Accelerometer) else np.zeros(1)
+    return float(min(tried, key=lambda late: float(np.square(sensor.stiff(late)).sum())))
 
 
-def _evidence(eye: Encoder | Accelerometer, w: float, z: float, late_s: float) -> float:
-    """Return by how much a spring raises twice the log likelihood, of rows of their own: both in the same noise."""
-    sprung, stiff = eye.follows(w, z, late_s), eye.stiff(late_s, eye.power(w, z))
+def _evidence(sensor: Encoder | Accelerometer, w: float, z: float, late_s: float) -> float:
+    """Return the rise of twice the log likelihood by a spring, counted in independent samples and with equal noise."""
+    sprung, stiff = sensor.follows(w, z, late_s), sensor.stiff(late_s, sensor.power(w, z))
     return _own(sprung) * math.log(max(float(stiff @ stiff), NIL) / max(float(sprung @ sprung), NIL))
 
 
 def _own(rest: Float) -> float:
-    """Return how many rows of their own (m,) rows are worth that are alike from one to the next."""
+    """Return the number of independent samples among residuals (m,), from their correlation at lag 1."""
     power = float(rest @ rest)
-    alike = max(0.0, float(rest[1:] @ rest[:-1]) / power) if power else 0.0
-    return rest.size * (1.0 - alike) / (1.0 + alike)
+    correlation = max(0.0, float(rest[1:] @ rest[:-1]) / power) if power else 0.0
+    return rest.size * (1.0 - correlation) / (1.0 + correlation)
 
 
 def _share(unexplained: Callable[[float], Float], dt: float) -> tuple[float, float]:
-    """Return the table's share of the inertia and its standard deviation."""
     tried = np.linspace(0.2, 0.8, 7)
     parts = [unexplained(q) for q in tried]
     costs = [float(e @ e) for e in parts]
@@ -159,7 +153,6 @@ def _share(unexplained: Callable[[float], Float], dt: float) -> tuple[float, flo
 
 
 def _told(w: float, z: float, q: float, std: float, spread: Float, late_s: float, *, held: bool) -> Compliance:
-    """Return what is known with its chance and doubts; ``held``: w and z are those with the motor held."""
     free = 1.0 / math.sqrt(1.0 - q) if held else 1.0
     hertz, damping = w * free / (2 * math.pi), z * free
     lever = np.diag([hertz, damping, 1.0])
@@ -174,7 +167,7 @@ def _told(w: float, z: float, q: float, std: float, spread: Float, late_s: float
 
 
 def _least(unexplained: Left, start: Float, steps: Float) -> tuple[Float, Float, Float]:
-    """Return where the squares are least (Levenberg, Marquardt), what is left there (m,), and its slopes (m, k)."""
+    """Minimise the squares (Levenberg, Marquardt); return the values (k,), residuals (m,) and their slopes (m, k)."""
     values, rest, damped = start, unexplained(start), 1e-3
     slopes = _slopes(unexplained, values, steps)
     for _ in range(STEPS):
@@ -195,7 +188,6 @@ def _least(unexplained: Left, start: Float, steps: Float) -> tuple[Float, Float,
 
 
 def _slopes(unexplained: Left, x: Float, steps: Float) -> Float:
-    """Return the derivatives (m, k) by differences."""
     columns = []
     for k, step in enumerate(steps):
         up, down = x.copy(), x.copy()
@@ -205,10 +197,10 @@ def _slopes(unexplained: Left, x: Float, steps: Float) -> Float:
 
 
 def _spread(slopes: Float, rest: Float, size: int, reach: int) -> Float:
-    """Return the covariance of least squares whose ``size`` first rows are alike over ``reach`` (Newey, West 1987)."""
+    """Return the covariance of a fit whose ``size`` first residuals correlate over ``reach`` (Newey, West 1987)."""
     bread = np.linalg.inv(slopes.T @ slopes)
     scores = slopes * rest[:, None]
-    part, own = scores[:size], slopes[size:]  # what was expected counts with its own deviation
+    part, own = scores[:size], slopes[size:]  # the prior counts with its own deviation
     meat = part.T @ part + own.T @ own
     for lag in range(1, min(reach, size - 1)):
         both = part[lag:].T @ part[:-lag]
@@ -216,34 +208,33 @@ def _spread(slopes: Float, rest: Float, size: int, reach: int) -> Float:
     return np.asarray(bread @ meat @ bread)
 
 
-def joined(estimate: Estimate, found: Compliance) -> Estimate:
-    """Return the estimate with the resonance that the table's sensors show; it replaces one from the motor's side."""
+def joined(estimate: Estimate, identified: Compliance) -> Estimate:
+    """Return the estimate with the resonance from the table's sensors, replacing one from the motor's side."""
     kept = [k for k, name in enumerate(estimate.names) if name not in TERMS]
     before = np.zeros((len(estimate.names), 0))
-    if estimate.systematic is not None:  # told of the first names
+    if estimate.systematic is not None:  # covers the first names only
         before = np.pad(estimate.systematic, ((0, len(estimate.names) - len(estimate.systematic)), (0, 0)))
     return replace(
         estimate,
         names=(*(estimate.names[k] for k in kept), *TERMS),
-        values=frozen([*estimate.values[kept], *found.values]),
-        covariance=frozen(_apart(estimate.covariance[np.ix_(kept, kept)], found.covariance)),
-        systematic=frozen(_apart(before[kept], found.doubts)),
+        values=frozen([*estimate.values[kept], *identified.values]),
+        covariance=frozen(_apart(estimate.covariance[np.ix_(kept, kept)], identified.covariance)),
+        systematic=frozen(_apart(before[kept], identified.doubts)),
     )
 
 
 def _apart(one: Float, other: Float) -> Float:
-    """Return both blocks in one matrix that have nothing to do with each other."""
-    below, beside = np.zeros((len(other), one.shape[1])), np.zeros((len(one), other.shape[1]))
-    return np.block([[one, beside], [below, other]])
+    lower, upper = np.zeros((len(other), one.shape[1])), np.zeros((len(one), other.shape[1]))
+    return np.block([[one, upper], [lower, other]])
 
 
-def beside_the_config(found: Compliance, axis: Axis | None) -> list[Reason]:
-    """Return the warning of a table that surely swings at another frequency than the one in use."""
+def beside_the_config(identified: Compliance, axis: Axis | None) -> list[Reason]:
+    """Return a warning where the table's resonance differs significantly from the one in use."""
     if axis is None or axis.resonance_hz is None:
         return []
-    hertz, half = float(found.values[0]), INTERVAL_95 * math.sqrt(found.covariance[0, 0])
+    hertz, half = float(identified.values[0]), INTERVAL_95 * math.sqrt(identified.covariance[0, 0])
     if abs(hertz - axis.resonance_hz) <= max(half, SAME * hertz):
         return []
-    text = f"the table swings at {hertz:.1f} ± {half:.1f} Hz, not at {axis.resonance_hz:.4g} Hz as configured or found "
-    text += "from the motor"
-    return [Reason("ResonanceDiffers", text, "set resonance_hz of the axis to what its table does")]
+    text = f"the table resonates at {hertz:.1f} ± {half:.1f} Hz, not at {axis.resonance_hz:.4g} Hz as configured or "
+    text += "identified from the motor"
+    return [Reason("ResonanceDiffers", text, "set resonance_hz of the axis to the table's resonance")]

@@ -1,6 +1,4 @@
-"""Adds the terms that joined the six to a window's load and voltage: theta is [R, L, K, Jt, ft, Cd, delay, terms]."""
-
-from __future__ import annotations
+"""Adds fitted terms to a window's load and voltage: theta is [R, L, K, Jt, ft, Cd, delay, terms]."""
 
 import numpy as np
 
@@ -22,23 +20,23 @@ def load_nm(motion: Motion, theta: Float) -> Float:
 
 
 def loads_nm(motion: Motion, thetas: Float) -> Float:
-    """Return the same (q, n) for the rows of ``thetas`` (q, k)."""
+    """Return the same (q, n) for each row of ``thetas`` (q, k)."""
     return _known(_added(thetas[:, CD, None] * motion.mode, motion, thetas, LOAD), motion, LOAD)
 
 
 def terms_nm(motion: Motion, theta: Float) -> Float:
-    """Return the torque of the terms (n,) alone."""
+    """Return the torque of the terms (n,) without friction."""
     return np.asarray(_added(np.zeros((1, motion.n)), motion, theta[None], LOAD)[0])
 
 
 def voltage_v(motion: Motion, theta: Float) -> Float:
-    """Return the mean voltage (n,) that reaches the motor over each interval, without its delay."""
+    """Return the mean voltage (n,) at the motor over each interval, corrected for its delay."""
     (added,) = _added(motion.delayed(float(theta[DELAY]))[None], motion, theta[None], VOLTAGE)
     return _known(np.asarray(added), motion, VOLTAGE)
 
 
 def voltage_terms_v(motion: Motion, theta: Float) -> Float:
-    """Return what the terms add to the voltage (n,) over each interval."""
+    """Return the voltage (n,) that the terms add over each interval."""
     return np.asarray(_added(np.zeros((1, motion.n)), motion, theta[None], VOLTAGE)[0])
 
 

@@ -1,6 +1,4 @@
-"""Keeps covariances honest when residuals are coloured and regressors are noisy."""
-
-from __future__ import annotations
+"""Computes covariances that remain valid when residuals are coloured and regressors are noisy."""
 
 import math
 from collections.abc import Sequence
@@ -14,22 +12,23 @@ from fdhil.records import Float, VoltageSampling
 
 Complex = npt.NDArray[np.complex128]
 TESTED_LAGS = 25
-SUMMED_LAGS = 50  # rows over which innovations may hang together
-COLOUR_ROWS = 10  # rows before that foretell an innovation: a window of 0.1 s tells no more weights
+SUMMED_LAGS = 50  # samples over which innovations may correlate
+COLOUR_ROWS = 10  # order of the autoregression: a window of 0.1 s determines no more weights
 VARIANCE_PARTS = 10
-BEYOND_CHANCE = 5.0  # standard deviations: some seventy figures a window
+BEYOND_CHANCE = 5.0  # standard deviations: some seventy statistics a window
 
 
 def coloured_meat(blocks: Sequence[Float], gammas: Sequence[Sequence[Float]], lengths: Sequence[int]) -> Float:
-    """Return the covariance (k, k) of the stacked scores sum_t phi_t e_t of regressions over the same rows.
+    """Return the covariance (k, k) of the stacked scores sum_t phi_t e_t of regressions over the same samples.
 
-    ``blocks`` are regressors (m, k_j) in windows of ``lengths``; ``gammas[a][b]`` (2 H + 1,) is the covariance of
+    ``blocks`` are regressors (m, k_j) of windows of ``lengths``; ``gammas[a][b]`` (2 H + 1,) is the covariance of
     residual a at t with residual b at t + lag, for lags -H to H. The residuals are sensor noise through known filters,
-    so their covariance is known; estimating it from the residuals leaks power that a derivative does not have.
+    so their covariance is known; an estimate from the residuals would leak power that a derivative does not have.
     """
     sizes = np.cumsum([0, *(b.shape[1] for b in blocks)])
     meat = np.zeros((sizes[-1], sizes[-1]))
-    for start, stop in _spans(lengths):
+    stops = np.cumsum(lengths).tolist()
+    for start, stop in zip([0, *stops[:-1]], stops, strict=True):
         for a, left in enumerate(blocks):
             for b, right in enumerate(blocks):
                 pulled = through(right[start:stop], gammas[a][b][::-1])
@@ -38,10 +37,10 @@ def coloured_meat(blocks: Sequence[Float], gammas: Sequence[Sequence[Float]], le
 
 
 def residual_gammas(theta: Float, impulse: Float, slope: Float, noise: Float) -> list[list[Float]]:
-    """Return the covariances of the residuals of [5] (V) and of K times [6] (N.m) that sensor noise causes.
+    """Return the autocovariances of the residuals of [5] (V) and of K times [6] (N.m) due to sensor noise.
 
-    ``theta`` is [L, R, K, Jt, ft, Cd]; ``impulse`` and ``slope`` are what the low-pass, and the operator after it, make
-    of one noisy sample; ``noise`` (3,) are the variances of voltage, current and speed.
+    ``theta`` is [L, R, K, Jt, ft, Cd]; ``impulse`` and ``slope`` are the responses of the low-pass, and of low-pass and
+    derivative, to one sample; ``noise`` (3,) are the variances of voltage, current and speed.
     """
     none = np.zeros_like(impulse)
     electrical = (impulse, -(theta[0] * slope + theta[1] * impulse), -theta[2] * impulse)
@@ -56,35 +55,29 @@ def residual_gammas(theta: Float, impulse: Float, slope: Float, noise: Float) ->
     ]
 
 
-def _spans(lengths: Sequence[int]) -> list[tuple[int, int]]:
-    stops = np.cumsum(lengths).tolist()
-    return list(zip([0, *stops[:-1]], stops, strict=True))
-
-
 def two_step(
     electrical: Float, mechanical: Float, residuals: Sequence[Float], gammas: list[list[Float]], lengths: Sequence[int]
 ) -> Float:
     """Return the covariance (6, 6) of [L, R, K, Jt, ft, Cd] fitted in two steps.
 
-    ``electrical`` (m, 4) is [u, Di, i, w], ``mechanical`` (m, 4) is [i, Dw, w, sign w]; the second step uses K of the
-    first, so the scores of both are stacked. Where residuals are larger than noise explains, the covariance grows.
+    ``electrical`` (m, 4) is [u, Di, i, w], ``mechanical`` (m, 4) is [i, Dw, w, sign w]. The second step uses K of the
+    first, so the scores of both are stacked. Residuals larger than the noise inflate the covariance.
     """
     phi_1, phi_2 = electrical[:, 1:], mechanical[:, 1:]
     expected = [gammas[k][k][gammas[k][k].size // 2] for k in (0, 1)]
     excess = [max(1.0, float(np.mean(e * e) / g)) for e, g in zip(residuals, expected, strict=True)]
     scaled = [[gammas[a][b] * np.sqrt(excess[a] * excess[b]) for b in (0, 1)] for a in (0, 1)]
     bread = _bread(phi_1, phi_2, mechanical[:, 0])
-    covariance: Float = bread @ coloured_meat([phi_1, phi_2], scaled, lengths) @ bread.T
-    return covariance
+    return bread @ coloured_meat([phi_1, phi_2], scaled, lengths) @ bread.T
 
 
 def suspicious(innovations: Float) -> bool:
-    """Return whether innovations (n, 2) are surely neither white nor of even variance along the window."""
+    """Return whether innovations (n, 2) are significantly coloured or of uneven variance along the window."""
     n = innovations.shape[0]
     if n < 4 * TESTED_LAGS:
         return False
     power = (innovations**2).sum(axis=0)
-    size = 1 << (n + TESTED_LAGS).bit_length()  # long enough that no lag wraps round
+    size = 1 << (n + TESTED_LAGS).bit_length()  # zero-padded so that no lag wraps round
     spectrum = np.fft.rfft(innovations, size, axis=0)
     correlations = np.fft.irfft(np.abs(spectrum) ** 2, size, axis=0)[1 : TESTED_LAGS + 1] / power
     shares = np.array([(part**2).mean(axis=0) for part in np.array_split(innovations, VARIANCE_PARTS)]) * n / power
@@ -94,14 +87,13 @@ def suspicious(innovations: Float) -> bool:
 
 
 def robust(information: Float, scores: Sequence[Float], rows: Sequence[tuple[Float, Float]]) -> Float:
-    """Return the covariance (k, k) of a fit with ``information`` (k, k), whose windows have ``scores`` (n, k) by row.
+    """Return the covariance (k, k) of a fit with ``information`` (k, k) whose windows have ``scores`` (n, k) by sample.
 
-    ``rows`` holds, for each window whose voltage comes with its rows, the innovations' slopes (n, 2, k) and those
-    innovations (m, 2) that are sure. The inverse information stands around the variance of the scores, told in two
-    ways. By the scores themselves (Newey and West 1987, with what its own scatter costs after Kiefer and Vogelsang
-    2005): that holds for uneven variance, but of what hangs together over a good part of the window, the fit has taken
-    most away. By an autoregression of the innovations, which lets a colour tell its slow part too. The larger of both
-    counts in every direction, and none is told better than by the information: a lucky sample is not precision.
+    ``rows`` has, for each window whose voltage is sampled with its other signals, the slopes (n, 2, k) of the
+    innovations and the innovations (m, 2) at known friction. The variance of the scores is estimated by the scores
+    (Newey and West 1987, with the cost of its own scatter after Kiefer and Vogelsang 2005), which is blind to
+    correlation over a large part of the window, and by an autoregression of the innovations. The larger counts in every
+    direction, at least the information.
     """
     root = root_of(information)
     power, foretold = np.zeros((2, root.shape[1], root.shape[1]))
@@ -111,23 +103,21 @@ def robust(information: Float, scores: Sequence[Float], rows: Sequence[tuple[Flo
         foretold += _coloured(slopes @ root, _spectrum(innovations, quick_size(2 * len(slopes))))
     share = SUMMED_LAGS / sum(len(own) for own in scores)
     power *= (1.0 + 2.9694 / 1.96 * min(share, 1.0)) ** 2
-    sandwich: Float = root @ larger(foretold, larger(power, np.eye(len(power)))) @ root.T
-    return sandwich
+    return root @ larger(foretold, larger(power, np.eye(len(power)))) @ root.T
 
 
 def summed(scores: Float) -> Float:
-    """Return the variance (k, k) of the sum of ``scores`` (n, k) that hang together, with Bartlett's weights."""
+    """Return the long-run variance (k, k) of the sum of correlated ``scores`` (n, k), with Bartlett's weights."""
     span = min(SUMMED_LAGS, len(scores) // 4) + 1
     sums = np.zeros((len(scores) + 2 * span, scores.shape[1]))
     np.cumsum(scores, axis=0, out=sums[span : span + len(scores)])
     sums[span + len(scores) :] = sums[span + len(scores) - 1]
     moving = sums[span:] - sums[:-span]  # the mean square of moving sums has these weights
-    meat: Float = moving.T @ moving / span
-    return meat
+    return moving.T @ moving / span
 
 
 def _spectrum(innovations: Float, size: int) -> Complex:
-    """Return a root (2, 2, size // 2 + 1) of the spectrum of innovations (n, 2), by an autoregression of few rows."""
+    """Return a root (2, 2, size // 2 + 1) of the spectrum of innovations (n, 2), by a short autoregression."""
     n = len(innovations)
     before = np.hstack([innovations[COLOUR_ROWS - lag : n - lag] for lag in range(1, COLOUR_ROWS + 1)])
     weights, _ = solve(before, innovations[COLOUR_ROWS:])
@@ -154,7 +144,7 @@ def _coloured(slopes: Float, root: Complex) -> Float:
 
 
 def larger(one: Float, other: Float) -> Float:
-    """Return the variance that is, in every direction, the larger of ``one`` and ``other`` (positive), both (k, k)."""
+    """Return the covariance (k, k) that is, in every direction, the larger of two; ``other`` is positive definite."""
     lower = np.linalg.cholesky(other)
     inverse = np.linalg.inv(lower)
     ratios, axes = np.linalg.eigh(inverse @ one @ inverse.T)
@@ -164,10 +154,10 @@ def larger(one: Float, other: Float) -> Float:
 
 
 def aliasing(sampling: VoltageSampling, dt_s: float) -> Float:
-    """Return the relative doubt (6,) of [R, L, K, Jt, ft, Cd] that instants of a switching drive's voltage leave.
+    """Return the relative doubt (6,) of [R, L, K, Jt, ft, Cd] where a switching drive's voltage is sampled at instants.
 
-    Current regulators answer in less than a sample, so an instant taken in step with them is no mean: on the bench, L
-    is 26 to 30 % off, R 3 %, K and Jt 0.2 % at 1 ms, though the model follows the speed as well as ever.
+    Current regulators respond within a sample, so an instant taken in step with them is not a mean: on the bench, L is
+    off by 26 to 30 %, R by 3 %, K and Jt by 0.2 % at 1 ms, although the model fits the speed as well as ever.
     """
     doubt = np.zeros(6)
     if sampling == "instant":
@@ -177,7 +167,6 @@ def aliasing(sampling: VoltageSampling, dt_s: float) -> Float:
 
 
 def _bread(phi_1: Float, phi_2: Float, current: Float) -> Float:
-    """Return the inverse (6, 6) of the stacked normal equations."""
     slope = np.zeros((6, 6))
     slope[:3, :3] = phi_1.T @ phi_1
     slope[3:, 3:] = phi_2.T @ phi_2
@@ -191,10 +180,10 @@ def _bread(phi_1: Float, phi_2: Float, current: Float) -> Float:
 def attenuation(
     electrical: Float, mechanical: Float, theta: Float, impulse: Float, slope: Float, noise: Float
 ) -> Float:
-    """Return the bias (6,) of [L, R, K, Jt, ft, Cd] that noise on the regressors causes, to first order.
+    """Return the bias (6,) of [L, R, K, Jt, ft, Cd] due to noise on the regressors, to first order.
 
-    ``impulse``, ``slope`` and ``noise`` (3,) as in :func:`residual_gammas`. The paper's method does not correct it, so
-    its interval must hold it.
+    ``impulse``, ``slope`` and ``noise`` (3,) are those of the residual autocovariances. The paper's method does not
+    correct this bias, so its interval must include it.
     """
     rows = electrical.shape[0]
     ff, dd, df = (float(a @ b) * rows for a, b in ((impulse, impulse), (slope, slope), (slope, impulse)))
@@ -202,5 +191,4 @@ def attenuation(
     pull[:2, :2] = noise[1] * np.array([[dd, df], [df, ff]])
     pull[2, 2] = noise[2] * ff
     pull[3:5, 3:5] = noise[2] * np.array([[dd, df], [df, ff]])
-    bias: Float = -_bread(electrical[:, 1:], mechanical[:, 1:], mechanical[:, 0]) @ pull @ theta
-    return bias
+    return -_bread(electrical[:, 1:], mechanical[:, 1:], mechanical[:, 0]) @ pull @ theta

@@ -1,11 +1,8 @@
-"""Moves readings of the current to its means where a drive feeds forward a speed that steps at every SYNC.
+"""Corrects current readings to means where a drive feeds forward a speed that steps at every SYNC.
 
-Such a drive differentiates the set-points that it gets: its speed set-point is a stair half a cycle behind the one
-between straight lines, which the measured position shows behind known loops. The current answers each step after the
-instant of its reading. By how much follows from the speed loop that runs along the stair of a constant acceleration.
+Such a speed set-point is a staircase half a cycle late, and the current responds to each step after it was read. The
+difference between reading and mean follows from a simulation of the speed loop on the staircase.
 """
-
-from __future__ import annotations
 
 import math
 from collections.abc import Sequence
@@ -22,27 +19,27 @@ from fdhil.identification.windows import bridged, carried
 from fdhil.model.closed_loop import simulate
 from fdhil.records import Float, Parameters, Window, read_only, rms
 
-SURELY = 0.6  # of what the other replay leaves, at most, for one to be right
-SAME_GRID = 1e-3  # of a row, by which it may differ from the cycle of the set-points
+SURELY = 0.6  # of the other replay's residual: largest of the right one
+SAME_GRID = 1e-3  # of a sample: tolerance of the set-points' cycle
 LEAST_ROWS = 50
-LEFT_OPEN = 0.2  # of what known loops determine: they are known to a tenth or so
+LEFT_OPEN = 0.2  # of what known loops determine: they are known to about a tenth
 SMOOTHING_S = 0.005
-SETTLED, LEAST_CYCLES = 8.0, 16  # time constants of the speed loop, and cycles, until all cycles are alike
+SETTLED, LEAST_CYCLES = 8.0, 16  # time constants of the speed loop, and cycles, until the cycles repeat
 
 
 def with_current_means(
     windows: Sequence[Window], settings: Identification, axis: Axis | None, sync_period_s: float | None
 ) -> Sequence[Window]:
-    """Return the windows of one drive with their current's means, where the ``axis``' loops show that its speed steps.
+    """Return the windows of one drive with mean currents, where a replay of the ``axis``' loops shows a stepping speed.
 
-    The first window decides for all: where its replay is far better without steps, readings are as good as means.
-    Where no loops are known, or the replay does not decide, all is left as it is.
+    The first window decides for all. Where the replay without steps is far better, readings serve as means. Where no
+    loops are known, or the replay is inconclusive, the windows are returned unchanged.
     """
     if axis is None or not windows or windows[0].slow_voltage is not None or windows[0].current_off_a is not None:
         return windows
     plain, stepped = _left_mm(windows[0], settings, axis, sync_period_s)
     if plain < SURELY * stepped and windows[0].dt_s < STEPPED_ROW_S:
-        return windows  # there is no doubt to take away
+        return windows  # no doubt to remove
     if plain < SURELY * stepped:
         return [replace(w, current_off_a=read_only(np.zeros(w.n))) for w in windows]
     if not stepped < SURELY * plain:
@@ -52,7 +49,7 @@ def with_current_means(
 
 
 def _left_mm(window: Window, settings: Identification, axis: Axis, sync_period_s: float | None) -> tuple[float, float]:
-    """Return the RMS (mm) that replays without and with steps leave; NaN where nothing can be compared."""
+    """Return the RMS residuals (mm) of replays without and with steps; NaN where nothing can be compared."""
     unknown = (math.nan, math.nan)
     if abs((sync_period_s or window.dt_s) / window.dt_s - 1.0) > SAME_GRID:
         return unknown
@@ -74,7 +71,7 @@ def _left_mm(window: Window, settings: Identification, axis: Axis, sync_period_s
 
 
 def _moved(window: Window, lag: float) -> Window:
-    """Return the window with ``lag`` (A per rad/s^2) times its acceleration added to its readings of the current."""
+    """Return the window with ``lag`` (A per rad/s^2) times its acceleration added to its current readings."""
     width = 2 * round(SMOOTHING_S / window.dt_s / 2) + 1
     beyond = lag * np.gradient(moving_mean(carried(window.speed_rad_s), width), window.dt_s)
     return replace(
@@ -87,8 +84,8 @@ def _moved(window: Window, lag: float) -> Window:
 def reading_lag(axis: Axis, sync_period_s: float) -> float:
     """Return by how much readings at SYNC are below the mean current, A per rad/s^2 of acceleration.
 
-    The regulators of speed and current run along a stair of one unit until every cycle is as the one before. The speed
-    loop takes the mean speed of its last period; the current loop is a lag of L over its gain.
+    Simulates the speed and current loops on a staircase of unit acceleration until the cycles repeat. The speed loop
+    uses the mean speed of its last period; the current loop is a first-order lag of L over its gain.
     """
     g, p = axis.regulators, axis.nominal
     every = max(1, round(g.speed_period_s / g.current_period_s))

@@ -1,6 +1,4 @@
-"""Finds the delay of the voltage against current and speed: whole rows from [1], less from innovations."""
-
-from __future__ import annotations
+"""Estimates the delay of the voltage against current and speed: whole samples from [1], fractions from innovations."""
 
 from dataclasses import replace
 
@@ -15,19 +13,20 @@ from fdhil.identification.terms import WHOLE_DEAD_TIME
 from fdhil.records import Float
 
 SPAN_S = 0.025
-# times that the power left must fall before a delay of whole rows is accepted: no voltage is early, but what the model
-# lacks of inverter and winding looks so
+# factors by which the residual power must fall before a delay of whole samples is accepted: a voltage is never early,
+# but unmodelled effects of inverter and winding look like it
 LATER, EARLIER = 1.5, 9.0
-MOST_DELAY = 2.5  # rows, two with rounding: what resembles a longer delay, and is none of whole rows, is none
-LEAST_DELAY = 0.05  # of a row; a smaller delay cannot be told from the voltage's course within a row
-CHANCE = 2.0  # standard deviations of a delay that are chance, not doubt
+MOST_DELAY = 2.5  # samples, two with rounding: a longer delay would be one of whole samples
+LEAST_DELAY = 0.05  # of a sample; a smaller delay cannot be distinguished from the voltage's waveform
+CHANCE = 2.0  # standard deviations of a delay due to chance
 
 
 def coarse_delay(signals: Signals, dt_s: float) -> float:
-    """Return by how many seconds, in whole samples, the voltage is late (early: negative); 0 unless it surely is.
+    """Return the delay of the voltage in s, in whole samples (negative: early); 0 unless it is significant.
 
-    [5], with what an inverter's dead time takes, is fitted with the voltage moved by each number of samples; the best
-    fit tells. Up to ``MOST_DELAY`` a delay is the business of the maximum-likelihood fit: other things resemble it.
+    [5], with a term for the inverter's dead time, is fitted with the voltage shifted by each number of samples; the
+    best fit wins. Delays up to ``MOST_DELAY`` are left to the maximum-likelihood fit, because other effects resemble
+    them.
     """
     reach = min(max(3, round(SPAN_S / dt_s)), signals.speed.size // 8)
     slope = derivative(signals.current, dt_s)
@@ -50,7 +49,7 @@ def coarse_delay(signals: Signals, dt_s: float) -> float:
 
 
 def delay_score(plain: Fit) -> tuple[float, float]:
-    """Return the delay (s) that one Newton step from a fit without delay would add, and its standard deviation."""
+    """Return the delay (s) that one Newton step would add to a fit without delay, and its standard deviation."""
     d = delay_direction(plain)
     rest = d - plain.but_delay @ solve(plain.but_delay, d)[0]
     weight = float(rest @ rest)
@@ -65,15 +64,16 @@ def delay_direction(result: Fit) -> Float:
     return jacobian(result.problem, result.theta, result.residuals, [DELAY], sizes)[:, 0]
 
 
-def with_delay_doubt(made: Fit) -> Fit:
+def with_delay_doubt(fitted: Fit) -> Fit:
     """Return the fit with its doubt about a delay of the voltage.
 
-    Regulators act several times within a row, which looks like a delay of a few per cent of it, but moves L
-    otherwise. So a small delay is not taken out: what it would change is a doubt, and so it is about a larger one.
+    Regulators act several times within a sample. That resembles a delay of a few per cent of it, but shifts L
+    differently. A small delay is therefore not corrected: its effect counts as a doubt, and likewise the uncertainty of
+    a larger one.
     """
-    if DELAY in made.free:
-        return replace(made, delay_doubt_s=LEAST_DELAY / 2 * min(m.dt_s for m in made.problem.motions))
-    if not (made.converged and np.isfinite(made.residuals).all()):
-        return made
-    delay, std = delay_score(made)
-    return replace(made, delay_doubt_s=float(np.sqrt(max(0.0, delay**2 - (CHANCE * std) ** 2))))
+    if DELAY in fitted.free:
+        return replace(fitted, delay_doubt_s=LEAST_DELAY / 2 * min(m.dt_s for m in fitted.problem.motions))
+    if not (fitted.converged and np.isfinite(fitted.residuals).all()):
+        return fitted
+    delay, std = delay_score(fitted)
+    return replace(fitted, delay_doubt_s=float(np.sqrt(max(0.0, delay**2 - (CHANCE * std) ** 2))))

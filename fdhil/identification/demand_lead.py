@@ -1,10 +1,8 @@
-"""Finds by how many whole cycles a recorded set-point is ahead of the one that the drive follows.
+"""Estimates by how many whole cycles a recorded set-point leads the one that the drive follows.
 
-What an NC's trace shows is its own set-point, some cycles before the drive's. Taken for the drive's, it gives wrong
-gains and filters that are not there.
+An NC's trace shows the NC's own set-point, some cycles before the drive's. Taken for the drive's, it yields wrong gains
+and filters that do not exist.
 """
-
-from __future__ import annotations
 
 from dataclasses import replace
 
@@ -15,19 +13,17 @@ from fdhil.identification.windows import bridged
 from fdhil.model.closed_loop import simulate
 from fdhil.records import Float, Parameters, Window, read_only, rms
 
-LEAST_FEEDFORWARD = 0.5  # with less, a lag at constant speed is that of the position loop
-WHOLE = 0.3  # of a cycle, by which a lead may miss a whole number
-EXPLAINED = (
-    0.003  # of what was left, at most, when the lead is taken out: with a filter or less feed-forward it is more
-)
+LEAST_FEEDFORWARD = 0.5  # with less, the lag at constant speed is the position loop's
+WHOLE = 0.3  # of a cycle: tolerance of a whole lead
+EXPLAINED = 0.003  # largest share of the residual that remains without the lead; more with a filter
 MOST = 32  # cycles
 LEAST_ROWS, SAME_GRID = 50, 1e-3
 
 
 def with_demand_on_time(window: Window, axis: Axis | None, sync_period_s: float | None) -> tuple[Window, int]:
-    """Return the window with the demand that the drive follows, and by how many cycles the recorded one is ahead.
+    """Return the window with the demand that the drive follows, and the lead of the recorded one in cycles.
 
-    The closed loop of the ``axis``' section tells it; the window itself and 0 where there is no lead.
+    The lead is estimated with the closed loop of the ``axis``' section; without a lead the window is returned with 0.
     """
     if axis is None or axis.regulators.speed_feedforward < LEAST_FEEDFORWARD:
         return window, 0
@@ -41,7 +37,7 @@ def with_demand_on_time(window: Window, axis: Axis | None, sync_period_s: float 
 
 
 def _lead(window: Window, axis: Axis, sync_period_s: float | None) -> tuple[float, float]:
-    """Return by how many cycles the demand is ahead, and the RMS (mm) that the closed loop leaves; 0 where unknown."""
+    """Return the lead of the demand in cycles and the RMS residual (mm) of the closed loop; 0 where unknown."""
     known = np.isfinite(window.demand_mm) & np.isfinite(window.position_mm)
     off_grid = abs((sync_period_s or window.dt_s) / window.dt_s - 1.0) > SAME_GRID
     if off_grid or np.count_nonzero(known) < LEAST_ROWS or not np.ptp(window.demand_mm[known]) > 0.0:
@@ -50,7 +46,7 @@ def _lead(window: Window, axis: Axis, sync_period_s: float | None) -> tuple[floa
     offset = None if window.offset_mm is None else np.nan_to_num(window.offset_mm)
     moved = simulate(Parameters(**axis.nominal.model_dump()), axis, window.dt_s, demand, offset).position_mm
     ahead = (moved - moved[0] - position + position[0])[known]
-    way = np.gradient(position)[known]  # in a cycle
+    way = np.gradient(position)[known]  # travel in a cycle
     power = float(way @ way)
     if not (power > 0.0 and np.isfinite(ahead).all()):
         return 0.0, 0.0

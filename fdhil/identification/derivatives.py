@@ -1,7 +1,5 @@
 """Differentiates by stencils: Dx(t) = 1/h sum_j b_j x(t + j h). Operator [4] of [DES] is zero forcing #1."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -14,7 +12,7 @@ _ROOT = math.sqrt(73.0)
 
 @dataclass(frozen=True, slots=True)
 class Operator:
-    """A derivative stencil: ``offsets`` in samples (rising) and ``weights``, before division by the sampling period."""
+    """A derivative stencil: ascending ``offsets`` in samples, and ``weights`` before division by the period."""
 
     name: str
     offsets: tuple[int, ...]
@@ -22,12 +20,12 @@ class Operator:
 
     @property
     def before(self) -> int:
-        """Rows that the stencil needs before its own."""
+        """Samples needed before the current one."""
         return max(0, -self.offsets[0])
 
     @property
     def after(self) -> int:
-        """Rows that the stencil needs after its own."""
+        """Samples needed after the current one."""
         return max(0, self.offsets[-1])
 
 

@@ -1,12 +1,7 @@
-"""Follows the parameters from rapid to rapid: jumps held back, a changed load, maintenance alarms.
+"""Tracks the parameters from rapid to rapid: holds back jumps, reports a changed load, raises maintenance alarms.
 
-One rapid tells the friction of its own direction, with a constant load in it: friction is compared in either direction
-by itself.
-
-Pure: the same estimates in the same order give the same notices. Nothing here reads a clock.
+Friction, which includes a constant load, is compared per direction. Pure: without a clock.
 """
-
-from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
@@ -23,11 +18,11 @@ LEAST_HISTORY = 3
 BEYOND_CHANCE = 5.0
 HELD_EPISODES = 2
 AGREEING = 2
-SURELY = 2.0  # standard deviations by which a change must be beyond its limit
-RELEASE = 0.8  # an alarm is released when the change has fallen to this share of its limit
-RELEASING = 4  # estimates whose mean releases an alarm
+SURELY = 2.0  # standard deviations by which a change must exceed its limit
+RELEASE = 0.8  # an alarm is cleared when the change has fallen to this share of its limit
+RELEASING = 4  # estimates whose mean clears an alarm
 FRICTION = ("ft", "Cd")
-# changes smaller than these are drift, not a jump, however sure the estimates are
+# smaller changes are drift, not a jump, however narrow the intervals are
 LEAST_JUMP: Mapping[str, float] = {"R": 0.05, "L": 0.08, "K": 0.03, "Jt": 0.03, "ft": 0.40, "Cd": 0.25}
 
 
@@ -43,7 +38,7 @@ class Point:
 
 @dataclass(slots=True)
 class DriftTracker:
-    """The history of one axis' parameters: says what an operator should know after each validated window or pool."""
+    """The parameter history of one axis; turns each validated window or pool into notices for the operator."""
 
     maintenance: Maintenance
     axis: str = ""
@@ -53,10 +48,11 @@ class DriftTracker:
     _held: list[Point] = field(default_factory=list)
 
     def update(self, values: Parameters, covariance: Float, tick: int = 0, direction: int = 1) -> list[Notice]:
-        """Take a validated estimate of a move in a ``direction``, with its covariance; return what is to be said.
+        """Add a validated estimate of a move in one ``direction`` with its covariance; return the notices.
 
-        ``ParameterJump`` holds the estimate back for ``HELD_EPISODES`` further ones; a step of Jt alone is
-        ``LoadChanged``: the correction must be withdrawn at once, and the new Jt is used from the second agreeing one.
+        ``ParameterJump`` holds the estimate back for ``HELD_EPISODES`` further ones. A step of Jt alone is
+        ``LoadChanged``: the correction must be withdrawn at once, and the new Jt is used after the second estimate that
+        agrees.
         """
         stds = np.sqrt(np.clip(np.diag(covariance)[: len(PARAMETERS)], 0.0, None))
         point = Point(np.array(list(values.as_dict().values())), stds, tick, direction)
@@ -69,9 +65,9 @@ class DriftTracker:
         return self._hold(point, moved)
 
     def resume(self, first: Mapping[int, Parameters], points: Iterable[Point]) -> None:
-        """Go on where an earlier run left off: an alarm that its ``points`` raised is not raised again.
+        """Continue after a restart without repeating alarms that the stored ``points`` had raised.
 
-        ``first`` are the first values in either direction, against which changes count.
+        ``first`` are the first values of either direction, the reference for changes.
         """
         self.references = dict(first)
         for point in points:
@@ -81,17 +77,16 @@ class DriftTracker:
 
     @property
     def holding(self) -> bool:
-        """Return whether the newest estimate is held back: it must not be used yet."""
+        """Whether the newest estimate is held back and must not be used yet."""
         return bool(self._held)
 
     def _recent(self, direction: int) -> list[list[Point]]:
-        """Return for each parameter the points that a new one is compared with: of friction those of its direction."""
         points = list(self.points)
         same = [point for point in points if point.direction == direction][-RECENT:]
         return [same if name in FRICTION else points[-RECENT:] for name in PARAMETERS]
 
     def _moved(self, point: Point) -> list[str]:
-        """Return the parameters that lie beyond chance and drift from the recent history (median and MAD)."""
+        """Return the parameters that differ from the recent history by more than chance and drift (median and MAD)."""
         moved = []
         for k, (name, recent) in enumerate(zip(PARAMETERS, self._recent(point.direction), strict=True)):
             if len(recent) < LEAST_HISTORY:
@@ -128,8 +123,8 @@ class DriftTracker:
 
     @staticmethod
     def _agree(one: Point, other: Point) -> bool:
-        alike = one.direction == other.direction
-        rows = [k for k, name in enumerate(PARAMETERS) if alike or name not in FRICTION]
+        same_direction = one.direction == other.direction
+        rows = [k for k, name in enumerate(PARAMETERS) if same_direction or name not in FRICTION]
         chance = BEYOND_CHANCE * np.sqrt(one.stds**2 + other.stds**2)
         least = np.array([LEAST_JUMP[name] for name in PARAMETERS]) * np.abs(one.values)
         return bool((np.abs(one.values - other.values) <= np.maximum(chance, least))[rows].all())
@@ -137,7 +132,8 @@ class DriftTracker:
     def _alarms(self, point: Point) -> list[Notice]:
         """Return maintenance alarms that begin or end: relative change from the first value, with hysteresis.
 
-        One sure window begins an alarm; it takes the mean of the newest, surely below ``RELEASE``, to end it.
+        One significant window raises an alarm; it is cleared when the mean of the newest is significantly below
+        ``RELEASE``.
         """
         notices = []
         for k, (name, first) in enumerate(self.references[point.direction].as_dict().items()):
@@ -147,7 +143,7 @@ class DriftTracker:
             change, doubt = abs(point.values[k] - first) / abs(first), SURELY * point.stds[k] / abs(first)
             if name not in self.alarms and change - doubt > limit:
                 self.alarms.add(name)
-                moved = f"{name} has moved by {100 * change:.0f} % to {point.values[k]:.4g} {UNITS[name]}"
+                moved = f"{name} has changed by {100 * change:.0f} % to {point.values[k]:.4g} {UNITS[name]}"
                 text = f"{moved}, limit {100 * limit:.0f} %"
                 notices.append(Notice("MaintenanceDue", "minor", text, self.axis, point.tick))
             elif name in self.alarms and self._released(k, limit):
@@ -167,6 +163,5 @@ class DriftTracker:
         return abs(float(np.mean(shares)) - 1) + doubt < RELEASE * limit
 
     def _measured(self, point: Point, k: int) -> bool:
-        """Return whether a point's parameter has a first value that it may be measured against."""
         first = self.references.get(point.direction)
         return first is not None and bool(list(first.as_dict().values())[k])

@@ -1,10 +1,8 @@
-"""Filters without moving anything in time: the paper's low-pass, and averages about each row.
+"""Filters without phase shift: the paper's low-pass, and centred averages.
 
-The same low-pass on every signal keeps the identification unbiased ([DES] eq. 8). They are a few lines of numpy: the
-library that has them as well takes a second to import, which the daemon's start cannot spare.
+The same low-pass on every signal keeps the identification unbiased ([DES] eq. 8). It is written in numpy, because
+importing scipy.signal takes a second, too long for the daemon's start.
 """
-
-from __future__ import annotations
 
 from functools import lru_cache
 
@@ -14,14 +12,14 @@ from fdhil.records import Bool, Float
 
 ORDER = 4
 REACH_SHARE = 0.01
-SPAN_PERIODS = 6  # of the corner's period: beyond it the impulse response is nil
+SPAN_PERIODS = 6  # of the corner's period: beyond it the impulse response is negligible
 PADDING_PERIODS = 3
 
 
 def zero_phase(values: Float, lowpass_hz: float, dt_s: float) -> Float:
     """Return ``values`` (..., n) through a Butterworth low-pass run forward and backward: no delay, squared gain.
 
-    The ends are continued by their own point reflection, as is usual for a filter run both ways.
+    The ends are extended by odd reflection, as usual for forward-backward filters.
     """
     n = values.shape[-1]
     pad = min(n - 1, round(PADDING_PERIODS / lowpass_hz / dt_s))
@@ -32,12 +30,11 @@ def zero_phase(values: Float, lowpass_hz: float, dt_s: float) -> Float:
     extended = np.concatenate([before, values, after], axis=-1)
     size = quick_size(extended.shape[-1])
     spectrum = np.fft.rfft(_lengthened(extended, size)) * _gain(size, lowpass_hz, dt_s)
-    filtered: Float = np.fft.irfft(spectrum, size)[..., pad : pad + n]
-    return filtered
+    return np.fft.irfft(spectrum, size)[..., pad : pad + n]
 
 
 def _lengthened(values: Float, size: int) -> Float:
-    """Return ``values`` (..., m) led on to ``size`` by a line back to their begin: the transform goes round."""
+    """Return ``values`` (..., m) extended to ``size`` by a line back to the first value: the FFT is periodic."""
     missing = size - values.shape[-1]
     share = np.linspace(0.0, 1.0, missing + 2)[1:-1]
     bridge = values[..., -1:] * (1.0 - share) + values[..., :1] * share
@@ -46,7 +43,7 @@ def _lengthened(values: Float, size: int) -> Float:
 
 @lru_cache(maxsize=256)
 def quick_size(least: int) -> int:
-    """Return the smallest size from ``least`` on of which a transform is quick: no prime factor above 5."""
+    """Return the smallest fast FFT size of at least ``least``: no prime factor above 5."""
     size = least
     while True:
         rest = size
@@ -60,7 +57,6 @@ def quick_size(least: int) -> int:
 
 @lru_cache(maxsize=64)
 def _gain(size: int, lowpass_hz: float, dt_s: float) -> Float:
-    """Return the gain at the frequencies of a real transform of ``size`` rows: a Butterworth's, squared."""
     corner = np.tan(np.pi * min(lowpass_hz * dt_s, 0.475))
     # the bilinear transform's frequency axis; at the highest one the gain is 0
     axis = np.tan(np.minimum(np.pi * np.fft.rfftfreq(size), np.pi / 2 * (1 - 1e-9)))
@@ -70,16 +66,15 @@ def _gain(size: int, lowpass_hz: float, dt_s: float) -> Float:
 
 @lru_cache(maxsize=32)
 def impulse_response(lowpass_hz: float, dt_s: float) -> Float:
-    """Return what the low-pass makes of one sample, centred (odd length)."""
+    """Return the centred impulse response of the low-pass (odd length)."""
     half = max(8, round(SPAN_PERIODS / lowpass_hz / dt_s))
     size = 2 * half + 1
-    response: Float = np.roll(np.fft.irfft(_gain(size, lowpass_hz, dt_s), size), half)
-    return response
+    return np.roll(np.fft.irfft(_gain(size, lowpass_hz, dt_s), size), half)
 
 
 @lru_cache(maxsize=32)
 def reach(lowpass_hz: float, dt_s: float) -> int:
-    """Return how many rows to either side the filter mixes into one: beyond it lies 1 % of its impulse response."""
+    """Return the half width of the low-pass in samples: 1 % of its impulse response lies beyond."""
     answer = np.abs(impulse_response(lowpass_hz, dt_s))
     half = answer.size // 2
     beyond = answer[half:][::-1].cumsum()[::-1] * 2 - answer[half]
@@ -87,7 +82,7 @@ def reach(lowpass_hz: float, dt_s: float) -> int:
 
 
 def moving_mean(values: Float, width: int) -> Float:
-    """Return the mean (n,) over ``width`` (odd) rows about each row; the ends are continued by their last value."""
+    """Return the centred mean (n,) over ``width`` (odd) samples; the end values are repeated beyond the ends."""
     if width <= 1 or values.size == 0:
         return values.copy()
     half = width // 2
@@ -96,7 +91,7 @@ def moving_mean(values: Float, width: int) -> Float:
 
 
 def all_about(flags: Bool, width: int, beyond: bool) -> Bool:
-    """Return where (n,) all ``width`` (odd) rows about a row are set; rows past the ends count as ``beyond``."""
+    """Return where (n,) all ``width`` (odd) samples around one are set; samples beyond the ends count as ``beyond``."""
     half = width // 2
     ends = np.full(half, beyond)
     missing = np.concatenate([[0], np.cumsum(~np.concatenate([ends, flags, ends]))])
@@ -105,9 +100,8 @@ def all_about(flags: Bool, width: int, beyond: bool) -> Bool:
 
 
 def through(columns: Float, kernel: Float) -> Float:
-    """Return each column (m, k) convolved with ``kernel`` (odd length), centred on its rows."""
+    """Return each column (m, k) convolved with a centred ``kernel`` (odd length)."""
     rows, half = columns.shape[0], kernel.size // 2
     size = quick_size(rows + kernel.size - 1)
     spectrum = np.fft.rfft(columns, size, axis=0) * np.fft.rfft(kernel, size)[:, None]
-    passed: Float = np.fft.irfft(spectrum, size, axis=0)[half : half + rows]
-    return passed
+    return np.fft.irfft(spectrum, size, axis=0)[half : half + rows]

@@ -1,10 +1,8 @@
-"""Fits windows ready to be fitted: Gauss-Newton on the whitened innovations, alternated with the noise levels.
+"""Fits prepared windows: Gauss-Newton on the whitened innovations, alternated with the noise levels.
 
-The entries of theta are [R, L, K, Jt, ft, Cd, delay], then one for each course that the motions have: a torque or a
-voltage in which the innovations are linear, for a term that joined the six.
+The entries of theta are [R, L, K, Jt, ft, Cd, delay], then one for each term of the motions: a torque or a voltage in
+which the innovations are linear.
 """
-
-from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -25,31 +23,30 @@ from fdhil.records import Float
 RENEWALS = 3
 STEPS = 16
 CONVERGED = 1e-3  # of a standard deviation
-ROUGH = 0.3  # of a standard deviation: near enough to tell the noise levels
-KEPT = 0.2  # of the step before: as long as steps shorten by more, their jacobian is good enough
-SLACK = 1e-6  # of the squares' sum, by which a step may miss the bottom
+ROUGH = 0.3  # of a standard deviation: near enough to estimate the noise levels
+KEPT = 0.2  # of the step before: while steps shorten faster, the jacobian is reused
+SLACK = 1e-6  # of the sum of squares, by which a step may miss the minimum
 DIFFERENCE = 1e-5
 DELAY_DIFFERENCE_S = 1e-5
-SHAPE_DOUBT = 1.5  # of the back-EMF's ramp within a sample: one standard deviation of the voltage's course
-SETTLED = 0.25  # squared standard deviations moved: for less, no noise level changes by a thousandth
+SHAPE_DOUBT = 1.5  # of the back-EMF's ramp within a sample: one standard deviation of the voltage's waveform
+SETTLED = 0.25  # squared standard deviations: smaller moves change no noise level by a thousandth
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Windows ready to be fitted: each with its noise levels and, for the parameters they were made for, its filter."""
+    """Prepared windows, each with its noise levels and the filter made for the parameters."""
 
     motions: tuple[Motion, ...]
     noises: tuple[Noise, ...]
     filters: tuple[Gains, ...]
 
     def residuals(self, theta: Float) -> Float:
-        """Return the whitened innovations (m,) of all windows, each by the filter that is right for ``theta`` (k,)."""
-        column: Float = self.columns(theta[None])[:, 0]
-        return column
+        """Return the whitened innovations (m,) of all windows, with the filter matched to ``theta`` (k,)."""
+        return self.columns(theta[None])[:, 0]
 
     @property
     def slow(self) -> bool:
-        """Whether the voltage comes more slowly than the drive's rows."""
+        """Whether the voltage is sampled more slowly than the drive's signals."""
         return any(m.slow is not None for m in self.motions)
 
     def columns(self, thetas: Float) -> Float:
@@ -59,24 +56,24 @@ class Problem:
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def shape_effect(self, theta: Float) -> Float:
-        """Return how the innovations (m,) change with what is not known of the voltage's course within its samples."""
+        """Return the change (m,) of the innovations due to the unknown waveform of the voltage within its samples."""
         if self.slow:
             pairs = zip(self.motions, self.noises, strict=True)
             return np.concatenate([course_effect(m, theta, s.vector() ** 2) for m, s in pairs])
         return self._all(theta, 1.0 + SHAPE_DOUBT) - self._all(theta, 1.0)
 
     def answer(self, theta: Float, courses: Sequence[Sequence[Course]]) -> Float:
-        """Return minus the change (m, q) of innovations with each of ``courses``, of which every window has its (q,).
+        """Return minus the change (m, q) of the innovations with each of ``courses``, (q,) for every window.
 
-        They are linear in them: one filter tells all.
+        The innovations are linear in them, so one filter serves all.
         """
         parts = zip(self.motions, self.noises, courses, strict=True)
         return np.concatenate([-_answered(m, theta, s, own) for m, s, own in parts])
 
     def course_effects(self, theta: Float) -> Float:
-        """Return how the innovations (m, c) change with one deviation of each thing not known of the voltage's course.
+        """Return the change (m, c) of the innovations with one deviation of each unknown of the voltage's waveform.
 
-        The first is :meth:`shape_effect`; in long rows the regulators' part has one of its own.
+        The first is the shape effect; in long samples the regulators' part has its own column.
         """
         shape = self.shape_effect(theta)[:, None]
         if any(m.within is None for m in self.motions):
@@ -91,11 +88,10 @@ class Problem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """The end of a fit: ``theta`` (7 + terms,), information (k, k) of the ``free`` entries, innovations (m,), noises.
+    """A finished fit: ``theta`` (7 + terms,), information (k, k) of the ``free`` entries, innovations (m,), noises.
 
-    ``delay_doubt_s`` is how much of a delay may be the voltage's course within its samples, or the other way round.
-    ``prior`` (k,) is what of the information on the diagonal was known before the data, and ``prior_std`` (k,) how far
-    that may be off; no rows: nothing was.
+    ``delay_doubt_s`` is the part of a delay that may be waveform within samples, or the reverse. ``prior`` (k,) is the
+    information known beforehand, on the diagonal, and ``prior_std`` (k,) its standard deviation; empty: none.
     """
 
     theta: Float
@@ -114,16 +110,16 @@ class Fit:
         """The jacobian (m, k) without the delay's column."""
         if DELAY not in self.free:
             return self.jacobian
-        at = self.free.index(DELAY)  # a slice is no copy, and keeps the order in memory, and with it the last bit
+        at = self.free.index(DELAY)  # a slice keeps the order in memory, and with it the last bit
         before, after = self.jacobian[:, :at], self.jacobian[:, at + 1 :]
         return np.column_stack([before, after]) if after.size else before
 
     def by_window(self, values: Float) -> list[Float]:
-        """Return ``values`` (m, ...) of all innovations in parts, one for each window."""
+        """Return ``values`` (m, ...) of all innovations split by window."""
         return np.split(values, np.cumsum([2 * m.n + m.samples for m in self.problem.motions])[:-1])
 
     def by_equation(self) -> dict[str, Float]:
-        """Return the innovations of [5], of the current or the samples of a slow voltage, and of [6], the speed's."""
+        """Return the innovations of [5], of the current or of a low-rate voltage, and of [6], the speed's."""
         pairs = list(zip(self.problem.motions, self.by_window(self.residuals), strict=True))
         return {
             "electrical": np.concatenate([e[2 * m.n :] if m.slow is not None else e[0::2] for m, e in pairs]),
@@ -162,7 +158,6 @@ def jacobian(problem: Problem, theta: Float, base: Float, free: Sequence[int], s
 
 
 def _answered(motion: Motion, theta: Float, noise: Noise, courses: Sequence[Course]) -> Float:
-    """Return the change (m, q) of a window's innovations with each course."""
     if motion.slow is not None:
         variances = noise.vector() ** 2
         base = innovations_of(motion, theta, variances).whitened
@@ -185,7 +180,7 @@ def _slow_answered(motion: Motion, theta: Float, variances: Float, course: Cours
 
 
 def typical(theta: Float, motions: Sequence[Motion]) -> Float:
-    """Return the typical size (k,) of each entry: friction is measured against the torque and speed there are."""
+    """Return the typical size (k,) of each entry; friction is sized by the torque and speed of the windows."""
     torque = abs(theta[K]) * max(float(np.abs(m.current).max()) for m in motions)
     speed = max(float(np.abs(m.speed).max()) for m in motions)
     sizes = np.abs(theta)
@@ -198,10 +193,10 @@ def typical(theta: Float, motions: Sequence[Motion]) -> Float:
 def descend(
     problem: Problem, theta: Float, free: Sequence[int], enough: float = CONVERGED
 ) -> tuple[Float, Float, Float, bool]:
-    """Take Gauss-Newton steps until one is below ``enough`` standard deviations.
+    """Run Gauss-Newton until a step is below ``enough`` standard deviations.
 
-    Return theta, innovations (m,), jacobian (m, k), and success. The jacobian hardly changes near the bottom, and costs
-    as much as all else: it is kept while each step is much shorter than the one before.
+    Return theta, innovations (m,), jacobian (m, k), and success. The jacobian is the expensive part and hardly changes
+    near the minimum: it is reused while each step is much shorter than the one before.
     """
     residuals = problem.residuals(theta)
     last, j, inverse, norms = 0.0, *_slopes(problem, theta, residuals, free)
@@ -225,7 +220,7 @@ def descend(
                     break
             share *= 0.5
         else:
-            return theta, residuals, j, True  # nothing lower along the step: this is the bottom, to rounding
+            return theta, residuals, j, True  # nothing lower along the step: the minimum, to rounding
         if size < enough:
             return theta, residuals, j, True
         last = size
@@ -240,7 +235,7 @@ def _slopes(problem: Problem, theta: Float, residuals: Float, free: Sequence[int
 
 
 def fit(motions: Sequence[Motion], start: Float, free: Sequence[int], known: Sequence[Noise] = ()) -> Fit:
-    """Alternate between the parameters and the noise levels, from ``start`` (k,) and the ``known`` levels of a fit."""
+    """Alternate between parameters and noise levels, from ``start`` (k,) and the ``known`` levels of an earlier fit."""
     theta, noises = start.copy(), list(known) or [m.noise for m in motions]
     for turn in range(RENEWALS):
         problem = Problem(tuple(motions), tuple(noises), ())

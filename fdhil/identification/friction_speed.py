@@ -1,6 +1,4 @@
-"""Finds the speed at which friction falls off, from the nearest on the grid: Gauss-Newton beside all that is free."""
-
-from __future__ import annotations
+"""Refines the Stribeck speed from the nearest one on the grid: Gauss-Newton jointly with all free entries."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,16 +13,16 @@ from fdhil.identification.terms import SPEEDS, stribeck, stribeck_slope
 from fdhil.records import Float
 
 TURNS = 3
-SPREAD = 0.5  # of the speed: what is known of it beforehand
-ENOUGH = 0.2  # deviations of the speed, by which a step may miss it
-BEYOND = 1.25  # times, by which it may lie beyond the grid
-MOST = 1.6  # times: a step beyond the neighbours on the grid is none of a straight line
+SPREAD = 0.5  # of the speed: its prior
+ENOUGH = 0.2  # standard deviations: smaller steps end the search
+BEYOND = 1.25  # factor by which it may lie beyond the grid
+MOST = 1.6  # factor: longer steps would leave the linear range
 
 
 def marginal(result: Fit, courses: Sequence[Sequence[Course]], prior: float) -> tuple[float, float, Float]:
-    """Return step and deviation of an amplitude beside all that is free, and what the latter makes of free entries.
+    """Return step and standard deviation of an amplitude given all free entries, and its effect on those entries.
 
-    ``courses`` has one course for each window, ``prior`` is the information about it that the data do not hold.
+    ``courses`` has one regressor for each window, ``prior`` is information about the amplitude from outside the data.
     """
     direction = result.problem.answer(result.theta, courses)[:, 0]
     shares = inverse_of(result.information)[0] @ (result.jacobian.T @ direction)
@@ -34,19 +32,19 @@ def marginal(result: Fit, courses: Sequence[Sequence[Course]], prior: float) -> 
 
 
 def place(motions: Sequence[Motion]) -> int | None:
-    """Return where friction at low speed stands among the courses, None where it did not join."""
+    """Return the index of the Stribeck term among the terms; None without one."""
     return next((k for k, course in enumerate(motions[0].courses) if course.name == "stribeck"), None)
 
 
 def slope(result: Fit, k: int) -> tuple[list[list[Course]], float]:
-    """Return how that friction changes with its speed in each window, N.m per rad/s, and the prior information."""
+    """Return the derivative of Stribeck friction by its speed, N.m per rad/s, by window, and the prior information."""
     size, speed = float(result.theta[DELAY + 1 + k]), result.problem.motions[0].courses[k].speed_rad_s
     made = [stribeck_slope(m, m.courses[k]) for m in result.problem.motions]
     return [[replace(course, values=course.values * size)] for course in made], (SPREAD * speed) ** -2
 
 
 def sharpened(result: Fit) -> Fit:
-    """Return the fit with friction at low speed at the speed that explains most; itself without such friction."""
+    """Return the fit with the Stribeck speed that explains most; the fit itself without a Stribeck term."""
     k = place(result.problem.motions)
     if k is None:
         return result
@@ -69,7 +67,7 @@ def sharpened(result: Fit) -> Fit:
 
 
 def untold(motions: Sequence[Motion]) -> bool:
-    """Return whether friction at low speed has joined at a speed that rows do not tell."""
+    """Return whether the Stribeck speed lies outside the range that the samples determine."""
     k = place(motions)
     if k is None:
         return False
@@ -78,13 +76,12 @@ def untold(motions: Sequence[Motion]) -> bool:
 
 
 def _told(motions: Sequence[Motion]) -> tuple[float, float]:
-    """Return the least and the largest speed that rows tell: below it none moves so slowly, and any amplitude fits."""
+    """Return the range of speeds that the samples determine: below it none moves so slowly, and any amplitude fits."""
     top = max(float(np.abs(m.speed).max()) for m in motions)
     return float(SPEEDS[0]) * top / BEYOND, float(SPEEDS[-1]) * top * BEYOND
 
 
 def _at(result: Fit, k: int, speed_rad_s: float) -> Fit:
-    """Return the windows fitted with that speed."""
     motions = []
     for motion in result.problem.motions:
         courses = (*motion.courses[:k], stribeck(motion, speed_rad_s), *motion.courses[k + 1 :])

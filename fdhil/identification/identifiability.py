@@ -1,6 +1,4 @@
-"""Withholds what the data cannot tell: a parameter without an interval has a reason instead."""
-
-from __future__ import annotations
+"""Withholds parameters that the data do not determine: each gets a reason instead of a value."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -22,7 +20,7 @@ PHYSICAL: Mapping[str, tuple[float, float]] = {
     "K": (1e-3, 100.0),
     "Jt": (1e-7, 100.0),
     "ft": (-np.inf, 10.0),
-    "Cd": (-1e3, 1e3),  # in one direction with a load, which may help
+    "Cd": (-1e3, 1e3),  # in one direction with a load, which may assist
 }
 
 CURRENT_AND_SPEED = "current and speed"
@@ -56,10 +54,10 @@ def empty_estimate(method: str, result: Result, reason: Reason) -> Estimate:
 
 
 def judge(estimate: Estimate, condition: float, top_rad_s: float, top_nm: float = 0.0) -> Estimate:
-    """Return the estimate with its result set, and NaN with a reason where the data cannot tell a parameter.
+    """Return the estimate with its result set, and NaN with a reason for each parameter that the data do not determine.
 
-    ``condition`` is that of the regressor with columns of equal length, ``top_rad_s`` the largest speed in the data,
-    ``top_nm`` the largest torque.
+    ``condition`` is that of the regressor with columns of equal length, ``top_rad_s`` the largest speed, ``top_nm`` the
+    largest torque in the data.
     """
     if not np.isfinite(condition) or condition > CONDITION_LIMIT:
         text = f"the regressor is rank deficient (condition number {condition:.1e})"
@@ -79,11 +77,10 @@ def judge(estimate: Estimate, condition: float, top_rad_s: float, top_nm: float 
 
 
 def _unknown(estimate: Estimate, top_rad_s: float, top_nm: float) -> dict[str, Reason]:
-    """Return the parameters whose standard deviation is too large to publish them."""
     missing = {}
     friction = abs(estimate.value("ft")) * top_rad_s + abs(estimate.value("Cd"))
-    # a friction coefficient may be nil: its interval is measured against the friction torque that
-    # there is, or, since a weight may balance it in one direction, against the torque that the drive makes
+    # a friction coefficient may be zero: its interval is compared with the total friction torque, or, since a weight
+    # may balance it in one direction, with the drive's torque
     matters = max(FRICTION_SHARE * friction, TORQUE_SHARE * top_nm)
     least = {"ft": matters / max(top_rad_s, 1e-300), "Cd": matters}
     for name, limit in RELATIVE_STD_LIMIT.items():
@@ -99,10 +96,10 @@ def _unknown(estimate: Estimate, top_rad_s: float, top_nm: float) -> dict[str, R
 
 
 def untold(estimate: Estimate, *, slow: bool) -> list[Reason]:
-    """Return the reasons for which an estimate with missing parameters is not believed, each once.
+    """Return the reasons why an estimate with missing parameters is not accepted, each once.
 
-    R and L are told by the voltage's course alone. A ``slow`` sensor may leave them open, however good the window is:
-    then they are null, each with its reason, and the rest is as good as any.
+    Only the voltage's waveform determines R and L. A ``slow`` sensor may leave them open in a good window: they are
+    null with their reasons, and the other parameters remain valid.
     """
     if slow and set(estimate.missing) <= TOLD_BY_VOLTAGE and estimate.result is Result.UNDER_EXCITED:
         return []
@@ -110,10 +107,10 @@ def untold(estimate: Estimate, *, slow: bool) -> list[Reason]:
 
 
 def unphysical(estimate: Estimate, *, one_way: bool = False) -> list[Reason]:
-    """Return a reason for each value outside of what a feed drive can be; a NaN has its own reason.
+    """Return a reason for each value outside the range of feed drives; a NaN has its own reason.
 
-    Friction may be negligible, so only a significantly negative one is unphysical. Of moves ``one_way`` a constant load
-    is part of Cd, and may be more than all friction.
+    Friction may be negligible, so only a significantly negative one is unphysical. In ``one_way`` moves a constant load
+    is part of Cd and may exceed all friction.
     """
     reasons = []
     for name, (low, high) in PHYSICAL.items():

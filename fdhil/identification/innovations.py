@@ -1,10 +1,8 @@
-"""Whitens what current and speed of a window do that the model, driven by the measured voltage, does not.
+"""Whitens the part of a window's current and speed that the model, driven by the measured voltage, does not explain.
 
-Each filter belongs to its parameters and noise levels. The response of one filter is linear in the signals, so that
-score tests ask it for the answer to many changes of them.
+Each filter belongs to its parameters and noise levels. Its response is linear in the signals, so score tests use one
+filter for many changes of them.
 """
-
-from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -35,9 +33,9 @@ NOTHING: Float = np.zeros((0, 0))
 
 @dataclass(frozen=True, slots=True)
 class Gains:
-    """The filter's gains (n, 7) by row and log determinant, for fixed parameters and noise.
+    """The filter's gains (n, 7) by sample and log determinant, for fixed parameters and noise.
 
-    With a slow voltage the filter is made anew from the noise's ``variances`` (3,), and there are no gains.
+    With a low-rate voltage the filter is rebuilt from the noise's ``variances`` (3,), and there are no gains.
     """
 
     gains: Float
@@ -46,7 +44,7 @@ class Gains:
 
     @property
     def whiteners(self) -> Float:
-        """The factors (n, 3) that whiten a row: of current in the current's, of current and of speed in the speed's."""
+        """The factors (n, 3) that whiten a sample: current to current, current to speed, speed to speed."""
         return self.gains[:, kalman.WHITE_I :]
 
 
@@ -60,11 +58,11 @@ def gains_of(motion: Motion, theta: Float, noise: Noise) -> Gains:
 
 
 def whiten(motion: Motion, thetas: Float, variances: Float) -> tuple[Float, Float]:
-    """Return the whitened innovations (m, q) for the rows of ``thetas`` (q, k), each by the filter made for it.
+    """Return the whitened innovations (m, q) for the rows of ``thetas`` (q, k), each by its own filter.
 
-    Those of current and speed come row by row, those of the samples of a slow voltage (m,) after them. All are white,
-    of unit variance, in a right model. ``variances`` (q, 3) are those of voltage, current and speed; with the
-    innovations come the log determinants (q,).
+    Current and speed alternate sample by sample, the samples of a low-rate voltage (m,) follow. With the right model
+    all are white with unit variance. ``variances`` (q, 3) are those of voltage, current and speed; the log determinants
+    (q,) are returned too.
     """
     if motion.slow is None:
         white, logdet = _whitened(motion, thetas, variances, NOTHING)
@@ -75,8 +73,8 @@ def whiten(motion: Motion, thetas: Float, variances: Float) -> tuple[Float, Floa
 
 
 def _whitened(motion: Motion, thetas: Float, variances: Float, gains: Float) -> tuple[Float, Float]:
-    told = thetas[:, DELAY:] if any_voltage(motion) else thetas[:, DELAY, None]
-    together = bool((told == told[0]).all())
+    delays = thetas[:, DELAY:] if any_voltage(motion) else thetas[:, DELAY, None]
+    together = bool((delays == delays[0]).all())
     voltages = np.array([voltage_v(motion, theta) for theta in (thetas[:1] if together else thetas)])
     frictions = thetas[:, [CD, *range(FIRST_COURSE, thetas.shape[1])]]
     loads = loads_nm(motion, thetas[:1] if bool((frictions == frictions[0]).all()) else thetas)
@@ -86,10 +84,10 @@ def _whitened(motion: Motion, thetas: Float, variances: Float, gains: Float) -> 
 def innovations(
     motion: Motion, theta: Float, gains: Gains, more_nm: Float | None = None, emf_share: float = 1.0
 ) -> Float:
-    """Return the whitened innovations (m,) by a filter that was made before, in the order of :func:`whiten`.
+    """Return the whitened innovations (m,) by a filter made earlier, in the same order as when it was made.
 
-    ``more_nm`` (n,) is one more torque against the positive direction over each interval; ``emf_share``
-    of the back-EMF's ramp within a voltage sample is taken.
+    ``more_nm`` (n,) is an additional torque against the positive direction over each interval; ``emf_share`` is the
+    share of the back-EMF's ramp within a voltage sample that is used.
     """
     if motion.slow is not None:
         return innovations_of(motion, theta, gains.variances, more_nm=more_nm).whitened
@@ -112,7 +110,7 @@ def answers(
     """Return the change (2 n, q) of the innovations when a signal changes by each of ``courses`` (q, n).
 
     ``kind`` names the signal: ``LOAD`` (N.m against the positive direction), ``VOLTAGE`` (V, over each interval with
-    ``rises`` within them), ``CURRENT`` (A) or ``SPEED`` (rad/s). The window's voltage must come with its rows.
+    ``rises`` within them), ``CURRENT`` (A) or ``SPEED`` (rad/s). The voltage must be sampled with the other signals.
     """
     readings = Readings.of(motion)
     within = NOTHING if rises is None or not readings.rise_v.size else np.asarray(rises)
@@ -122,7 +120,7 @@ def answers(
 
 
 def course_answers(motion: Motion, theta: Float, gains: Gains) -> Float:
-    """Return the change (2 n, q) of the innovations with what is open of voltage and current within rows."""
+    """Return the change (2 n, q) of the innovations with the unknown voltage and current within samples."""
     assert motion.within is not None
     rises, currents = motion.within.rise_v, motion.within.current_a
     readings, signals = Readings.of(motion), np.zeros((4, motion.n))

@@ -1,12 +1,12 @@
-"""Runs the Kalman filters over a window's rows: all that is compiled of them, with the entries named.
+"""Compiled Kalman filters over a window's samples, with named entries.
 
-Three filters share the drive's equations [1] and [2]. ``whiten`` takes the voltage of each interval as an input, which
-is noisy: with G the model's response from voltage to z = [i; w], the residual z - G u has covariance S_iw + G S_u G',
-and a filter whose process noise is the voltage's noise through the drive whitens exactly that residual.
-``slow_innovations`` takes the samples of a slower sensor as measurements, and ``departure`` the voltage as a state that
-walks. Where friction is not known (standstill, reversal) the speed is a random walk, and only [1] speaks.
+Three filters share the drive's equations [1] and [2]. The whitening filter takes the noisy voltage of each interval as
+an input: with G the model's response from voltage to z = [i; w], the residual z - G u has covariance S_iw + G S_u G',
+and a filter whose process noise is the voltage's noise through the drive whitens exactly that residual. The low-rate
+filter takes the samples of a slower sensor as measurements; the departure filter takes the voltage as a random walk.
+Where friction is unknown (standstill, reversal) the speed is a random walk, and only [1] applies.
 
-Of two states and one input all is written out: a matrix library's way there and back takes longer than the sums.
+Two states and one input are written out: calling a matrix library would take longer than the sums.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ Rows = npt.NDArray[np.int64]
 
 R, L, K, JT, FT, CD, DELAY = range(7)  # entries of theta
 OF_VOLTAGE, OF_CURRENT, OF_SPEED = range(3)  # entries of noise variances
-LOAD, VOLTAGE, CURRENT, SPEED = range(4)  # signals that move the filter over the rows
-# columns of an interval's step: what current and speed become of those at its begin, of the mean voltage, of friction
-# and load together, of the voltage's rise within it; and how a walk of the speed over it reaches the current
+LOAD, VOLTAGE, CURRENT, SPEED = range(4)  # signals that drive the filter
+# columns of an interval's transition: current and speed from those at its begin, from the mean voltage, from friction
+# and load together, from the voltage's rise within it; and the effect of a walk of the speed on the current
 I_I, I_W, W_I, W_W, I_U, W_U, I_T, W_T, I_RISE, W_RISE, I_WALK = range(11)
-# columns of a row's gains: from the innovations of current and speed to their states, and to whitened innovations
+# columns of a sample's gains: from the innovations of current and speed to their states, and to whitened innovations
 G_II, G_IW, G_WI, G_WW, WHITE_I, WHITE_IW, WHITE_W = range(7)
-STATE_I, STATE_W, STATE_SLOPE, STATE_SUM = range(4)  # of the filter beside a slow voltage
-STATE_U = 2  # of the filter whose voltage walks
+STATE_I, STATE_W, STATE_SLOPE, STATE_SUM = range(4)  # of the filter with a low-rate voltage
+STATE_U = 2  # of the filter with a random-walk voltage
 STATES = 4
 NO_SAMPLE = -1
-SETTLED, SETTLED_ROWS = 1e-12, 4  # relative change of a gain from row to row, and how often: from then on it stays
-LOG_ROWS = 16  # determinants, at most DIFFUSE^2 of the measurement's, that are multiplied before a logarithm is taken
+SETTLED, SETTLED_ROWS = 1e-12, 4  # relative change of a gain per sample, and how often: then it is constant
+LOG_ROWS = 16  # determinants, at most DIFFUSE^2 of the measurement's, multiplied per logarithm
 
 
 class Readings(NamedTuple):
-    """The rows (n,) of a window as the filters take them; ``mode`` and ``observed`` as in :class:`Motion`.
+    """The samples (n,) of a window as the filters take them; ``mode`` and ``observed`` as in the prepared window.
 
-    ``emf_share`` of the back-EMF's rise within an interval is taken, beside the voltage's own ``rise_v``, which may
-    have no rows; ``walk`` is the standard deviation of the speed's change over an interval of unknown friction.
+    ``emf_share`` of the back-EMF's rise within an interval is used, in addition to the voltage's own ``rise_v``, which
+    may be empty; ``walk`` is the standard deviation of the speed's change over an interval of unknown friction.
     """
 
     dt_s: float
@@ -58,10 +58,10 @@ class Readings(NamedTuple):
 
     @classmethod
     def of(cls, motion: Motion, emf_share: float = 1.0) -> Readings:
-        """Return the readings of a motion.
+        """Return the readings of a prepared window.
 
-        Of the course of an interval mean within its sample only the back-EMF's ramp is certain: what the current
-        regulator adds depends on the drive, and to take it from neighbouring means biases L.
+        Within an interval mean only the back-EMF's ramp is certain: the regulator's part depends on the drive, and
+        taking it from neighbouring means would bias L.
         """
         means = motion.voltage_sampling == "interval_mean"
         rise_v, share = (np.zeros(0), emf_share) if means else (motion.voltage_rise, emf_share - 1.0)
@@ -70,10 +70,10 @@ class Readings(NamedTuple):
 
 
 class Marks(NamedTuple):
-    """Where the samples of a slow voltage lie among the rows, in order of time (b,).
+    """Where the samples of a low-rate voltage begin and end among the drive's samples, in order of time (b,).
 
-    Mark b comes after the drive's row ``row``, at ``time_s``; there ends the voltage sample ``sample`` (-1: none is
-    wholly known), and the next begins. Instants are marks that begin nothing.
+    Mark b follows the drive's sample ``row``, at ``time_s``; there the voltage sample ``sample`` ends (-1: none
+    complete) and the next begins. Instants are marks that begin no sample.
     """
 
     row: Rows
@@ -82,7 +82,7 @@ class Marks(NamedTuple):
 
 
 class SlowSensor(NamedTuple):
-    """The samples (m,) of a slow voltage, means over ``period_s`` or instants; ``shape_variance`` (m,) is their own."""
+    """The samples (m,) of a low-rate voltage, means over ``period_s`` or instants, and ``shape_variance`` (m,)."""
 
     voltage: Float
     instant: bool
@@ -93,9 +93,9 @@ class SlowSensor(NamedTuple):
 
 @compiled
 def interval_steps(theta: Float, dt: float, emf_share: float) -> Float:
-    """Return the steps (2, 11) over an interval where friction is not known, and where it is.
+    """Return the transition coefficients (2, 11) over an interval of unknown friction, and of known friction.
 
-    ``emf_share`` of the back-EMF's own rise over it, which is linear in the same quantities, is part of them.
+    They include ``emf_share`` of the back-EMF's rise over the interval, which is linear in the same quantities.
     """
     steps = np.empty((2, 11))
     for known in range(2):
@@ -104,7 +104,7 @@ def interval_steps(theta: Float, dt: float, emf_share: float) -> Float:
             a[1, :] = 0.0
         phi, mean, ramp = transition(a, dt)
         u = 1.0 / theta[L]
-        f = -1.0 / theta[JT] if known else 0.0  # else the friction torque is whatever keeps the speed on its walk
+        f = -1.0 / theta[JT] if known else 0.0  # else the speed is a random walk, whatever the friction
         to_i = np.array([phi[0, 0], phi[0, 1], mean[0, 0] * u, mean[0, 1] * f])
         to_w = np.array([phi[1, 0], phi[1, 1], mean[1, 0] * u, mean[1, 1] * f])
         rise = emf_share * theta[K] * (to_w - np.array([0.0, 1.0, 0.0, 0.0]))
@@ -118,7 +118,6 @@ def interval_steps(theta: Float, dt: float, emf_share: float) -> Float:
 
 @compiled
 def _moved(steps: Float, known: int, i: float, w: float, u: float, torque: float, rise: float) -> tuple[float, float]:
-    """Return current and speed at the end of an interval."""
     s = steps[known]
     return (
         s[I_I] * i + s[I_W] * w + (s[I_U] * u + s[I_T] * torque + s[I_RISE] * rise),
@@ -149,7 +148,7 @@ def _spread(
 def _whiten_one(
     theta: Float, variances: Float, readings: Readings, mean_v: Float, load: Float, white: Float, gains: Float
 ) -> float:
-    """Fill ``white`` (n, 2), and ``gains`` (n, 7) unless it has no rows; return the innovations' log determinant."""
+    """Fill ``white`` (n, 2), and ``gains`` (n, 7) unless it is empty; return the innovations' log determinant."""
     steps = interval_steps(theta, readings.dt_s, readings.emf_share)
     mode, observed, rise_v = readings.mode, readings.observed, readings.rise_v
     current, speed = readings.current, readings.speed
@@ -193,7 +192,7 @@ def _whiten_one(
         was, known = known, 0 if mode[k] == UNKNOWN else 1
         if known != was:
             still = 0
-        if still < SETTLED_ROWS:  # else the gains change no more
+        if still < SETTLED_ROWS:  # else the gains are constant
             if observed[k]:
                 p11, p12, p22 = g11 * vi, g12 * vw, g22 * vw
             p11, p12, p22 = _spread(steps, known, p11, p12, p22, vu, 0.0 if known else readings.walk)
@@ -208,8 +207,9 @@ def whiten(
 ) -> tuple[Float, Float]:
     """Return whitened innovations (q, n, 2) and log determinants (q,) for the rows of ``thetas`` (q, 7).
 
-    ``variances`` (q, 3) are those of voltage, current and speed; ``mean_v`` and ``loads``, all torque against the
-    positive direction, are (q, n) or, when all share them, (1, n). ``gains`` (n, 7), or of no rows, takes the last's.
+    ``variances`` (q, 3) are those of voltage, current and speed; ``mean_v`` and ``loads``, the total torque against the
+    positive direction, are (q, n), or (1, n) where shared. ``gains`` (n, 7) receives the last filter's gains, unless
+    empty.
     """
     q = thetas.shape[0]
     white = np.empty((q, readings.mode.size, 2))
@@ -224,10 +224,10 @@ def whiten(
 def respond(
     theta: Float, readings: Readings, signals: Float, kind: int, courses: Float, rises: Float, gains: Float
 ) -> Float:
-    """Return the whitened innovations (n, 2, q) by the filter of ``gains`` (n, 7), which are linear in all signals.
+    """Return the whitened innovations (n, 2, q) by the filter of ``gains`` (n, 7), linear in all signals.
 
-    Of ``signals`` (4, n) that of ``kind`` is each of ``courses`` (q, n), with ``rises`` (q, n) of the voltage within
-    the intervals, or none. The load is friction, and what comes on top, against the positive direction.
+    The signal ``kind`` of ``signals`` (4, n) is replaced by each of ``courses`` (q, n), with ``rises`` (q, n) of the
+    voltage within the intervals, or none. The load is friction and all other torque against the positive direction.
     """
     steps, q = interval_steps(theta, readings.dt_s, readings.emf_share), len(courses)
     mode, observed = readings.mode, readings.observed
@@ -264,7 +264,7 @@ def respond(
 
 @compiled
 def _take(x: Float, p: Float, h: Float, value: float, noise: float) -> tuple[float, float]:
-    """Take in a measurement ``value`` = h x with the variance ``noise``; return its innovation and variance."""
+    """Update with a measurement ``value`` = h x of variance ``noise``; return its innovation and variance."""
     error, variance = value, noise
     s0 = p[0, 0] * h[0] + p[0, 1] * h[1] + p[0, 2] * h[2] + p[0, 3] * h[3]
     s1 = p[1, 0] * h[0] + p[1, 1] * h[1] + p[1, 2] * h[2] + p[1, 3] * h[3]
@@ -284,9 +284,9 @@ def _take(x: Float, p: Float, h: Float, value: float, noise: float) -> tuple[flo
 
 @compiled
 def _advance(theta: Float, x: Float, p: Float, h: float, known: bool, push: float, walk: float, period: float) -> None:
-    """Move state ``x`` (4,) and covariance ``p`` (4, 4) on by ``h``; Jt w' = K i - ft w + Jt ``push`` where known.
+    """Propagate ``x`` (4,) and ``p`` (4, 4) by ``h`` seconds; Jt w' = K i - ft w + Jt ``push`` where friction is known.
 
-    ``walk`` is the variance of di/dt per second; terms of third order in h ft/Jt are left out: they are nil.
+    ``walk`` is the variance of di/dt per second; terms of third order in h ft/Jt are negligible and left out.
     """
     pull, drag = (theta[K] / theta[JT], theta[FT] / theta[JT]) if known else (0.0, 0.0)
     drop, emf, square = theta[R] / period, theta[K] / period, h * h / 2
@@ -322,10 +322,10 @@ def _advance(theta: Float, x: Float, p: Float, h: float, known: bool, push: floa
 def slow_innovations(
     theta: Float, readings: Readings, sensor: SlowSensor, noise: Float, spread: Float, load: Float, slope_walk: Float
 ) -> tuple[Float, Float]:
-    """Return the innovations (2 n + m,) of rows and of the samples of a slow voltage (m,), and their variances.
+    """Return innovations (2 n + m,) of the drive's samples and of a low-rate voltage (m,), and their variances.
 
-    ``noise`` (3,) = variances of voltage, current, speed; ``spread`` (n, 2) are the last two of each row, infinite
-    where nothing was read. ``load`` (n,) may have no rows.
+    ``noise`` (3,) = variances of voltage, current, speed; ``spread`` (n, 2) are the last two of each sample, infinite
+    where nothing was read. ``load`` (n,) may be empty.
     """
     dt, mode, current, speed = readings.dt_s, readings.mode, readings.current, readings.speed
     voltage, period, instant = sensor.voltage, sensor.period_s, sensor.instant
@@ -356,7 +356,7 @@ def slow_innovations(
                 at = 2 * n + j
                 noisy = noise[OF_VOLTAGE] + sensor.shape_variance[j]
                 values[at], variance[at] = _take(x, p, of_voltage, voltage[j], noisy)
-            if not instant:  # a sample begins: nothing is summed yet but - L i / T of the present current
+            if not instant:  # a sample begins: its sum starts at - L i / T of the present current
                 x[STATE_SUM] = -lever * x[STATE_I]
                 for a in range(STATE_SUM):
                     p[STATE_SUM, a] = p[a, STATE_SUM] = -lever * p[STATE_I, a]
@@ -371,12 +371,12 @@ def slow_innovations(
 def departure(
     theta: Float, dt: float, mode: Modes, load: Float, y: Float, variance: Float, walks: Float, signal: int
 ) -> tuple[float, float]:
-    """Return the sum of squares by which readings ``y`` (n, 3) depart from the best course, in units of ``variance``.
+    """Return the squares, in units of ``variance``, by which readings ``y`` (n, 3) depart from the smoothed signals.
 
-    And how many of the readings of ``signal`` were news: the sum of their shares of variance that were not their own.
-    Readings are of current, speed and voltage; their variance (n, 3) is infinite where there is none. ``load`` (n,) is
-    that of :func:`whiten`; ``walks`` (n, 3) are the variances that speed (where friction is unknown) and voltage gain
-    over each interval, and of the voltage's rise within it.
+    Also return how many readings of ``signal`` were informative: the sum of the shares of variance that were not their
+    own. Readings are current, speed and voltage; their variance (n, 3) is infinite where there is none. ``load`` (n,)
+    is as in the whitening filter; ``walks`` (n, 3) are the variances that speed (where friction is unknown) and voltage
+    gain over each interval, and of the voltage's rise within it.
     """
     steps = interval_steps(theta, dt, 0.0)
     x, p, of_signal = np.zeros(STATES), np.zeros((STATES, STATES)), np.eye(STATES)

@@ -1,9 +1,7 @@
-"""Estimates R and L from a recording in which the rotor does not turn: [1] without its back-EMF.
+"""Estimates R and L from a recording with a locked rotor: [1] without its back-EMF.
 
-The current that R and L make of the measured voltage is compared with the measured one ([LJU] ch. 4, output error).
+The current computed from R, L and the measured voltage is fitted to the measured one ([LJU] ch. 4, output error).
 """
-
-from __future__ import annotations
 
 import math
 
@@ -22,19 +20,19 @@ NAME = "locked_rotor"
 TURNING = 8.0  # of the noise of the speed
 ADVICE = "add a recording in which the rotor turns"
 START_L_H = 1e-3
-OPEN_SHARE = np.array([5e-4, 1e-3])  # of R and L: what the voltage's course within a sample leaves open
+OPEN_SHARE = np.array([5e-4, 1e-3])  # of R and L: doubt of the voltage's waveform within a sample
 TOO_SLOW = "the current changes too little, or too slowly, to determine {}"
 
 
 def is_locked(window: Window) -> bool:
-    """Return whether the speed of a laboratory recording is nothing but noise while a current flows."""
+    """Return whether the speed of a laboratory recording is only noise while a current flows."""
     speed, current = np.abs(carried(window.speed_rad_s)).max(), np.abs(carried(window.current_a)).max()
     noise = noise_levels(window)
     return not window.is_rapid and bool(speed <= TURNING * noise.speed_rad_s and current > TURNING * noise.current_a)
 
 
 def estimate_locked(window: Window) -> Estimate:
-    """Return R and L of a window whose voltage was measured; the rest is NaN with its reason."""
+    """Return R and L of a window with a measured voltage; the other parameters are NaN with a reason."""
     assert window.voltage_v is not None
     voltage = interval_shape(carried(window.voltage_v), window.voltage_sampling)[0]
     current = carried(window.current_a)
@@ -55,7 +53,7 @@ def estimate_locked(window: Window) -> Estimate:
     )
     shares = np.sqrt(np.diag(spread) * correlation_factor(found.fun) + OPEN_SHARE**2)
     values, covariance = np.full(6, np.nan), np.full((6, 6), np.nan)
-    still = "the rotor does not turn, which leaves {} open"
+    still = "the rotor does not turn, so {} cannot be determined"
     missing = {name: Reason("LowExcitation", still.format(name), ADVICE) for name in PARAMETERS}
     for k, name in enumerate(PARAMETERS[:2]):
         if 0.0 < shares[k] <= RELATIVE_STD_LIMIT[name]:
@@ -68,7 +66,7 @@ def estimate_locked(window: Window) -> Estimate:
 
 
 def correlation_factor(residuals: Float) -> float:
-    """Return by how much correlated residuals (m,) widen a variance, at least 1: 1 + 2 sum of their correlations."""
+    """Return the variance inflation of correlated residuals (m,), at least 1: 1 + 2 sum of their correlations."""
     power, total = float(residuals @ residuals), 1.0
     for lag in range(1, min(200, residuals.size // 4)):
         share = float(residuals[lag:] @ residuals[:-lag]) / max(power, 1e-300)

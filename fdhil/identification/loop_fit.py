@@ -1,11 +1,8 @@
-"""Fits a drive's own loops by output error: the closed loop's answer to the demand against position and current.
+"""Fits a drive's loops by output error: the closed loop's response to the demand against position and current.
 
-The demand is the drive's own input and has no noise, so nothing is biased by a sensor's noise; what the mechanics do
-not explain is a known load. Levenberg and Marquardt's steps on the kernel; both signals weigh as what is left of them,
-renewed between the rounds.
+The demand is free of noise, so sensor noise causes no bias; what the mechanics do not explain is a known load. Both
+signals are scaled by their residuals, renewed between rounds of Levenberg-Marquardt.
 """
-
-from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
@@ -20,18 +17,18 @@ from fdhil.records import Float
 
 DELAY = "current_delay_cycles"
 STEPS, TRIALS = 24, 8
-CONVERGED, ENOUGH = 1e-4, 0.05  # of the squares' sum: a step that gains less is the last, or asks for new slopes
-ROUNDS, SETTLED = 4, 1e-3  # in which the scale is renewed, until what is left changes by less
-SYSTEMATIC = 0.005  # of a gain: what rounding of the demand and a start that is not quite at rest do to all rapids
+CONVERGED, ENOUGH = 1e-4, 0.05  # of the sum of squares: a smaller gain ends the steps, or requires new slopes
+ROUNDS, SETTLED = 4, 1e-3  # renewals of the scale, until the residual changes by less
+SYSTEMATIC = 0.005  # of a gain: common effect of the demand's rounding and of a start not quite at standstill
 LEAST_POSITION_MM, LEAST_CURRENT_A = 1e-5, 1e-4
 
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """A key of the regulators as the fit moves it: by ``scale``, or by its logarithm (0), between ``low`` and ``high``.
+    """A regulator key in the fit: scaled by ``scale``, or logarithmic (0), between ``low`` and ``high``.
 
-    ``doubt`` is how far off it may be to begin with, one standard deviation in that coordinate: it holds what the data
-    cannot tell. ``step`` is what its derivative is taken over, ``usual`` where the search for an option begins.
+    ``doubt`` is the prior standard deviation in that coordinate; it holds what the data do not determine. ``step`` is
+    the difference for its derivative, ``usual`` the start value of an option.
     """
 
     scale: float
@@ -66,27 +63,27 @@ KEYS: dict[str, Key] = {
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Rapids, and the axis whose regulators are sought: ``names`` are the keys that move, k of them."""
+    """Rapids, and the axis whose regulators are fitted: the k keys ``names`` vary."""
 
     rapids: tuple[Rapid, ...]
     axis: Axis
     names: tuple[str, ...]
 
     def start(self) -> Float:
-        """Return the coordinates (k,) of the axis as it is."""
+        """Return the coordinates (k,) of the axis' present regulators."""
         regulators = self.axis.regulators
         return np.array([KEYS[name].coordinate(float(getattr(regulators, name))) for name in self.names])
 
     def doubt(self) -> Float:
-        """Return the standard deviations (k,) before any data."""
+        """Return the prior standard deviations (k,)."""
         return np.array([KEYS[name].doubt for name in self.names])
 
     def bounds(self) -> tuple[Float, Float]:
-        """Return the least and the largest coordinates, (k,)."""
+        """Return the lower and upper bounds of the coordinates, (k,)."""
         return np.array([KEYS[n].low for n in self.names]), np.array([KEYS[n].high for n in self.names])
 
     def drive(self, coordinates: Float) -> tuple[Axis, float]:
-        """Return the axis with the regulators of some coordinates, and the delay in cycles, which need not be whole."""
+        """Return the axis with the regulators of some coordinates, and the delay in cycles, not necessarily whole."""
         values = {n: KEYS[n].value(float(c)) for n, c in zip(self.names, coordinates, strict=True)}
         delay = values.pop(DELAY, float(self.axis.regulators.current_delay_cycles))
         return with_regulators(self.axis, **values), delay
@@ -97,7 +94,7 @@ class Problem:
         return [replay(rapid, drive, delay) for rapid in self.rapids]
 
     def slopes(self, coordinates: Float, answers: Sequence[Float]) -> list[Float]:
-        """Return how each rapid's position and current change with the keys, (2, n, k)."""
+        """Return the derivatives (2, n, k) of each rapid's position and current by the keys."""
         out = [np.empty((*answer.shape, len(self.names))) for answer in answers]
         _, high = self.bounds()
         for c, name in enumerate(self.names):
@@ -111,99 +108,98 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """The bottom that was found: coordinates, what is left (2, n) of each window, in mm and A, and its scale (2,)."""
+    """The minimum: coordinates, ``residuals`` (2, n) of each rapid in mm and A, and their scale (2,)."""
 
     problem: Problem
     coordinates: Float
-    left: tuple[Float, ...]
+    residuals: tuple[Float, ...]
     scale: Float
 
     @property
     def unexplained_um(self) -> float:
-        """RMS of what is left of the position."""
-        return float(spread_of(self.problem, self.left)[0]) * 1e3
+        """RMS residual of the position."""
+        return float(spread_of(self.problem, self.residuals)[0]) * 1e3
 
     @property
     def deviance(self) -> float:
-        """Minus twice the logarithm of the likelihood for each row, but for what all fits of the rapids share."""
-        scale, spread = scale_of(self.problem, self.left), spread_of(self.problem, self.left)
+        """Minus twice the log likelihood per sample, without the constant that all fits of the rapids share."""
+        scale, spread = scale_of(self.problem, self.residuals), spread_of(self.problem, self.residuals)
         return float((2.0 * np.log(scale) + (spread / scale) ** 2).sum())
 
     @property
     def values(self) -> dict[str, float]:
-        """The keys that moved, in their units."""
+        """The fitted keys, in their units."""
         pairs = zip(self.problem.names, self.coordinates, strict=True)
         return {name: KEYS[name].value(float(c)) for name, c in pairs}
 
     def axis(self) -> Axis:
-        """Return the axis with the regulators found; a delay is whole only where it was not sought."""
+        """Return the axis with the fitted regulators; a delay is whole only where it was not fitted."""
         return self.problem.drive(self.coordinates)[0]
 
     def squares(self, scale: Float) -> float:
         """Return the sum of squares at some scale."""
-        pairs = zip(self.left, self.problem.rapids, strict=True)
-        return float(sum(np.square((left / scale[:, None])[:, one.known]).sum() for left, one in pairs))
+        pairs = zip(self.residuals, self.problem.rapids, strict=True)
+        return float(sum(np.square((own / scale[:, None])[:, one.known]).sum() for own, one in pairs))
 
     def answers(self) -> list[Float]:
-        """Return position and current (2, n) of the closed loop, for each rapid."""
-        pairs = zip(self.problem.rapids, self.left, strict=True)
-        return [np.stack((rapid.position_mm, rapid.current_a)) - left for rapid, left in pairs]
+        """Return the closed loop's position and current (2, n) for each rapid."""
+        pairs = zip(self.problem.rapids, self.residuals, strict=True)
+        return [np.stack((rapid.position_mm, rapid.current_a)) - own for rapid, own in pairs]
 
 
 def left_of(problem: Problem, coordinates: Float) -> tuple[tuple[Float, ...], list[Float]]:
-    """Return what the closed loop leaves of each window, and its answers, both (2, n)."""
+    """Return residuals and responses of the closed loop, both (2, n) for each rapid."""
     answers = problem.answers(coordinates)
     measured = [np.stack((one.position_mm, one.current_a)) for one in problem.rapids]
     return tuple(m - a for m, a in zip(measured, answers, strict=True)), answers
 
 
-def spread_of(problem: Problem, left: Sequence[Float]) -> Float:
-    """Return the RMS (2,) of what is left, in mm and A."""
-    whole = np.concatenate([r[:, one.known] for r, one in zip(left, problem.rapids, strict=True)], axis=1)
+def spread_of(problem: Problem, residuals: Sequence[Float]) -> Float:
+    """Return the RMS (2,) of the residuals, in mm and A."""
+    whole = np.concatenate([r[:, one.known] for r, one in zip(residuals, problem.rapids, strict=True)], axis=1)
     return np.asarray(np.sqrt((whole**2).mean(axis=1)))
 
 
-def scale_of(problem: Problem, left: Sequence[Float]) -> Float:
-    """Return the scale (2,) at which what is left is weighed: its RMS, as far as that is not rounding."""
-    return np.maximum(spread_of(problem, left), (LEAST_POSITION_MM, LEAST_CURRENT_A))
+def scale_of(problem: Problem, residuals: Sequence[Float]) -> Float:
+    """Return the scale (2,) of the residuals: their RMS, but at least the rounding."""
+    return np.maximum(spread_of(problem, residuals), (LEAST_POSITION_MM, LEAST_CURRENT_A))
 
 
 def fit(problem: Problem, start: Float | None = None) -> Fit:
-    """Return the regulators that explain position and current best, from the axis as it is or from ``start``."""
+    """Fit the regulators to position and current, from the axis' present ones or from ``start``."""
     at = problem.start() if start is None else start
-    left, _ = left_of(problem, at)
-    made, prior = Fit(problem, at, left, scale_of(problem, left)), at.copy()
+    residuals, _ = left_of(problem, at)
+    fitted, prior = Fit(problem, at, residuals, scale_of(problem, residuals)), at.copy()
     for _ in range(ROUNDS):
-        before = made.unexplained_um
-        made = _descend(made, prior)
-        made = replace(made, scale=scale_of(problem, made.left))
-        if abs(made.unexplained_um - before) < SETTLED * before:
+        before = fitted.unexplained_um
+        fitted = _descend(fitted, prior)
+        fitted = replace(fitted, scale=scale_of(problem, fitted.residuals))
+        if abs(fitted.unexplained_um - before) < SETTLED * before:
             break
-    return made
+    return fitted
 
 
-def _descend(made: Fit, prior: Float) -> Fit:
-    """Go down at one scale."""
-    problem, damping, answers = made.problem, 1e-3, made.answers()
+def _descend(fitted: Fit, prior: Float) -> Fit:
+    problem, damping, answers = fitted.problem, 1e-3, fitted.answers()
     weights, (low, high) = 1.0 / problem.doubt() ** 2, problem.bounds()
 
     def cost(of: Fit) -> float:
-        return of.squares(made.scale) + float(weights @ (of.coordinates - prior) ** 2)
+        return of.squares(fitted.scale) + float(weights @ (of.coordinates - prior) ** 2)
 
-    now, slopes, fresh = cost(made), problem.slopes(made.coordinates, answers), True
+    now, slopes, fresh = cost(fitted), problem.slopes(fitted.coordinates, answers), True
     for _ in range(STEPS):
-        information, score = normal(made, slopes)
-        score = score - weights * (made.coordinates - prior)
-        before = made, now, answers
+        information, score = normal(fitted, slopes)
+        score = score - weights * (fitted.coordinates - prior)
+        before = fitted, now, answers
         for _ in range(TRIALS if fresh else 1):
             matrix = information + np.diag(weights + damping * np.diag(information))
-            step = _free_step(matrix, score, made.coordinates, low, high)
-            at = np.clip(made.coordinates + step, low, high)
-            left, reached = left_of(problem, at)
-            trial = replace(made, coordinates=at, left=left)
+            step = _free_step(matrix, score, fitted.coordinates, low, high)
+            at = np.clip(fitted.coordinates + step, low, high)
+            residuals, reached = left_of(problem, at)
+            trial = replace(fitted, coordinates=at, residuals=residuals)
             value = cost(trial)
             if np.isfinite(value) and value < now:
-                now, made, answers, damping = value, trial, reached, max(damping / 10, 1e-9)
+                now, fitted, answers, damping = value, trial, reached, max(damping / 10, 1e-9)
                 break
             damping *= 8
         gained = before[1] - now
@@ -211,23 +207,22 @@ def _descend(made: Fit, prior: Float) -> Fit:
             break
         fresh = gained < ENOUGH * before[1]
         if fresh:
-            slopes = problem.slopes(made.coordinates, answers)
+            slopes = problem.slopes(fitted.coordinates, answers)
         else:
-            slopes = _turned(slopes, made.coordinates - before[0].coordinates, answers, before[2], information)
-    return made
+            slopes = _turned(slopes, fitted.coordinates - before[0].coordinates, answers, before[2], information)
+    return fitted
 
 
 def _turned(
     slopes: Sequence[Float], step: Float, after: Sequence[Float], before: Sequence[Float], metric: Float
 ) -> list[Float]:
-    """Return slopes (2, n, k) that agree with what a ``step`` did (Broyden 1965): they cost as much as all else."""
+    """Return slopes (2, n, k) updated by the effect of a ``step`` (Broyden 1965): new ones cost as much as all else."""
     share = np.diag(metric) * step
     share = share / max(float(share @ step), 1e-300)
     return [own + (a - b - own @ step)[..., None] * share for own, a, b in zip(slopes, after, before, strict=True)]
 
 
 def _free_step(matrix: Float, score: Float, at: Float, low: Float, high: Float) -> Float:
-    """Return the step of those coordinates that no bound holds."""
     held = (at <= low) & (score < 0) | (at >= high) & (score > 0)
     free = np.flatnonzero(~held)
     step = np.zeros_like(at)
@@ -235,62 +230,61 @@ def _free_step(matrix: Float, score: Float, at: Float, low: Float, high: Float) 
     return step
 
 
-def normal(made: Fit, slopes: Sequence[Float]) -> tuple[Float, Float]:
+def normal(fitted: Fit, slopes: Sequence[Float]) -> tuple[Float, Float]:
     """Return information (k, k) and score (k,) of a fit with the ``slopes`` (2, n, k) of each rapid."""
     k = slopes[0].shape[2]
     information, score = np.zeros((k, k)), np.zeros(k)
-    for phi, rest in _weighed(made, slopes):
+    for phi, rest in _weighed(fitted, slopes):
         flat = phi.reshape(-1, k)
         information += flat.T @ flat
         score += flat.T @ rest.ravel()
     return information, score
 
 
-def _weighed(made: Fit, slopes: Sequence[Float]) -> Iterator[tuple[Float, Float]]:
-    """Yield slopes (2, m, k) and what is left (2, m) of each rapid's whole rows, in units of the scale."""
-    for rapid, left, slope in zip(made.problem.rapids, made.left, slopes, strict=True):
+def _weighed(fitted: Fit, slopes: Sequence[Float]) -> Iterator[tuple[Float, Float]]:
+    """Yield scaled slopes (2, m, k) and residuals (2, m) of each rapid's complete samples."""
+    for rapid, own, slope in zip(fitted.problem.rapids, fitted.residuals, slopes, strict=True):
         known = rapid.known
-        yield slope[:, known] / made.scale[:, None, None], left[:, known] / made.scale[:, None]
+        yield slope[:, known] / fitted.scale[:, None, None], own[:, known] / fitted.scale[:, None]
 
 
-def covariance_of(made: Fit) -> Float:
-    """Return the covariance (k, k) of the keys' coordinates: the larger of the information's and the sandwich's."""
-    slopes = made.problem.slopes(made.coordinates, made.answers())
-    information, _ = normal(made, slopes)
-    # what the model does not have is no white noise (Newey and West 1987)
-    meat = sum(summed(np.einsum("cnk,cn->nk", phi, rest)) for phi, rest in _weighed(made, slopes))
-    inverse = np.linalg.inv(information + np.diag(1.0 / made.problem.doubt() ** 2))
+def covariance_of(fitted: Fit) -> Float:
+    """Return the covariance (k, k) of the coordinates: the larger of inverse information and sandwich."""
+    slopes = fitted.problem.slopes(fitted.coordinates, fitted.answers())
+    information, _ = normal(fitted, slopes)
+    # unmodelled dynamics are coloured (Newey and West 1987)
+    meat = sum(summed(np.einsum("cnk,cn->nk", phi, rest)) for phi, rest in _weighed(fitted, slopes))
+    inverse = np.linalg.inv(information + np.diag(1.0 / fitted.problem.doubt() ** 2))
     sandwich = inverse @ meat @ inverse
     wider = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(inverse), 1.0))
-    floor = np.diag([(SYSTEMATIC if KEYS[name].scale == 0.0 else 0.0) ** 2 for name in made.problem.names])
+    floor = np.diag([(SYSTEMATIC if KEYS[name].scale == 0.0 else 0.0) ** 2 for name in fitted.problem.names])
     return np.asarray((inverse * np.outer(wider, wider)) + floor)
 
 
-def likeliest(made: Fit, options: Sequence[tuple[str, ...]]) -> list[Fit]:
-    """Return where fits with further keys begin, the likeliest first.
+def likeliest(fitted: Fit, options: Sequence[tuple[str, ...]]) -> list[Fit]:
+    """Return the starts of fits with additional keys, the likeliest first.
 
-    Each of the ``options`` goes as far as the slopes lead in a straight line, from the end of the fit without and from
-    where that began: a lack bends what is there.
+    Each of the ``options`` is extrapolated linearly, from the end of the fit without it and from that fit's start,
+    because a missing key distorts the others.
     """
-    begun = made.problem.start()
-    left, _ = left_of(made.problem, begun)
-    starts = (made, Fit(made.problem, begun, left, scale_of(made.problem, left)))
+    begun = fitted.problem.start()
+    residuals, _ = left_of(fitted.problem, begun)
+    starts = (fitted, Fit(fitted.problem, begun, residuals, scale_of(fitted.problem, residuals)))
     found = [one for start in starts for one in _ahead(start, options)]
     return sorted((one for one in found if math.isfinite(one.deviance)), key=lambda one: one.deviance)
 
 
 def _ahead(start: Fit, options: Sequence[tuple[str, ...]]) -> Iterator[Fit]:
-    """Yield for each of the ``options``, begun at its usual value, where one step leads from ``start``."""
     slopes = start.problem.slopes(start.coordinates, start.answers())
     for option in options:
         wider = replace(start.problem, names=(*start.problem.names, *option))
         at = np.append(start.coordinates, [KEYS[name].usual for name in option])
-        left, answers = left_of(wider, at)
+        residuals, answers = left_of(wider, at)
         own = replace(wider, axis=start.axis(), names=option).slopes(at[-len(option) :], answers)
         both = [np.concatenate(pair, axis=2) for pair in zip(slopes, own, strict=True)]
-        information, score = normal(Fit(wider, at, left, scale_of(wider, left)), both)
+        information, score = normal(Fit(wider, at, residuals, scale_of(wider, residuals)), both)
         low, high = wider.bounds()
         at = np.clip(at + np.linalg.solve(information + np.diag(1.0 / wider.doubt() ** 2), score), low, high)
         if (at[-len(option) :] > 0.0).all():
-            left, _ = left_of(wider, at)
-            yield Fit(wider, at, left, scale_of(wider, left))
+            residuals, _ = left_of(wider, at)
+            yield Fit(wider, at, residuals, scale_of(wider, residuals))

@@ -1,6 +1,4 @@
-"""Runs a rapid through the closed loop once more, from its recorded demand alone, and tells what is left of it."""
-
-from __future__ import annotations
+"""Replays a rapid through the closed loop from its recorded demand."""
 
 import math
 from dataclasses import dataclass, replace
@@ -17,21 +15,21 @@ from fdhil.records import Bool, Float, Parameters, Window, read_only
 LEAST_ROWS = 50
 REST_ROWS = 30
 LEAD_ROWS = 5
-BEGUN = 1e-6  # of the way
+BEGUN = 1e-6  # of the travel
 CREEP = 1e-5
 EDGE_ROWS = 3  # at either end, where the demand may be cut
 NIL_MM = 1e-9
 PENALISED = 3  # order of the differences
 WEIGHTS = tuple(10.0**k for k in range(6))
-LOW_PASS_S = 0.009  # twice: about 40 Hz, as far as the outer loops reach
-ROUNDED = 0.7  # of a step: half of one, and what the neighbours' rounding adds at a corner
+LOW_PASS_S = 0.009  # applied twice: about 40 Hz, the bandwidth of the outer loops
+ROUNDED = 0.7  # of a step: half a step, and more at a corner where the neighbours are rounded too
 
 
 @dataclass(frozen=True, slots=True)
 class Rapid:
-    """One rapid on its grid, rows (n,) of its window from ``first`` on: what the drive was asked for, and what it did.
+    """One rapid, samples (n,) of its window from ``first`` on: the drive's demand and its response.
 
-    ``known`` marks whole rows; the axis stood at ``standstill_mm``, held by ``standstill_a``, or crept on at
+    ``known`` marks complete samples; the axis stood at ``standstill_mm``, held by ``standstill_a``, or still moved at
     ``creep_mm_s`` from the move before. ``load_nm`` (n,) is the torque that ``plant`` does not explain.
     """
 
@@ -60,9 +58,9 @@ class Rapid:
 
 
 def rapid_of(window: Window, plant: Parameters, sync_period_s: float | None = None) -> Rapid | None:
-    """Return the rapid of a window, moved by ``plant``; None where demand, position and current are not all told.
+    """Return the rapid of a window, moved by ``plant``; None without demand, position or current.
 
-    Set-points come every ``sync_period_s`` (left out: with every row); of rows that come more often only theirs count.
+    Set-points come every ``sync_period_s`` (default: every sample); samples between set-points are left out.
     """
     window = _on_the_grid(window, sync_period_s)
     known = np.isfinite(window.demand_mm) & np.isfinite(window.position_mm) & np.isfinite(window.current_a)
@@ -97,13 +95,12 @@ def rapid_of(window: Window, plant: Parameters, sync_period_s: float | None = No
 
 
 def _held(current_a: Float, row: int) -> float:
-    """Return the current that is held at a row: held by friction beside its place, an axis pulls ever more."""
+    """Return the holding current at a sample: an axis held by friction off its target integrates ever more current."""
     rows = np.arange(current_a.size)
     return float(np.polyval(np.polyfit(rows, current_a, 1), row)) if rows.size > LEAD_ROWS else float(current_a.mean())
 
 
 def _on_the_grid(window: Window, sync_period_s: float | None) -> Window:
-    """Return the window with the rows at which set-points came; a recording begins with one of them."""
     every = 1 if sync_period_s is None else round(sync_period_s / window.dt_s)
     if every <= 1:
         return window
@@ -119,11 +116,10 @@ def _on_the_grid(window: Window, sync_period_s: float | None) -> Window:
 
 
 def _load(position_mm: Float, current_a: Float, plant: Parameters, window: Window) -> Float:
-    """Return the torque (n,) that a plant of six parameters does not explain, low-passed; held where it stands.
+    """Return the low-passed torque (n,) that a plant of six parameters does not explain; held at standstill.
 
-    Friction that is not as modelled, a load, ripples: whatever it is, the loops answer it, and it must not end in their
-    gains. Current and motion tell it without them. All of it goes through the same low-pass, whose second differences
-    of the position are exact.
+    Unmodelled friction, a load, ripples: the loops respond to them, and they must not bias the gains. All signals pass
+    the same low-pass, so that second differences of the position are exact.
     """
     width = max(1, round(LOW_PASS_S / window.dt_s)) | 1
     rad_per_mm = 2 * math.pi / window.pitch_mm
@@ -134,14 +130,13 @@ def _load(position_mm: Float, current_a: Float, plant: Parameters, window: Windo
     torque = plant.K * moving_mean(moving_mean(current_a, width), width)
     acceleration = np.diff(angle, 2, prepend=angle[0], append=angle[-1]) / window.dt_s**2
     rows = np.flatnonzero(all_about(moving, 2 * width + 1, beyond=False))
-    if not rows.size or width == 1:  # between rows so far apart the current is not what its instants say
+    if not rows.size or width == 1:  # in such long samples instants of the current are not its mean
         return np.zeros(window.n)
-    left = torque - friction - plant.Jt * acceleration
-    return np.asarray(np.interp(np.arange(window.n), rows, left[rows]))
+    unexplained = torque - friction - plant.Jt * acceleration
+    return np.asarray(np.interp(np.arange(window.n), rows, unexplained[rows]))
 
 
 def _creep(position_mm: Float, dt_s: float, least_mm: float) -> float:
-    """Return the speed (mm/s) of an axis that has not come to rest yet; 0 where it stands."""
     rows = position_mm.size
     if rows < 3 or abs(position_mm[-1] - position_mm[0]) < least_mm:
         return 0.0
@@ -149,10 +144,10 @@ def _creep(position_mm: Float, dt_s: float, least_mm: float) -> float:
 
 
 def smoothed(demand_mm: Float) -> Float:
-    """Return the smoothest course (n,) that rounds to a recorded demand: what an NC plans is smooth, and finer.
+    """Return the smoothest signal (n,) that rounds to a recorded demand: NCs plan more finely than they record.
 
-    Rounded to 1 um at 1 kHz a demand asks for jumps of the speed by 1 mm/s, which the drive never saw. The squares of
-    the third differences are weighed against the way from the record (Whittaker 1923), as far as rounding allows.
+    Rounded to 1 um at 1 kHz a demand has speed jumps of 1 mm/s that the drive never received. Squared third differences
+    are penalised (Whittaker 1923) as far as rounding allows.
     """
     steps = np.abs(np.diff(demand_mm))
     steps = steps[steps > NIL_MM]
@@ -168,8 +163,8 @@ def smoothed(demand_mm: Float) -> Float:
 
 
 def _whittaker(values: Float, weight: float) -> Float:
-    """Return the course (n,) with the least squared way from ``values`` + ``weight`` x squared third differences."""
-    from scipy.linalg import solveh_banded  # late: loops are rarely sought, and it is slow to import
+    """Return the signal (n,) of least squared distance to ``values`` + ``weight`` x squared third differences."""
+    from scipy.linalg import solveh_banded  # imported late: it is slow, and loops are rarely identified
 
     n, third = values.size, np.array([-1.0, 3.0, -3.0, 1.0])
     bands = np.zeros((PENALISED + 1, n))
@@ -181,9 +176,9 @@ def _whittaker(values: Float, weight: float) -> Float:
 
 
 def replay(rapid: Rapid, axis: Axis, delay_cycles: float) -> Float:
-    """Return position in mm and current in A (2, n) of the closed loop along a rapid's demand.
+    """Return the closed loop's position in mm and current in A (2, n) along a rapid's demand.
 
-    ``delay_cycles`` may lie between two whole numbers: it stands in the place of the regulators' own.
+    ``delay_cycles`` replaces the regulators' own delay and may be fractional.
     """
     whole = math.floor(delay_cycles)
     part = delay_cycles - whole
@@ -195,7 +190,7 @@ def replay(rapid: Rapid, axis: Axis, delay_cycles: float) -> Float:
 
 def _run(rapid: Rapid, axis: Axis, delay_cycles: int) -> Float:
     drive = with_regulators(axis, current_delay_cycles=delay_cycles)
-    # a load is a torque offset of the other sign, but for the current, which has it
+    # a load is a torque offset of the opposite sign, except in the current, which includes it
     offset = -rapid.load_nm * (axis.nominal.K / rapid.plant.K)
     start = standing(rapid, drive)
     answer = closed_loop.simulate(rapid.plant, drive, rapid.dt_s, rapid.demand_mm, torque_offset_nm=offset, state=start)
@@ -203,7 +198,7 @@ def _run(rapid: Rapid, axis: Axis, delay_cycles: int) -> Float:
 
 
 def standing(rapid: Rapid, axis: Axis) -> closed_loop.State:
-    """Return the state of an axis that stands, held by a current: what the position does not ask for is integrated."""
+    """Return the state of an axis at standstill, whose integrators supply the holding current."""
     g, rad_per_mm = axis.regulators, 2 * math.pi / axis.screw_pitch_mm
     speed = rapid.creep_mm_s * rad_per_mm
     lag = (rapid.demand_mm[0] - rapid.standstill_mm) * rad_per_mm
@@ -224,12 +219,12 @@ def standing(rapid: Rapid, axis: Axis) -> closed_loop.State:
 
 
 def with_regulators(axis: Axis, **values: float | str) -> Axis:
-    """Return an axis with other regulators, unchecked: for those who try many."""
+    """Return an axis with other regulators, without validation."""
     return axis.model_copy(update={"regulators": axis.regulators.model_copy(update=values)})
 
 
 def fitting_periods(regulators: Regulators, dt_s: float) -> dict[str, float]:
-    """Return the cycles of speed and current loop that divide a row: the configured ones where they do."""
+    """Return the configured periods of speed and current loop, adjusted to divide a sample."""
     speed = dt_s / max(1, round(dt_s / regulators.speed_period_s))
     current = speed / max(1, round(speed / regulators.current_period_s))
     return {"speed_period_s": speed, "current_period_s": current}

@@ -1,10 +1,8 @@
-"""Where the search for a drive's loops begins when no configuration tells, or when it leads astray: a coarse grid.
+"""Starts the search for a drive's loops without a usable configuration: a coarse grid.
 
-Of a cascade that is well set up, each loop is slower than the one inside it by a factor of a few. So the corner of the
-speed loop and two such factors span what drives are, and the lag at constant speed tells the feed-forward.
+In a well-tuned cascade each loop is slower than its inner loop by a factor of a few. The lag at constant speed
+determines the feed-forward.
 """
-
-from __future__ import annotations
 
 import math
 from dataclasses import replace
@@ -20,12 +18,12 @@ from fdhil.records import Window
 CASCADE = ("position_gain_per_s", "speed_feedforward", "speed_kp", "speed_ki")
 CORNERS_HZ = (8.0, 16.0, 32.0, 64.0, 128.0)
 SLOWER = (2.5, 5.0, 10.0)
-CURRENT_CORNER_HZ = 400.0  # faster than what rows of 1 ms show
+CURRENT_CORNER_HZ = 400.0  # faster than samples of 1 ms resolve
 NO_LIMIT = 1e5
 
 
 def begun_anew(problem: Problem) -> Problem:
-    """Return the problem begun at the best cascade of the grid, judged by the longest rapid; limits and cycles stay."""
+    """Return the problem started at the best cascade of the grid for the longest rapid; limits and cycles stay."""
     longest = int(np.argmax([np.ptp(one.demand_mm) for one in problem.rapids]))
     rapid = problem.rapids[longest]
     plant = rapid.plant
@@ -46,15 +44,15 @@ def begun_anew(problem: Problem) -> Problem:
             current_delay_cycles=0,
         )
         trial = Problem((rapid,), start, CASCADE)
-        left, _ = left_of(trial, trial.start())
-        cost = float(np.log(scale_of(trial, left)).sum())
+        residuals, _ = left_of(trial, trial.start())
+        cost = float(np.log(scale_of(trial, residuals)).sum())
         if cost < least:
             best, least = replace(problem, axis=start, names=CASCADE), cost
     return best
 
 
 def _feedforward(rapid: Rapid, gain: float) -> float:
-    """Return the share that is fed forward: at constant speed v the lag is v (1 - share) / Kv."""
+    """Return the feed-forward share: at constant speed v the lag is v (1 - share) / Kv."""
     speed = np.gradient(rapid.demand_mm, rapid.dt_s)
     steady = np.abs(speed) > 0.95 * np.abs(speed).max()
     share = 1.0 - gain * float(np.median(rapid.lag_mm[steady] / speed[steady]))
@@ -62,7 +60,7 @@ def _feedforward(rapid: Rapid, gain: float) -> float:
 
 
 def made_up_axis(window: Window, rapid: Rapid) -> Axis:
-    """Return an axis of which only a recording is known: a fast current loop, no limits, cycles that divide a row."""
+    """Return an axis for a recording alone: a fast current loop, no limits, cycles that divide a sample."""
     plant, current = rapid.plant, 2 * math.pi * CURRENT_CORNER_HZ
     regulators = Regulators(
         position_gain_per_s=1.0,

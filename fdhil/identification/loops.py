@@ -1,13 +1,9 @@
-"""Identifies a drive's own loops from its rapids: gains, feed-forward, filters, computing delay, structure.
+"""Identifies a drive's loops from its rapids: gains, feed-forward, filters, computing delay, structure.
 
-The four gains every cascade has are fitted first. What else a drive may have joins one key at a time, the likeliest of
-all first, as long as it explains a tenth of the tolerance at the table, or of what is left: over hundreds of
-rows no chance does either. The other structures of the table are tried against the cascade by the same measure. With
-full feed-forward and no filter, a cascade answers the same when position_gain_per_s and speed_ki / speed_kp change
-places: of the two the one nearer to where the fit began is told.
+The four gains of a cascade are fitted first; further keys are added one at a time, and other structures tried, while
+each explains a tenth of the tolerance or of the residual. With full feed-forward and no filter, exchanging
+position_gain_per_s and speed_ki / speed_kp changes nothing: the one nearer to the start is reported.
 """
-
-from __future__ import annotations
 
 import math
 from collections.abc import Sequence
@@ -25,21 +21,21 @@ from fdhil.identification.loop_replay import Rapid, fitting_periods, rapid_of, w
 from fdhil.identification.loop_start import CASCADE, begun_anew, made_up_axis
 from fdhil.records import INTERVAL_95, LoopEstimate, Parameters, Reason, Verdict, Window, frozen, rms
 
-WORTH, WORTH_LEFT = 0.1, 0.1  # of the tolerance, or of what is left: what a key must explain to join
+WORTH, WORTH_LEFT = 0.1, 0.1  # of the tolerance, or of the residual: least effect of another key
 LEAST_UM = 0.02
-WELL, NOTHING_UM = 0.25, 0.1  # of the tolerance, and in um: with less left nothing is missing
+WELL, NOTHING_UM = 0.25, 0.1  # of the tolerance, and in um: a smaller residual is complete
 MOST_WINDOWS, MOST_TRIED = 4, 4
 DIFFER = "LoopsDiffer"
-LOOSE = 0.25  # relative standard deviation above which a gain is not known
+LOOSE = 0.25  # relative standard deviation of an undetermined gain
 PID = ("position_gain_per_s", "speed_feedforward", "speed_kp", "position_ki_per_s2")
 SINGLE = ("speed_filter_s", "setpoint_filter_s", DELAY, "torque_feedforward", "position_ki_per_s2")
 SINGLE_KEYS = tuple((name,) for name in SINGLE)
-FILTERS = (("speed_filter_s", "setpoint_filter_s"),)  # they hide each other: neither alone explains much
+FILTERS = (("speed_filter_s", "setpoint_filter_s"),)  # they mask each other: neither alone explains much
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One key of the regulators as configured and as found; ``apart`` where chance does not explain the difference."""
+    """One key of the regulators as configured and as identified."""
 
     key: str
     configured: float
@@ -48,7 +44,7 @@ class Difference:
 
     @property
     def apart(self) -> bool:
-        """Whether the configured value lies outside the 95 % interval of what was found."""
+        """Whether the configured value lies outside the 95 % interval of the identified one."""
         return abs(self.found - self.configured) > INTERVAL_95 * self.std
 
 
@@ -61,39 +57,41 @@ def identify_loops(
     *,
     growing: bool = True,
 ) -> LoopEstimate | None:
-    """Return the loops of the drive whose rapids these are; None where no window tells demand, position and current.
+    """Return the loops of the drive that fitted the rapids; None where no window has demand, position and current.
 
-    ``mechanics`` are what each window's estimate says of the motor and what it moves, ``axis`` the machine's section:
-    without it the search begins from the demand alone. Set-points come every ``sync_period_s`` (left out: each row).
-    Without ``growing`` the keys that are configured are found anew, and no others are tried: that takes no time.
+    ``mechanics`` are the parameters identified from each window, ``axis`` is the machine's section; without it the
+    search starts from the demand alone. Set-points come every ``sync_period_s`` (default: every sample). Without
+    ``growing`` only the configured keys are fitted, which is fast.
     """
     if axis is not None and axis.regulators.structure == "linuxcnc_pid":
-        return None  # its gains are those of the HAL files, and no other structure stands in for it
+        return None  # its gains are those of the HAL files, and no other structure is equivalent
     on_time = [with_demand_on_time(window, axis, sync_period_s)[0] for window in windows[-MOST_WINDOWS:]]
     pairs = list(zip(on_time, mechanics[-MOST_WINDOWS:], strict=True))
-    told = [(rapid, own) for w, own in pairs if (rapid := rapid_of(w, own, sync_period_s)) is not None]
-    if not told:
+    usable = [(rapid, own) for w, own in pairs if (rapid := rapid_of(w, own, sync_period_s)) is not None]
+    if not usable:
         return None
-    rapids = tuple(rapid for rapid, _ in told)
+    rapids = tuple(rapid for rapid, _ in usable)
     following = rms(np.concatenate([one.lag_mm[one.known] for one in rapids])) * 1e3
     tolerance = settings.tolerance_for(following)
     problem = _problem(rapids, axis, windows[0])
-    modelled = tuple(replace(rapid, plant=own, load_nm=np.zeros_like(rapid.load_nm)) for rapid, own in told)
+    modelled = tuple(replace(rapid, plant=own, load_nm=np.zeros_like(rapid.load_nm)) for rapid, own in usable)
+    kinds = [replace(problem, rapids=r) for r in (rapids, modelled)]
     if growing:
         found = _whole_delay(_of_either(problem, modelled, tolerance, axis is not None))
     else:
-        fits = [loop_fit.fit(replace(problem, rapids=r)) for r in (rapids, modelled)]
-        found = _whole_delay(min(fits, key=lambda made: made.unexplained_um))
-    configured = None if axis is None else min(_left_um(replace(problem, rapids=r)) for r in (rapids, modelled))
+        fits = [loop_fit.fit(kind) for kind in kinds]
+        found = _whole_delay(min(fits, key=lambda fitted: fitted.unexplained_um))
+    residuals_mm = (loop_fit.spread_of(kind, loop_fit.left_of(kind, kind.start())[0])[0] for kind in kinds)
+    configured = None if axis is None else float(min(residuals_mm)) * 1e3
     verdict = _verdict(found, tolerance, following, configured)
     return _told(windows[0].axis, found, verdict, configured)
 
 
 def _of_either(problem: Problem, modelled: tuple[Rapid, ...], tolerance_um: float, configured: bool) -> Fit:
-    """Return the best fit with what the model lacks as a load, or without: sought again where the other is better.
+    """Return the best fit with or without unexplained torque as a load; searched again where the other is better.
 
-    A model that has all that is there is better without what noise makes of the rest. Sought is with one rapid of
-    either direction, fitted with all.
+    A complete model fits better without the noise in that torque. The search uses one rapid of either direction, the
+    final fit uses all.
     """
     few = _both_ways(problem.rapids)
     kinds = [problem.rapids, modelled]
@@ -110,18 +108,11 @@ def _of_either(problem: Problem, modelled: tuple[Rapid, ...], tolerance_um: floa
 
 
 def _both_ways(rapids: Sequence[Rapid]) -> list[int]:
-    """Return the newest rapid, and the newest of the other direction where there is one."""
     ways = [float(np.sign(rapid.demand_mm[-1] - rapid.demand_mm[0])) for rapid in rapids]
     return [j for side in (-1.0, 1.0) for j in [k for k, way in enumerate(ways) if way == side][-1:]] or [0]
 
 
-def _left_um(problem: Problem) -> float:
-    """Return what the regulators that the search begins with leave of the position."""
-    return float(loop_fit.spread_of(problem, loop_fit.left_of(problem, problem.start())[0])[0]) * 1e3
-
-
 def _problem(rapids: tuple[Rapid, ...], axis: Axis | None, window: Window) -> Problem:
-    """Return where the search begins: at the configured regulators, or at what the demand alone says."""
     if axis is None:
         return begun_anew(Problem(rapids, made_up_axis(window, rapids[-1]), CASCADE))
     axis = with_regulators(axis, **fitting_periods(axis.regulators, rapids[0].dt_s))
@@ -129,7 +120,6 @@ def _problem(rapids: tuple[Rapid, ...], axis: Axis | None, window: Window) -> Pr
 
 
 def _names(regulators: Regulators) -> tuple[str, ...]:
-    """Return the keys that a structure has, and the options that are configured."""
     base: tuple[str, ...] = PID if regulators.structure == "pid" else CASCADE
     if base == CASCADE and regulators.speed_ki == 0.0:
         base = CASCADE[:3]
@@ -137,9 +127,8 @@ def _names(regulators: Regulators) -> tuple[str, ...]:
 
 
 def _best(begun: Fit, tolerance_um: float, configured: bool) -> Fit:
-    """Return the best fit of all structures; another structure than that of the start must be worth it."""
     best = _grown(begun, tolerance_um)
-    if configured and best.unexplained_um > tolerance_um:  # the configuration may have led astray
+    if configured and best.unexplained_um > tolerance_um:  # the configuration may be a bad start
         best = min(best, _grown(loop_fit.fit(begun_anew(begun.problem)), tolerance_um), key=lambda f: f.unexplained_um)
     if best.problem.names == CASCADE and beyond_rounding_um(best) < enough_um(tolerance_um):
         return best
@@ -151,52 +140,50 @@ def _best(begun: Fit, tolerance_um: float, configured: bool) -> Fit:
     return best
 
 
-def _grown(made: Fit, tolerance_um: float) -> Fit:
-    """Let keys join, the likeliest first, as long as it is worth it; two at once where that is worth more."""
-    begun = made.problem.names
-    while beyond_rounding_um(made) > enough_um(tolerance_um):
-        options = [option for option in (*SINGLE_KEYS, *FILTERS) if not {*option} & {*made.problem.names}]
-        starts = loop_fit.likeliest(made, options)[:MOST_TRIED] if options else []
+def _grown(fitted: Fit, tolerance_um: float) -> Fit:
+    begun = fitted.problem.names
+    while beyond_rounding_um(fitted) > enough_um(tolerance_um):
+        options = [option for option in (*SINGLE_KEYS, *FILTERS) if not {*option} & {*fitted.problem.names}]
+        starts = loop_fit.likeliest(fitted, options)[:MOST_TRIED] if options else []
         fits = (loop_fit.fit(start.problem, start.coordinates) for start in starts)
-        grown = min(fits, key=lambda f: f.deviance, default=made)
-        if not made.unexplained_um - grown.unexplained_um > worth_um(made, tolerance_um):
+        grown = min(fits, key=lambda f: f.deviance, default=fitted)
+        if not fitted.unexplained_um - grown.unexplained_um > worth_um(fitted, tolerance_um):
             break
-        made = grown
-    return _without_spare_keys(made, [name for name in made.problem.names if name not in begun], tolerance_um)
+        fitted = grown
+    return _without_spare_keys(fitted, [name for name in fitted.problem.names if name not in begun], tolerance_um)
 
 
-def _without_spare_keys(made: Fit, joined: Sequence[str], tolerance_um: float) -> Fit:
-    """Return the fit without those of several keys that joined whose part the others take."""
-    for name in joined if len(joined) > 1 else ():
-        problem, place = made.problem, made.problem.names.index(name)
+def _without_spare_keys(fitted: Fit, added: Sequence[str], tolerance_um: float) -> Fit:
+    for name in added if len(added) > 1 else ():
+        problem, place = fitted.problem, fitted.problem.names.index(name)
         names = tuple(other for other in problem.names if other != name)
         fewer = replace(problem, axis=with_regulators(problem.axis, **{name: 0}), names=names)
-        without = loop_fit.fit(fewer, np.delete(made.coordinates, place))
-        if without.unexplained_um - made.unexplained_um <= worth_um(without, tolerance_um):
-            made = without
-    return made
+        without = loop_fit.fit(fewer, np.delete(fitted.coordinates, place))
+        if without.unexplained_um - fitted.unexplained_um <= worth_um(without, tolerance_um):
+            fitted = without
+    return fitted
 
 
-def beyond_rounding_um(made: Fit) -> float:
-    """Return what is left of the position beyond the rounding of its record."""
-    rounding = max(rapid.resolution_mm for rapid in made.problem.rapids) * 1e3
-    return math.sqrt(max(made.unexplained_um**2 - rounding**2 / 12, 0.0))
+def beyond_rounding_um(fitted: Fit) -> float:
+    """Return the residual of the position beyond the rounding of its recording."""
+    rounding = max(rapid.resolution_mm for rapid in fitted.problem.rapids) * 1e3
+    return math.sqrt(max(fitted.unexplained_um**2 - rounding**2 / 12, 0.0))
 
 
 def enough_um(tolerance_um: float) -> float:
-    """Return how little may be left for nothing to be missing."""
+    """Return the residual below which the model is complete."""
     return min(NOTHING_UM, WELL * tolerance_um)
 
 
-def worth_um(made: Fit, tolerance_um: float) -> float:
-    """Return by how much another key, or another structure, must explain more than this fit does."""
-    return max(LEAST_UM, min(WORTH * tolerance_um, WORTH_LEFT * made.unexplained_um))
+def worth_um(fitted: Fit, tolerance_um: float) -> float:
+    """Return by how much another key, or another structure, must lower the residual of this fit."""
+    return max(LEAST_UM, min(WORTH * tolerance_um, WORTH_LEFT * fitted.unexplained_um))
 
 
-def _other_structure(made: Fit) -> Problem | None:
-    """Return the other law of the table, begun where it is nearest to this one: a cascade is a PID but for a filter."""
-    problem = made.problem
-    found = made.axis()
+def _other_structure(fitted: Fit) -> Problem | None:
+    """Return the other structure, started at its nearest equivalent: a cascade is a PID except for a filter."""
+    problem = fitted.problem
+    found = fitted.axis()
     g = found.regulators
     keep = tuple(n for n in problem.names if n in SINGLE and n not in ("speed_filter_s", "position_ki_per_s2"))
     if g.structure == "pid":
@@ -223,55 +210,54 @@ def _other_structure(made: Fit) -> Problem | None:
     return replace(problem, axis=axis, names=(*PID, *keep))
 
 
-def _whole_delay(made: Fit) -> Fit:
-    """Return the fit with a whole number of cycles as delay, the rest found anew."""
-    problem = made.problem
+def _whole_delay(fitted: Fit) -> Fit:
+    problem = fitted.problem
     if DELAY not in problem.names:
-        return made
+        return fitted
     place = problem.names.index(DELAY)
-    cycles = round(made.coordinates[place])
+    cycles = round(fitted.coordinates[place])
     axis = with_regulators(problem.axis, **{DELAY: cycles})
     fewer = replace(problem, axis=axis, names=tuple(n for n in problem.names if n != DELAY))
-    again = loop_fit.fit(fewer, np.delete(made.coordinates, place))
+    again = loop_fit.fit(fewer, np.delete(fitted.coordinates, place))
     return replace(again, problem=replace(problem, axis=axis), coordinates=np.insert(again.coordinates, place, cycles))
 
 
-def _told(name: str, made: Fit, verdict: Verdict, configured_um: float | None) -> LoopEstimate:
-    """Return the answer in the units of the keys."""
-    names = made.problem.names
-    values = made.values
+def _told(name: str, fitted: Fit, verdict: Verdict, configured_um: float | None) -> LoopEstimate:
+    names = fitted.problem.names
+    values = fitted.values
     slope = [KEYS[n].scale or v for n, v in values.items()]
-    covariance = loop_fit.covariance_of(made) * np.outer(slope, slope)
-    structure = made.problem.axis.regulators.structure
+    covariance = loop_fit.covariance_of(fitted) * np.outer(slope, slope)
+    structure = fitted.problem.axis.regulators.structure
     if structure != "pid":
         structure = "double_pi" if values.get("position_ki_per_s2", 0.0) > 0.0 else "p_pi_pi"
     return LoopEstimate(name, structure, names, frozen([*values.values()]), frozen(covariance), verdict, configured_um)
 
 
-def _verdict(made: Fit, tolerance_um: float, following_um: float, configured_um: float | None) -> Verdict:
-    """Return whether the loops explain the rapids, and what the configured ones leave beyond that."""
-    left = made.unexplained_um
+def _verdict(fitted: Fit, tolerance_um: float, following_um: float, configured_um: float | None) -> Verdict:
+    residual_um = fitted.unexplained_um
     reasons, warnings = [], []
-    if not left <= tolerance_um:
-        text = f"the best loops leave {left:.3g} um of a following error of {following_um:.3g} um"
-        advice = "the drive has a structure or a filter that is not known; identification.tolerance_um may be raised"
+    if not residual_um <= tolerance_um:
+        text = f"the best loops leave {residual_um:.3g} um of a following error of {following_um:.3g} um unexplained"
+        advice = (
+            "the drive has an unknown structure or filter; check its regulators, or raise identification.tolerance_um"
+        )
         reasons.append(Reason("LoopsUnexplained", f"{text}, more than {tolerance_um:.3g} um", advice))
-    elif configured_um is not None and configured_um - left > WORTH * tolerance_um:
+    elif configured_um is not None and configured_um - residual_um > WORTH * tolerance_um:
         text = f"the configured regulators leave {configured_um:.3g} um of a following error of {following_um:.3g} um"
-        advice = "put what was found into [axis.X.regulators]"
-        warnings.append(Reason(DIFFER, f"{text}, those found {left:.3g} um", advice))
-    doubts = np.sqrt(np.diag(loop_fit.covariance_of(made)))
-    for n, doubt in zip(made.problem.names, doubts, strict=True):
+        advice = "write the identified values to [axis.X.regulators]"
+        warnings.append(Reason(DIFFER, f"{text}, the identified ones {residual_um:.3g} um", advice))
+    doubts = np.sqrt(np.diag(loop_fit.covariance_of(fitted)))
+    for n, doubt in zip(fitted.problem.names, doubts, strict=True):
         if KEYS[n].scale == 0.0 and doubt > LOOSE:
-            text = f"{n} is known to {100 * doubt:.0f} % only"
-            warnings.append(Reason("LoopsUndetermined", text, "let the axis accelerate harder"))
-    return Verdict(not reasons, None, tuple(reasons), left, tuple(warnings))
+            text = f"the standard deviation of {n} is {100 * doubt:.0f} %, limit {100 * LOOSE:.0f} %"
+            warnings.append(Reason("LoopsUndetermined", text, "record rapids with a higher acceleration"))
+    return Verdict(not reasons, None, tuple(reasons), residual_um, tuple(warnings))
 
 
 def better_loops(loops: LoopEstimate) -> bool:
-    """Return whether loops are believed and explain more than the configured ones, so that they are used instead.
+    """Return whether the loops are accepted and fit better than the configured ones, so that they are used instead.
 
-    What no configuration may hold is no drive's: a demand that is not what the drive follows gives such values.
+    Values that no configuration may have are rejected: they come from a demand that the drive did not follow.
     """
     differ = any(warning.code == DIFFER for warning in loops.verdict.warnings)
     return loops.verdict.accepted and differ and _may_be_configured(loops)
@@ -287,26 +273,26 @@ def _may_be_configured(loops: LoopEstimate) -> bool:
 
 
 def with_loops(axis: Axis, loops: LoopEstimate) -> Axis:
-    """Return the axis with the regulators that were identified in the place of the configured ones."""
+    """Return the axis with the identified regulators."""
     values = {**axis.regulators.model_dump(), **regulators_of(loops)}
     return axis.model_copy(update={"regulators": Regulators.model_validate(values)})
 
 
 def regulators_of(loops: LoopEstimate) -> dict[str, Any]:
-    """Return keys of ``[axis.X.regulators]`` as they were found; what a structure does not have is 0."""
+    """Return the identified keys of ``[axis.X.regulators]``; keys that the structure lacks are 0."""
     lacks = {"pid": ("speed_ki", "speed_filter_s"), "p_pi_pi": ("position_ki_per_s2",)}.get(loops.structure, ())
     found = dict(zip(loops.names, loops.values.tolist(), strict=True))
     return {"structure": loops.structure, **found, **dict.fromkeys(lacks, 0.0)}
 
 
 def changed_regulators(configured: Axis, used: Axis) -> dict[str, Any]:
-    """Return the keys of ``[axis.X.regulators]`` by which the used regulators differ from the configured ones."""
+    """Return the keys of ``[axis.X.regulators]`` whose used value differs from the configured one."""
     before = configured.regulators.model_dump()
     return {key: value for key, value in used.regulators.model_dump().items() if value != before[key]}
 
 
 def differences(axis: Axis, loops: LoopEstimate) -> list[Difference]:
-    """Return every key that was identified beside its configured value."""
+    """Return each identified key with its configured value."""
     spread = np.sqrt(np.diag(loops.covariance))
     return [
         Difference(name, float(getattr(axis.regulators, name)), float(value), float(std))

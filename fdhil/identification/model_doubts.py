@@ -1,11 +1,9 @@
-"""Bounds what a model that is nearly right leaves open, however many samples there are.
+"""Bounds what a nearly right model leaves open, however many samples there are.
 
-Axes d and q of a motor are not quite parted, windings and magnets saturate a little, and friction is no straight line
-over speed. Where such a remainder has the shape of a parameter's own regressor, no residual shows it: it is one
-standard deviation of the parameter, the same in all windows of a drive.
+The d and q axes of a motor are not perfectly decoupled, windings and magnets saturate slightly, and friction is not
+linear in speed. A deviation shaped like a parameter's own regressor leaves no residual: it counts as one standard
+deviation of the parameter, common to all windows of a drive.
 """
-
-from __future__ import annotations
 
 from collections.abc import Mapping
 
@@ -16,12 +14,12 @@ from fdhil.identification.kalman import CD, FT, K, L, R
 from fdhil.records import Float
 
 SHARES: Mapping[int, float] = {R: 0.008, L: 0.03, K: 0.0003}
-CURVE_SHARE = 0.004  # of the friction at top speed, by which a straight line over speed misses it
+CURVE_SHARE = 0.004  # of the friction at top speed: its deviation from a straight line over speed
 CROSSING = 1.5  # top speed over the one at which the straight line meets the curve again
 
 
 def model_doubts(result: Fit) -> Float:
-    """Return (k, 4) one standard deviation of the entries of theta for a remainder shaped as R, L, K or friction."""
+    """Return (k, 4) standard deviations of theta for unmodelled deviations shaped like R, L, K or friction."""
     theta, top = result.theta, max(float(np.abs(m.speed).max()) for m in result.problem.motions)
     doubts = np.zeros((theta.size, 4))
     for column, (entry, share) in enumerate(SHARES.items()):

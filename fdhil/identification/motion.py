@@ -1,4 +1,4 @@
-"""Makes a window ready for the estimators: where the drive surely moves, and the voltage over each interval."""
+"""Prepares a window for the estimators: where the drive is in motion, and the voltage over each interval."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from fdhil.identification.windows import RUN_SHARE, bridged, carried, noise_of, 
 from fdhil.model.feed_drive import interval_shape
 from fdhil.records import Bool, Float, SlowVoltage, VoltageSampling, Window
 
-UNKNOWN = 0  # stuck, reversing or about to move: the friction torque is not known
-# what the model can explain at best, as a share of a signal's peak: the voltage's course within a sample is not known
+UNKNOWN = 0  # stuck, reversing or about to move: the friction torque is unknown
+# best possible accuracy of the model, as a share of a signal's peak: the voltage's waveform within a sample is unknown
 SHAPE_SHARE = (3e-4, 1e-4, 1e-4)
-BROKEN = 9  # a sample is lost: nothing is known over this interval
-DIFFUSE = 1e6  # variance, in units of the measurement's, of a state about which nothing is known
+BROKEN = 9  # a sample is lost: the interval is skipped
+DIFFUSE = 1e6  # variance, in units of the measurement's, of an unknown state
 
 Modes = npt.NDArray[np.int8]
 
@@ -38,11 +38,10 @@ class Noise:
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """What one unit of a term is over each interval of a window, ``values`` (n,), in which all is linear.
+    """The effect of one unit of a term over each interval of a window, ``values`` (n,); the model is linear in it.
 
-    Its ``kind`` is the signal that it adds to, as :mod:`fdhil.identification.courses` has them.
-    Friction at low speed falls off with ``speed_rad_s``. The term is the amplitude and what it is counted from,
-    ``about``.
+    ``kind`` is the signal it adds to. Stribeck friction decays with ``speed_rad_s``. The term is the fitted amplitude
+    plus ``about``.
     """
 
     name: str
@@ -54,7 +53,7 @@ class Course:
 
 @dataclass(frozen=True, slots=True)
 class Within:
-    """What is not known of long rows, (q, n) one standard deviation a row of each: the voltage's rise, the current."""
+    """Unknowns within long samples, (q, n) one standard deviation each: the voltage's rise, the current."""
 
     rise_v: Float
     current_a: Float
@@ -62,19 +61,18 @@ class Within:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """One window on its grid: ``mode`` (n,) says what is known of the interval that begins at each row.
+    """One window on its grid: ``mode`` (n,) classifies the interval that begins at each sample.
 
-    +1 or -1: the drive surely moves that way; ``UNKNOWN``: friction is not known; ``BROKEN``: samples are lost.
+    +1 or -1: the drive is in motion that way; ``UNKNOWN``: friction is unknown; ``BROKEN``: samples are lost.
     ``voltage_mean`` and ``voltage_rise`` (n,) describe the voltage over each interval; ``current`` and ``speed`` (n,)
-    are instants, ``observed`` (n,) marks the rows that were measured. ``speed_walk`` is the standard deviation of the
-    speed's change over an interval of unknown friction. Where the voltage is ``slow``, ``voltage_mean`` (m,) are its
-    samples, and ``slope_walk`` (n,) is the variance that the current's slope gains per second, (A/s)^2/s,
-    and ``shape_variance`` (m,), V^2, what the voltage's course within a row adds to its noise. ``courses`` are those of
-    the terms that joined, in the order of the last entries of theta;
-    ``angle_rad`` (n,) is the shaft's as its place tells, or has no rows;
-    ``within`` is what is open within long rows, ``known`` are courses whose size is;
-    below ``noise_floor`` of what its readings show no noise level is sought: it has no effect that could be seen;
-    ``speed_late`` is by how many seconds the recorded speed was late, and the standard deviation of that.
+    are instants, ``observed`` (n,) marks measured samples. ``speed_walk`` is the standard deviation of the speed's
+    change over an interval of unknown friction. With a ``slow`` voltage, ``voltage_mean`` (m,) are its samples,
+    ``slope_walk`` (n,), (A/s)^2/s, is the variance that the current's slope gains per second, and ``shape_variance``
+    (m,), V^2, is the variance due to the voltage's waveform within a sample. ``courses`` are the regressors of the
+    terms, in the order of the last entries of theta; ``known`` are regressors of fixed size. ``angle_rad`` (n,) is the
+    shaft's angle, or empty. ``within`` holds the unknowns within long samples. Noise levels are not fitted below
+    ``noise_floor`` of the visible noise, where they have no visible effect. ``speed_late`` is the lag in s that was
+    removed from the speed, with its standard deviation.
     """
 
     dt_s: float
@@ -99,27 +97,26 @@ class Motion:
 
     @property
     def n(self) -> int:
-        """Number of rows."""
+        """Number of samples."""
         return int(self.speed.size)
 
     @property
     def samples(self) -> int:
-        """Number of samples of a slow voltage."""
+        """Number of samples of a low-rate voltage."""
         return 0 if self.slow is None else int(self.slow.voltage_v.size)
 
     @property
     def voltage_period_s(self) -> float:
-        """The time from one voltage sample to the next."""
+        """The sampling period of the voltage."""
         return self.dt_s if self.slow is None else self.slow.period_s
 
     def at_voltage(self, course: Float) -> Float:
-        """Return a course over the rows (n,) at the begin of each voltage sample."""
+        """Return a signal (n,) at the begin of each voltage sample."""
         if self.slow is None:
             return course
         begins = self.slow.begin_s + self.slow.period_s * np.arange(self.slow.voltage_v.size)
         begins = begins if self.slow.late_s is None else begins + self.slow.late_s
-        sampled: Float = np.interp(begins, np.arange(self.n) * self.dt_s, course)
-        return sampled
+        return np.interp(begins, np.arange(self.n) * self.dt_s, course)
 
     def aligned(self, delay_s: float) -> Motion:
         """Return the motion with its voltage earlier by ``delay_s``."""
@@ -128,7 +125,7 @@ class Motion:
         return replace(self, voltage_mean=self.delayed(delay_s))
 
     def delayed(self, delay_s: float) -> Float:
-        """Return the mean voltage (n,) of each interval when the measured voltage is late by ``delay_s``."""
+        """Return the mean voltage (n,) of each interval, corrected for a voltage that is late by ``delay_s``."""
         if delay_s == 0.0:
             return self.voltage_mean
         rows = delay_s / self.dt_s
@@ -139,12 +136,11 @@ class Motion:
             shifted[-whole:], rise[-whole:] = self.voltage_mean[-1], 0.0
         elif whole < 0:
             shifted[:-whole], rise[:-whole] = self.voltage_mean[0], 0.0
-        moved: Float = shifted + (rows - whole) * rise
-        return moved
+        return shifted + (rows - whole) * rise
 
 
 def surely_moving(speed: Float, rapid_rad_s: float) -> Bool:
-    """Return where (n,) the shaft surely turns, over the whole reach of the smoothing that decides it."""
+    """Return where (n,) the shaft is in motion over the whole width of the smoothing that decides it."""
     limit = RUN_SHARE * rapid_rad_s
     width = 2 * int(np.clip((5 * noise_of(speed) / limit) ** 2, 0, 15)) + 1
     smoothed = moving_mean(carried(speed), width)
@@ -154,7 +150,7 @@ def surely_moving(speed: Float, rapid_rad_s: float) -> Bool:
 
 
 def prepare(window: Window) -> Motion:
-    """Return the window as the estimators need it; its voltage must be there and it must have rows."""
+    """Prepare a window for the estimators. ValueError without a voltage."""
     slow = window.slow_voltage
     if window.voltage_v is None and slow is None:
         raise ValueError("a window without voltage has no electrical equation")
@@ -162,7 +158,7 @@ def prepare(window: Window) -> Motion:
     sure = surely_moving(window.speed_rad_s, window.rapid_speed_rad_s)
     side = np.sign(carried(window.speed_rad_s)).astype(np.int8)
     mode = np.where(sure, np.sign(_majority(side, sure)), UNKNOWN).astype(np.int8)
-    mode[:-1][mode[:-1] != mode[1:]] = UNKNOWN  # an interval belongs to a motion when both its ends do
+    mode[:-1][mode[:-1] != mode[1:]] = UNKNOWN  # both ends of an interval must be in the same motion
     if slow is not None:
         mean, rise = carried(slow.voltage_v), np.zeros(slow.voltage_v.size)
     elif window.voltage_v is not None:
@@ -189,12 +185,11 @@ def prepare(window: Window) -> Motion:
 def _angle(window: Window) -> Float:
     if not np.isfinite(window.position_mm).any():
         return np.zeros(0)
-    angle: Float = bridged(window.position_mm) * (2 * math.pi / window.pitch_mm)
-    return angle
+    return bridged(window.position_mm) * (2 * math.pi / window.pitch_mm)
 
 
 def _majority(side: Modes, sure: Bool) -> Modes:
-    """Return for every row the direction that most rows of its moving stretch have (noise may flip single rows)."""
+    """Return for each sample the majority direction of its moving stretch: noise may flip single samples."""
     result = np.zeros_like(side)
     for a, b in runs_of(sure, 1):
         result[a:b] = 1 if side[a:b].sum(dtype=np.int64) >= 0 else -1
@@ -203,10 +198,7 @@ def _majority(side: Modes, sure: Bool) -> Modes:
 
 @lru_cache(maxsize=8)
 def noise_levels(window: Window) -> Noise:
-    """Return the noise of the three signals as their third differences show it, never below their resolution.
-
-    Estimator and checks ask for it several times a window.
-    """
+    """Return the noise of the three signals from their third differences, at least their resolution."""
     voltage = window.slow_voltage.voltage_v if window.slow_voltage is not None else window.voltage_v
     signals = (voltage, window.current_a, window.speed_rad_s)
     levels = [_level(s, share) for s, share in zip(signals, SHAPE_SHARE, strict=True)]
@@ -222,7 +214,7 @@ def _level(values: Float | None, share: float) -> float:
 
 
 def resolution(values: Float) -> float:
-    """Return the smallest step between different values, 0 when there is only one."""
+    """Return the smallest step between different values, 0 for a constant."""
     if values.size < 2:
         return 0.0
     ordered = np.sort(values)

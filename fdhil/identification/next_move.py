@@ -1,10 +1,8 @@
-"""Predicts which further move narrows the intervals of an estimate most: by the information of [1] and [2].
+"""Predicts which further move narrows the intervals of an estimate most, by the information of [1] and [2].
 
-Each row of a move adds the information of its regressors, divided by the variance that the sensors' noise gives to the
-equation ([LJU] ch. 13). Moves are simulated with the estimated model, within the voltage of the recording.
+Each sample adds the information of its regressors, divided by the variance of the equation due to sensor noise ([LJU]
+ch. 13). Moves are simulated with the estimated model, within the voltage of the recording.
 """
-
-from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -17,7 +15,7 @@ from fdhil.identification.windows import carried
 from fdhil.model.feed_drive import simulate_plant
 from fdhil.records import PARAMETERS, Estimate, Float, Parameters, Window
 
-MOVES: Mapping[str, Callable[[Float], Float]] = {  # share (n,) of the voltage over the share (n,) of the time
+MOVES: Mapping[str, Callable[[Float], Float]] = {  # share (n,) of the voltage over that of the time
     "steps of voltage in both directions": lambda t: np.array([0.0, 0.5, 1.0, -1.0, -0.5, 0.0])[(t * 6).astype(int)],
     "fast chirp about half the voltage": lambda t: 0.5 + 0.5 * np.sin(2 * np.pi * (2.0 + 60.0 * t) * t),
     "slowly in both directions": lambda t: np.where(t < 0.5, 0.15, -0.15),
@@ -27,16 +25,16 @@ MOVES: Mapping[str, Callable[[Float], Float]] = {  # share (n,) of the voltage o
 
 @dataclass(frozen=True)
 class NextMove:
-    """A further move: the least share of its present interval that it leaves to each parameter."""
+    """A further move, and the share of the present interval that remains at least for each parameter."""
 
     name: str
     shares: Mapping[str, float]
 
 
 def predict_next_moves(window: Window, estimate: Estimate) -> list[NextMove]:
-    """Return for each move, as long as the window, what it leaves of the intervals, the same recording again first.
+    """Return for each move, as long as the window, the remaining intervals; the same recording again comes first.
 
-    What the sensors' noise does not explain of the intervals of the ``estimate`` stays, whatever is recorded.
+    The part of the intervals that sensor noise does not explain remains in any case.
     """
     if window.voltage_v is None:
         return []

@@ -1,6 +1,4 @@
-"""Tells the noise levels of voltage, current and speed, for given parameters, by the likelihood of the innovations."""
-
-from __future__ import annotations
+"""Fits the noise levels of voltage, current and speed for given parameters, by the likelihood of the innovations."""
 
 from collections.abc import Callable
 
@@ -13,14 +11,11 @@ from fdhil.records import Float
 ITERATIONS = 12
 STEP = 0.05
 LARGEST = 1.0
-ENOUGH = 0.15  # what such a step leaves is less than the data can tell
+ENOUGH = 0.15  # smaller steps are below the data's resolution
 
 
 def fit_noise(motion: Motion, theta: Float, start: Noise) -> Noise:
-    """Return the noise levels that make the innovations most likely, by Newton steps on their logarithms.
-
-    ``theta`` (7,) is [R, L, K, Jt, ft, Cd, delay].
-    """
+    """Return the most likely noise levels for ``theta`` (7,), by Newton steps on their logarithms."""
     lower = np.log(motion.noise.vector()) + np.log(motion.noise_floor)
     x = np.log(start.vector())
 
@@ -50,7 +45,6 @@ def fit_noise(motion: Motion, theta: Float, start: Noise) -> Noise:
 
 
 def _differences(costs: Callable[[Float], Float], x: Float, here: float) -> tuple[Float, Float]:
-    """Return gradient (3,) and diagonal curvature (3,) by central differences."""
     steps = STEP * np.eye(3)
     around = costs(np.concatenate([x + steps, x - steps]))
     high, low = around[:3], around[3:]

@@ -1,11 +1,9 @@
-"""Solves linear least squares by scaled normal equations: small, fast, and on one thread.
+"""Solves linear least squares by scaled normal equations: small, fast, on one thread.
 
-The regressions here have a handful of well-scaled columns and thousands of rows; an orthogonal factorisation would
-cost ten times more and, in a library with its own threads, disturb the bus's receive thread. At six columns most of a
-library call is its way there and back, so the small matrix is taken apart here.
+An orthogonal factorisation of some thousand samples would cost ten times more, and a library's own threads would
+disturb the bus's receive thread. At six columns a library call is mostly overhead, so the small matrix is diagonalised
+here.
 """
-
-from __future__ import annotations
 
 import numpy as np
 
@@ -13,8 +11,8 @@ from fdhil.model.compiled import compiled
 from fdhil.records import Float
 
 NIL = 1e-15  # of the largest power: below it a direction is rounding
-ROUNDING = 1e-16  # of two powers: below it they need no turn
-SWEEPS = 30  # of Jacobi's rotations: six do for any matrix of this size
+ROUNDING = 1e-16  # of two powers: below it no rotation is needed
+SWEEPS = 30  # of Jacobi rotations: six suffice for any matrix of this size
 
 
 def solve(phi: Float, y: Float) -> tuple[Float, float]:
@@ -45,7 +43,7 @@ def root_of(information: Float) -> Float:
 
 @compiled
 def _turned(matrix: Float) -> tuple[Float, Float]:
-    """Return eigenvalues (k,) and eigenvectors (k, k) of a symmetric matrix by Jacobi's rotations."""
+    """Return eigenvalues (k,) and eigenvectors (k, k) of a symmetric matrix by Jacobi rotations."""
     a = matrix.copy()
     k = a.shape[0]
     axes = np.eye(k)
@@ -75,7 +73,7 @@ def _turned(matrix: Float) -> tuple[Float, Float]:
 def _parted(gram: Float) -> tuple[Float, float, bool]:
     """Return a root (k, r) of the inverse, the condition number, and whether all is finite.
 
-    The matrix is scaled to a unit diagonal first, and directions of no power are left out.
+    The matrix is scaled to a unit diagonal first; directions without power are left out.
     """
     k = gram.shape[0]
     scale = np.empty(k)

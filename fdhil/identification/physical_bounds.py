@@ -1,10 +1,7 @@
-"""Keeps estimates within what a drive can physically be: the likeliest values that respect every bound.
+"""Bounds estimates to physically possible drives, by the constrained maximum of their normal likelihood.
 
-Where chance took an estimate beyond a bound, the maximum of its normal likelihood under the bounds takes its place: a
-step along the covariance to the bounds that hold it. The covariance stays: the interval is that of the data.
+The covariance is kept: the interval is that of the data.
 """
-
-from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,15 +11,15 @@ import numpy as np
 from fdhil.model.physical import Bound, bounds
 from fdhil.records import Estimate, Float, frozen
 
-SIGNIFICANT = 3.0  # standard deviations beyond a bound that are not due to chance
+SIGNIFICANT = 3.0  # standard deviations beyond a bound
 _FRICTION = ("Cd", "stribeck")
 
 
 def bounded(estimate: Estimate, direction: int | None = None) -> Estimate:
-    """Return the estimate within all physical bounds; itself where it lies within them.
+    """Return the estimate within all physical bounds; the estimate itself where it respects them.
 
-    Of moves in one ``direction`` a constant load is part of the dry friction: what makes that surely negative is told
-    as ``load``.
+    In moves of one ``direction`` a constant load is part of the dry friction: what makes that significantly negative is
+    reported as ``load``.
     """
     if direction is not None:
         estimate = _with_load(estimate, direction)
@@ -32,7 +29,7 @@ def bounded(estimate: Estimate, direction: int | None = None) -> Estimate:
 
 
 def nearest(names: Sequence[str], values: Float, covariance: Float) -> Float:
-    """Return the likeliest values (k,) within the bounds, for the covariance (k, k); ``values`` itself if it is."""
+    """Return the likeliest values (k,) within the bounds, for the covariance (k, k); ``values`` itself if unchanged."""
     usable = np.isfinite(values) & np.isfinite(np.diag(covariance))
     rows = [k for k in range(len(names)) if usable[k]]
     known = [names[k] for k in rows]
@@ -47,15 +44,15 @@ def nearest(names: Sequence[str], values: Float, covariance: Float) -> Float:
 
 
 def beyond_chance(names: Sequence[str], values: Float, covariance: Float) -> list[tuple[Bound, float]]:
-    """Return the bounds beyond which values (k,) surely lie, each with the sum that should not be below it."""
-    told = _told(names, values)
+    """Return the bounds that values (k,) violate significantly, each with the sum that should not be below it."""
+    named = _told(names, values)
     found = []
-    for bound in bounds([name for name, value in told.items() if np.isfinite(value)]):
+    for bound in bounds([name for name, value in named.items() if np.isfinite(value)]):
         row = _row(bound, names)
         known = np.flatnonzero(row)
         std = float(np.sqrt(row[known] @ covariance[np.ix_(known, known)] @ row[known]))
-        if bound.beyond(told) > SIGNIFICANT * std:
-            found.append((bound, bound.least - bound.beyond(told)))
+        if bound.beyond(named) > SIGNIFICANT * std:
+            found.append((bound, bound.least - bound.beyond(named)))
     return found
 
 
@@ -68,12 +65,12 @@ def _row(bound: Bound, names: Sequence[str]) -> Float:
 
 
 def _broken(listed: Sequence[Bound], names: Sequence[str], values: Float) -> list[Bound]:
-    told = _told(names, values)
-    return [bound for bound in listed if bound.beyond(told) > 0.0]
+    named = _told(names, values)
+    return [bound for bound in listed if bound.beyond(named) > 0.0]
 
 
 def _projected(listed: Sequence[Bound], names: Sequence[str], start: Float, covariance: Float) -> Float:
-    """Return the values nearest to ``start``, measured by the covariance, within the bounds: an active-set method."""
+    """Return the values within the bounds nearest to ``start`` in the covariance metric, by an active-set method."""
     values, active = start, list[Bound]()
     for _ in range(2 * len(listed)):
         broken = [b for b in _broken(listed, names, values) if b not in active]
@@ -92,17 +89,16 @@ def _projected(listed: Sequence[Bound], names: Sequence[str], start: Float, cova
 
 
 def _settled(names: Sequence[str], values: Float, listed: Sequence[Bound], active: Sequence[Bound]) -> Float:
-    """Return the values on their ``active`` bounds to the last bit, and on those that no doubt let them reach."""
-    told = _told(names, values)
+    """Return the values exactly on their ``active`` bounds, to the last bit."""
+    named = _told(names, values)
     for bound in listed:
-        if bound in active or bound.beyond(told) > 0.0:
-            others = sum(weight * told[name] for name, weight in bound.weights.items() if name != bound.moves)
-            told[bound.moves] = (bound.least - others) / bound.weights[bound.moves]
-    return np.array([*told.values()])
+        if bound in active or bound.beyond(named) > 0.0:
+            others = sum(weight * named[name] for name, weight in bound.weights.items() if name != bound.moves)
+            named[bound.moves] = (bound.least - others) / bound.weights[bound.moves]
+    return np.array([*named.values()])
 
 
 def _with_load(estimate: Estimate, direction: int) -> Estimate:
-    """Return the estimate with the part of its friction that surely is a load as ``load``, N.m."""
     found = beyond_chance(estimate.names, estimate.values, estimate.covariance)
     surely = [(bound, value) for bound, value in found if set(bound.weights) <= set(_FRICTION)]
     if not surely or "load" in estimate.names:

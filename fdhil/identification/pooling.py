@@ -1,8 +1,7 @@
-"""Combines the estimates of several windows of one drive, and tells how far two of them may lie apart by chance.
+"""Pools the estimates of several windows of one drive, and computes how far two of them may differ by chance.
 
-A small mixed model: what is common to all windows is estimated by generalised least squares, with what differs between
-them (:mod:`fdhil.identification.between`) in the covariance. Moves in both directions tell a constant load from dry
-friction, and viscous friction by direction.
+A small mixed model: common values are estimated by generalised least squares, with the variance between windows in the
+covariance. Moves in both directions separate a constant load from dry friction, and viscous friction by direction.
 """
 
 from __future__ import annotations
@@ -18,65 +17,64 @@ from fdhil.identification.ripple_parts import as_amplitude, as_parts
 from fdhil.identification.slow_rows import leaves_steps_open
 from fdhil.records import PARAMETERS, Estimate, Float, Int, Window, frozen
 
-# of a doubt that windows of one drive share, what may still differ between them: its size depends on the regulators,
-# which are the same, and a little on the move
+# share of a common doubt that may still differ between windows of one drive: it depends on the regulators, which are
+# the same, and a little on the move
 UNSHARED = 0.2
-JOINS = 3.3  # standard deviations: of a thousand pools of a drive without a load, one is given one
-LEAST_BEYOND = 0.5  # of the range of the windows' values, by which a common one may lie outside of them
-LEAST_SHARE = 1e-6  # of a parameter's size: what is not told more narrowly than rounding
-BY_DIRECTION = {"load": "Cd", "viscous": "ft"}  # what the direction changes, and of which parameter
+JOINS = 3.3  # standard deviations: one false load in a thousand pools
+LEAST_BEYOND = 0.5  # of the windows' range, by which a common value may lie outside it
+LEAST_SHARE = 1e-6  # of a parameter's size: rounding
+BY_DIRECTION = {"load": "Cd", "viscous": "ft"}  # term by direction: the parameter that it changes
 
 
 def member(window: Window, estimate: Estimate, place: int = 0) -> Member:
-    """Return what a window tells, ready to be pooled: its own chance apart from the doubts that all windows share."""
+    """Return a window's estimate ready to be pooled: own covariance separated from the doubts shared by all windows."""
     own, systematic, alias = _parts(window, estimate)
-    told = np.isfinite(estimate.values) & np.isfinite(np.diag(estimate.covariance))
-    kept = [k for k, name in enumerate(estimate.names) if told[k] and name not in estimate.given]
+    finite = np.isfinite(estimate.values) & np.isfinite(np.diag(estimate.covariance))
+    kept = [k for k, name in enumerate(estimate.names) if finite[k] and name not in estimate.given]
     doubts = np.column_stack([np.diag(alias)[:, : len(PARAMETERS)], systematic])
     names = tuple(estimate.names[k] for k in kept)
     values, own, doubts = as_parts(names, estimate.values[kept], own[np.ix_(kept, kept)], doubts[kept])
     return Member(names, values, own, doubts, place, window.direction)
 
 
-def pooled(members: Sequence[Member], first: Estimate, apart: Between, *, joining: bool = True) -> Estimate:
-    """Return what windows, given in order, tell together of the drive as it is at the newest of them.
+def pooled(members: Sequence[Member], first: Estimate, variance: Between, *, joining: bool = True) -> Estimate:
+    """Pool the estimates of windows given in order, as of the newest of them.
 
-    ``apart`` is what differs between them. With ``joining`` a load, and viscous friction by direction, join where the
-    windows surely tell them. Method, and what no window tells, are those of ``first``.
+    ``variance`` is the variance between windows. With ``joining`` a load, and viscous friction by direction, are added
+    where significant. Method, and parameters that no window determines, are those of ``first``.
     """
     names = _common(members)
-    joined: list[str] = []
-    told = _Stack.of(members, names, apart)
-    answer = _solved(told, joined)
-    if _is_beyond_all(answer, told):
+    added: list[str] = []
+    stack = _Stack.of(members, names, variance)
+    answer = _solved(stack, added)
+    if _is_beyond_all(answer, stack):
         members = [replace(m, own=np.diag(np.diag(m.own))) for m in members]
-        told = _Stack.of(members, names, apart)
-        answer = _solved(told, joined)
+        stack = _Stack.of(members, names, variance)
+        answer = _solved(stack, added)
     while joining:
-        trials = {term: _solved(told, [*joined, term]) for term in _open(members, names, joined)}
+        trials = {term: _solved(stack, [*added, term]) for term in _open(members, names, added)}
         surest = max(trials, key=lambda term: trials[term].surety(), default=None)
         if surest is None or trials[surest].surety() < JOINS:
             break
-        joined.append(surest)
+        added.append(surest)
         answer = trials[surest]
-    return _estimate(answer, names, joined, first)
+    return _estimate(answer, names, added, first)
 
 
-def _is_beyond_all(answer: _Solution, told: _Stack) -> bool:
-    """Return whether R, L, K or Jt lies outside of what all windows tell.
+def _is_beyond_all(answer: _Solution, stack: _Stack) -> bool:
+    """Return whether R, L, K or Jt lies outside the range of all windows.
 
-    Doubts that tie parameters together more than windows agree drive a common value away from each of them.
+    Shared doubts that tie parameters together more than windows agree move the common value away from each of them.
     """
-    for k, name in enumerate(told.names):
+    for k, name in enumerate(stack.names):
         if name in ("R", "L", "K", "Jt"):
-            own = told.values[told.which == k]
+            own = stack.values[stack.which == k]
             if not own.min() - LEAST_BEYOND * np.ptp(own) <= answer.values[k] <= own.max() + LEAST_BEYOND * np.ptp(own):
                 return True
     return False
 
 
 def _common(members: Sequence[Member]) -> tuple[str, ...]:
-    """Return the parameters that any window tells, and the terms that at least half of the windows have."""
     seen = dict.fromkeys(name for m in members for name in m.names)
     known = [name for name in PARAMETERS if name in seen]
     terms = [name for name in seen if name not in PARAMETERS and 2 * sum(name in m.names for m in members)
@@ -84,43 +82,40 @@ def _common(members: Sequence[Member]) -> tuple[str, ...]:
     return (*known, *terms)
 
 
-def _open(members: Sequence[Member], names: Sequence[str], joined: Sequence[str]) -> list[str]:
-    """Return the terms by direction that may still join: there must be moves in both."""
+def _open(members: Sequence[Member], names: Sequence[str], added: Sequence[str]) -> list[str]:
     both = len({m.direction for m in members}) == 2
-    return [term for term, of in BY_DIRECTION.items() if both and of in names and term not in joined]
+    return [term for term, of in BY_DIRECTION.items() if both and of in names and term not in added]
 
 
 @dataclass(frozen=True, slots=True)
 class _Solution:
-    """Common ``values`` (k,) with their chance (k, k) and the doubts (k, q) that the windows share."""
+    """Common ``values`` (k,) with their covariance ``chance`` (k, k) and the doubts (k, q) that the windows share."""
 
     values: Float
     chance: Float
     doubts: Float
 
     def surety(self) -> float:
-        """Return how many standard deviations the last value lies from 0."""
         return abs(float(self.values[-1])) / float(np.sqrt(self.chance[-1, -1]))
 
 
-def _solved(told: _Stack, joined: Sequence[str]) -> _Solution:
-    """Return the generalised least squares of what the windows tell, by the stack's names and the terms ``joined``."""
-    of = [told.names.index(BY_DIRECTION[term]) for term in joined]
-    columns = np.equal.outer(told.which, np.arange(len(told.names))).astype(np.float64)
-    columns = np.column_stack([columns, *(np.where(told.which == k, told.side, 0.0) for k in of)])
-    unit = np.concatenate([told.unit, told.unit[of]])
-    phi = columns * unit / told.unit[told.which][:, None]
-    chance = np.linalg.inv(phi.T @ told.weight @ phi)
-    gain = chance @ phi.T @ told.weight / told.unit[told.which]
-    return _Solution(gain @ told.values * unit, chance * np.outer(unit, unit), (gain @ told.shared) * unit[:, None])
+def _solved(stack: _Stack, added: Sequence[str]) -> _Solution:
+    of = [stack.names.index(BY_DIRECTION[term]) for term in added]
+    columns = np.equal.outer(stack.which, np.arange(len(stack.names))).astype(np.float64)
+    columns = np.column_stack([columns, *(np.where(stack.which == k, stack.side, 0.0) for k in of)])
+    unit = np.concatenate([stack.unit, stack.unit[of]])
+    phi = columns * unit / stack.unit[stack.which][:, None]
+    chance = np.linalg.inv(phi.T @ stack.weight @ phi)
+    gain = chance @ phi.T @ stack.weight / stack.unit[stack.which]
+    return _Solution(gain @ stack.values * unit, chance * np.outer(unit, unit), (gain @ stack.shared) * unit[:, None])
 
 
 @dataclass(frozen=True, slots=True)
 class _Stack:
-    """What all windows tell, one value a row (m,): ``which`` of the ``names`` it is and the ``side`` that was moved to.
+    """All windows' values stacked (m,): ``which`` of the ``names`` each is, and the ``side`` it was moved to.
 
-    ``weight`` (m, m) is the inverse of the rows' covariance about what the drive is at the newest window, in units (k,)
-    of the names; ``shared`` (m, q) are the doubts that the windows share.
+    ``weight`` (m, m) is the inverse covariance relative to the newest window, in units (k,) of the names; ``shared``
+    (m, q) are the doubts that the windows share.
     """
 
     names: tuple[str, ...]
@@ -132,8 +127,7 @@ class _Stack:
     weight: Float
 
     @classmethod
-    def of(cls, members: Sequence[Member], names: tuple[str, ...], apart: Between) -> _Stack:
-        """Return the rows of all members that have one of the names."""
+    def of(cls, members: Sequence[Member], names: tuple[str, ...], variance: Between) -> _Stack:
         kept = [[k for k, name in enumerate(m.names) if name in names] for m in members]
         which = np.array([names.index(m.names[k]) for m, own in zip(members, kept, strict=True) for k in own])
         values = np.concatenate([m.values[own] for m, own in zip(members, kept, strict=True)])
@@ -141,7 +135,7 @@ class _Stack:
         shared = np.zeros((which.size, max(m.shared.shape[1] for m in members)))
         unit = np.array([float(np.abs(values[which == k]).max()) for k in range(len(names))])
         unit[unit == 0.0] = 1.0
-        total, start = _between(members, kept, which, names, apart), 0
+        total, start = _between(members, kept, which, names, variance), 0
         for m, own in zip(members, kept, strict=True):
             rows = slice(start, start + len(own))
             total[rows, rows] += m.own[own][:, own]
@@ -155,26 +149,25 @@ class _Stack:
 
 
 def _between(
-    members: Sequence[Member], kept: Sequence[Sequence[int]], which: Int, names: Sequence[str], apart: Between
+    members: Sequence[Member], kept: Sequence[Sequence[int]], which: Int, names: Sequence[str], variance: Between
 ) -> Float:
-    """Return the covariance (m, m) that windows have because they differ, about what the drive is at the newest."""
+    """Return the covariance (m, m) due to variation between windows, relative to the newest."""
     place = np.repeat([float(m.place) for m in members], [len(own) for own in kept])
     back = place.max() - place
     walk, scatter = (
-        np.array([shares.get(name, 0.0) * apart.sizes.get(name, 0.0) ** 2 for name in names])[which]
-        for shares in (apart.walk, apart.scatter)
+        np.array([shares.get(name, 0.0) * variance.sizes.get(name, 0.0) ** 2 for name in names])[which]
+        for shares in (variance.walk, variance.scatter)
     )
-    # two windows share the way from the newer of them to the newest
+    # two windows share the walk from the newer of them to the newest
     total = np.where(np.equal.outer(which, which), walk * np.minimum.outer(back, back), 0.0)
-    together: Float = total + np.diag(scatter)
-    return together
+    return total + np.diag(scatter)
 
 
-def _estimate(found: _Solution, names: Sequence[str], joined: Sequence[str], first: Estimate) -> Estimate:
-    """Return the solution as an estimate: parameters that no window tells stay open, given ones stay as given."""
-    listed = (*PARAMETERS, *(name for name in names if name not in PARAMETERS), *_told_terms(joined))
-    values, total, doubts = as_amplitude((*names, *joined), found.values, found.chance, found.doubts)
-    known = {name: k for k, name in enumerate((*names, *joined))}
+def _estimate(found: _Solution, names: Sequence[str], added: Sequence[str], first: Estimate) -> Estimate:
+    extra = [*(["load"] * ("load" in added)), *(["viscous_positive", "viscous_negative"] * ("viscous" in added))]
+    listed = (*PARAMETERS, *(name for name in names if name not in PARAMETERS), *extra)
+    values, total, doubts = as_amplitude((*names, *added), found.values, found.chance, found.doubts)
+    known = {name: k for k, name in enumerate((*names, *added))}
     root = np.zeros((len(listed), len(known)))
     for row, name in enumerate(listed):
         for of, share in _made_of(name).items():
@@ -199,23 +192,16 @@ def _estimate(found: _Solution, names: Sequence[str], joined: Sequence[str], fir
     )
 
 
-def _told_terms(joined: Sequence[str]) -> tuple[str, ...]:
-    """Return the names under which terms by direction are told."""
-    sides = ("viscous_positive", "viscous_negative") if "viscous" in joined else ()
-    return (*(("load",) if "load" in joined else ()), *sides)
-
-
 def _made_of(name: str) -> dict[str, float]:
-    """Return of what solved values, and by which shares, a told value is made."""
     sides = {"viscous_positive": 1.0, "viscous_negative": -1.0}
     return {"ft": 1.0, "viscous": sides[name]} if name in sides else {name: 1.0}
 
 
 def friction_at(estimate: Estimate, speed_rad_s: float) -> tuple[float, float] | None:
-    """Return the friction torque Cd + ft w at a speed, and its standard deviation (N.m); None where it is not known.
+    """Return the friction torque Cd + ft w at a speed and its standard deviation (N.m); None where it is unknown.
 
-    At one speed ft and Cd trade, each with a wide interval: this sum is what is known, and what trends follow. Of a
-    single window it holds the load of its direction.
+    At one speed ft and Cd compensate each other, each with a wide interval: their sum is well determined, and trends
+    follow it. From a single window it includes the load of its direction.
     """
     if not {"ft", "Cd"} <= set(estimate.names):
         return None
@@ -227,34 +213,32 @@ def friction_at(estimate: Estimate, speed_rad_s: float) -> tuple[float, float] |
 
 
 def difference_covariance(one: tuple[Window, Estimate], other: tuple[Window, Estimate]) -> Float:
-    """Return the covariance (6, 6) of the difference between what two windows of one drive tell.
+    """Return the covariance (6, 6) of the difference between the estimates of two windows of one drive.
 
-    What is not known of the voltage's course within its samples is the regulators' doing and the same in both: with s
-    and t what it does to either estimate, it moves their difference by s - t only, and hides no change of the drive.
+    The voltage's unknown waveform within its samples depends on the regulators and is the same in both: with its
+    effects s and t on the two estimates, their difference moves by s - t only, and hides no change of the drive.
     """
     (own, systematic, alias), (its_own, its_systematic, its_alias) = (_of_six(*_parts(*pair)) for pair in (one, other))
     wide = max(systematic.shape[1], its_systematic.shape[1])
     systematic, its_systematic = (np.pad(s, ((0, 0), (0, wide - s.shape[1]))) for s in (systematic, its_systematic))
-    apart = systematic - its_systematic
+    difference = systematic - its_systematic
     part, its_part = _unshared(one[0], systematic), _unshared(other[0], its_systematic)
     unshared = part @ part.T + its_part @ its_part.T + np.diag(alias**2 + its_alias**2)
-    covariance: Float = own + its_own + apart @ apart.T + np.diag((alias - its_alias) ** 2) + UNSHARED**2 * unshared
-    return covariance
+    return own + its_own + difference @ difference.T + np.diag((alias - its_alias) ** 2) + UNSHARED**2 * unshared
 
 
 def change_covariance(window: Window, estimate: Estimate) -> Float:
-    """Return the covariance (6, 6) by which an estimate is compared with earlier ones of the same drive.
+    """Return the covariance (6, 6) for comparing an estimate with earlier ones of the same drive.
 
-    How set-points step within long rows is the same in all of them, and hides no change.
+    How set-points step within long samples is the same in all of them, and hides no change.
     """
     own, systematic, alias = _of_six(*_parts(window, estimate))
     part = _unshared(window, systematic)
-    covariance: Float = own + part @ part.T + np.diag(alias**2)
-    return covariance
+    return own + part @ part.T + np.diag(alias**2)
 
 
 def _unshared(window: Window, systematic: Float) -> Float:
-    """Return the doubts (k, q) that windows of one drive may have in part for themselves: not how set-points step."""
+    """Return the doubts (k, q) that may differ partly between windows of one drive: not how set-points step."""
     return systematic[:, :2] if leaves_steps_open(window) else systematic
 
 
@@ -267,7 +251,7 @@ def _parts(window: Window, estimate: Estimate) -> tuple[Float, Float, Float]:
     """Return the covariance (k, k) of a window's own chance, and the doubts (k, q) and (k,) that it shares."""
     size = len(estimate.names)
     systematic = np.zeros((size, 0))
-    if estimate.systematic is not None:  # told of the first names
+    if estimate.systematic is not None:  # covers the first names only
         systematic = np.pad(estimate.systematic, ((0, size - len(estimate.systematic)), (0, 0)))
     slow = window.slow_voltage
     period = window.dt_s if slow is None else slow.period_s

@@ -1,10 +1,9 @@
-"""Lets terms join the six where the data surely show them: forward selection on a fit's own innovations.
+"""Adds significant terms to the six parameters: forward selection on a fit's own innovations.
 
-The innovations are linear in the terms and nearly so in the six, so what each would explain beyond all that are free
-follows from one Gram matrix, without another fit. A term joins where minus twice the log likelihood falls by more than
-its price: the Bayesian criterion, extended by the number of terms that were tried (Chen and Chen 2008), with as many
-rows as are independent; where it is worth it; and where the six stay identifiable. Then all are fitted once more, from
-where the straight line leads.
+One Gram matrix yields what each term would explain beyond all free entries, without another fit. A term is added where
+minus twice the log likelihood falls by more than its price (the Bayesian criterion extended by the number of terms
+tried, Chen and Chen 2008, with the number of independent samples), where it is worthwhile, and where the six stay
+identifiable.
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ from fdhil.identification.delay import LEAST_DELAY, MOST_DELAY, delay_direction,
 from fdhil.identification.fit import Fit, fit
 from fdhil.identification.identifiability import admissible
 from fdhil.identification.kalman import DELAY, LOAD
-from fdhil.identification.motion import Course, Motion
 from fdhil.identification.noise import fit_noise
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.slow_voltage import in_order
@@ -34,21 +32,21 @@ from fdhil.records import Estimate, Float
 Rows = npt.NDArray[np.intp]
 
 ROUNDS = 3
-MOST = 8  # courses in all
-IMITATED = 1e-6  # share of a direction below which only rounding is left of it
-WORTH = 0.005  # of the motor's torque (RMS): a tenth of the share of the following error that is tolerated
-SHIFT = 1.0  # standard deviations of one of the six: a smaller shift is within its interval anyway
+MOST = 8  # regressors in all
+IMITATED = 1e-6  # share of a direction below which only rounding remains
+WORTH = 0.005  # of the motor's torque (RMS): a tenth of the tolerated share of the following error
+SHIFT = 1.0  # standard deviations of one of the six: a smaller shift is within its interval
 SIX = 6
-LEAST_SURE = 3.5  # standard deviations of a term, colour and all else that was chosen included
-LATE = "late"  # the candidate that is a delay of the voltage, and no term
+LEAST_SURE = 3.5  # standard deviations of a term, with colour and all other terms
+LATE = "late"  # the candidate that is a delay of the voltage, not a term
 SURE_DELAY = 5.0  # standard deviations beyond which a delay is accepted
 
 
 def add_terms(base: Fit, command: bool, estimate_of: Callable[[Fit], Estimate], *, delayed: bool = False) -> Fit:
-    """Return the fit with the terms that its windows surely show; itself where there are none.
+    """Return the fit with the terms that are significant in its windows; the fit itself without any.
 
-    ``command`` says whether the voltage may be a commanded one, ``estimate_of`` makes an estimate of a fit. Where the
-    voltage may be ``delayed``, its delay is one of the candidates: dead time and others resemble it.
+    ``command`` is true where the voltage may be a commanded one; ``estimate_of`` converts a fit to an estimate. Where
+    the voltage may be ``delayed``, its delay is a candidate too: dead time and other terms resemble it.
     """
     result, left = base, candidates(base.problem.motions, command)
     if delayed and DELAY not in base.free:
@@ -74,9 +72,9 @@ def add_terms(base: Fit, command: bool, estimate_of: Callable[[Fit], Estimate], 
 
 
 def _weak(wider: Fit, chosen: Sequence[Candidate], base: Fit, estimate_of: Callable[[Fit], Estimate]) -> set[str]:
-    """Return the families of what is not sure beside all else; the last chosen where the six are told no more.
+    """Return the families that are insignificant given all else; the last chosen where the six lose identifiability.
 
-    Friction that pushes is none: what makes it so stands for something else.
+    Negative friction is rejected: it stands for something else.
     """
     estimate = estimate_of(wider)
     terms = [c.family for c in chosen if c.family != LATE]
@@ -94,7 +92,6 @@ def _weak(wider: Fit, chosen: Sequence[Candidate], base: Fit, estimate_of: Calla
 
 
 def _surely_late(wider: Fit, estimate: Estimate) -> bool:
-    """Return whether a fit's delay is surely there, and one that data of these rows can tell."""
     if estimate.delay_s is None or estimate.delay_std_s is None or not _may_be_late(wider, estimate.delay_s):
         return False
     alone = not wider.problem.motions[0].courses
@@ -106,7 +103,7 @@ def _may_be_late(base: Fit, delay_s: float) -> bool:
 
 
 def _std(estimate: Estimate, family: str) -> float:
-    """Return the deviation of a term; of friction at low speed for the speed that was chosen: whether it is there."""
+    """Return the deviation of a term; for Stribeck friction at its chosen speed, which decides whether it exists."""
     if family != "stribeck":
         return estimate.std(family)
     k, speed = estimate.names.index(family), estimate.names.index("stribeck_speed")
@@ -115,7 +112,6 @@ def _std(estimate: Estimate, family: str) -> float:
 
 
 def _with(base: Fit, chosen: Sequence[Candidate], bench: _Bench) -> Fit:
-    """Return the windows fitted with the chosen terms too, from where the straight line leads."""
     motions = []
     for k, motion in enumerate(base.problem.motions):
         more = tuple(course for candidate in chosen for course in candidate.courses[k])
@@ -133,7 +129,6 @@ def _with(base: Fit, chosen: Sequence[Candidate], bench: _Bench) -> Fit:
 
 
 def _entries(candidate: Candidate, chosen: Sequence[Candidate], first: int) -> list[int]:
-    """Return the entries of theta of one of the ``chosen``, of which the ``first`` begins the new ones."""
     if candidate.family == LATE:
         return [DELAY]
     before = sum(len(c.courses[0]) for c in chosen[: list(chosen).index(candidate)])
@@ -141,14 +136,13 @@ def _entries(candidate: Candidate, chosen: Sequence[Candidate], first: int) -> l
 
 
 def _chosen(base: Fit, left: Sequence[Candidate], delayed: bool) -> tuple[_Bench, list[Candidate]]:
-    """Return the candidates that join this fit, the surest first, and the bench on which they were tried."""
     number, room = len(left), MOST - len(base.problem.motions[0].courses)
     bench = begun = _Bench.of(base, left, delayed)
     found: list[Candidate] = []
     while bench.left.size and len(found) < room:
         scores = bench.scores()
         plain = scores.gains - _price(scores.freedom, bench.rows, number)
-        hopeful = np.flatnonzero(plain > 0.0)  # were all innovations independent
+        hopeful = np.flatnonzero(plain > 0.0)  # if all innovations were independent
         if not hopeful.size:
             break
         colour = bench.colour(scores, hopeful)
@@ -167,15 +161,14 @@ def _chosen(base: Fit, left: Sequence[Candidate], delayed: bool) -> tuple[_Bench
 
 
 def _price(freedom: Float, rows: float | Float, number: int) -> Float:
-    price: Float = freedom * np.log(np.maximum(rows, 2.0)) + 2.0 * math.log(number)
-    return price
+    return freedom * np.log(np.maximum(rows, 2.0)) + 2.0 * math.log(number)
 
 
 class _Scores(NamedTuple):
-    """What each of c candidates, of one course or two, explains beyond all that is free.
+    """Score of each of c candidates, of one regressor or two, given all free entries.
 
-    ``shares`` (k, 2, c) are of the free entries in the courses; ``powers`` (2, c) the squares of what is beyond them,
-    ``amplitudes`` (2, c), and ``gains`` (c,) the fall of minus twice the log likelihood.
+    ``shares`` (k, 2, c) are the projections of the regressors on the free entries; ``powers`` (2, c) the squares of the
+    rest, ``amplitudes`` (2, c), and ``gains`` (c,) the fall of minus twice the log likelihood.
     """
 
     shares: Float
@@ -187,12 +180,12 @@ class _Scores(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Bench:
-    """A fit with the ``candidates`` for it, of which those ``left`` (c,) are tried.
+    """A fit with ``candidates``, of which those ``left`` (c,) are still tried.
 
-    ``columns`` (m, p) are ``doubts`` about the voltage's course, the jacobian, and the courses of the candidates,
-    the two of each at ``places`` (2, candidates): the last column, which is nil, where there is no second. ``gram``
-    (p, p), as far as it is asked for, and ``pulls`` (p,) are their products, the doubts' expected sizes included;
-    ``free`` are those that are fitted.
+    ``columns`` (m, p) are ``doubts`` about the voltage's waveform, the jacobian, and the candidates' regressors, the
+    two of each at ``places`` (2, candidates); the last column is zero and stands for a missing second. ``gram`` (p, p),
+    filled on demand, and ``pulls`` (p,) are their products, with the doubts' expected sizes; ``free`` are those that
+    are fitted.
     """
 
     fit: Fit
@@ -208,7 +201,6 @@ class _Bench:
 
     @classmethod
     def of(cls, base: Fit, left: Sequence[Candidate], delayed: bool) -> _Bench:
-        """Return the bench of a fit, whose voltage may be ``delayed`` by what is to be found."""
         doubts = base.problem.course_effects(base.theta)
         begin = doubts.shape[1] + base.jacobian.shape[1]
         motions = range(len(base.problem.motions))
@@ -217,25 +209,23 @@ class _Bench:
         columns = np.column_stack([doubts, base.jacobian, answer, *late, np.zeros(len(base.residuals))])
         sizes = [len(c.courses[0]) for c in left]
         first = begin + np.cumsum([0, *sizes])[:-1]
-        nil = columns.shape[1] - 1
-        places = np.array([first, np.where(np.array(sizes) == 2, first + 1, nil)], dtype=np.intp)
-        places[0, [c.family == LATE for c in left]] = nil - 1
+        zero_column = columns.shape[1] - 1
+        places = np.array([first, np.where(np.array(sizes) == 2, first + 1, zero_column)], dtype=np.intp)
+        places[0, [c.family == LATE for c in left]] = zero_column - 1
         rows, free = np.arange(len(left)), list(range(begin))
         gram = np.diag(np.einsum("mp,mp->p", columns, columns))
         gram[tuple(places)] = gram[tuple(places[::-1])] = np.einsum("mc,mc->c", *(columns[:, p] for p in places))
         pulls = columns.T @ base.residuals
         made = cls(base, left, columns, gram, pulls, doubts.shape[1], places, rows, free, delayed)
         made._fill(free)
-        gram[range(doubts.shape[1]), range(doubts.shape[1])] += 1.0  # one deviation of them is all that is expected
+        gram[range(doubts.shape[1]), range(doubts.shape[1])] += 1.0  # their prior: one standard deviation
         return made
 
     def _fill(self, rows: list[int]) -> None:
-        """Fill in the Gram matrix's ``rows``: those of candidates are asked for when they join."""
         products = self.columns[:, rows].T @ self.columns
         self.gram[rows], self.gram[:, rows] = products, products.T
 
     def without(self, taken: int, kept: Rows, joins: bool) -> _Bench:
-        """Return the bench of those ``kept`` that are of another family than the ``taken``, which ``joins`` or not."""
         family = self.candidates[self.left[taken]].family
         others = [k for k in self.left[kept] if self.candidates[k].family != family]
         more = self._columns_of(int(self.left[taken])) if joins else []
@@ -247,23 +237,19 @@ class _Bench:
         return [int(p) for p in self.places[:, candidate] if p < self.columns.shape[1] - 1]
 
     def step(self, chosen: Sequence[Candidate]) -> Float:
-        """Return by how much the fit's free entries, and those of the ``chosen``, move with all of them (k,)."""
         free = self.free + [p for c in chosen for p in self._columns_of(list(self.candidates).index(c))]
         moved: Float = inverse_of(self.gram[np.ix_(free, free)])[0] @ self.pulls[free]
         return moved[self.doubts :]
 
     @property
     def rows(self) -> float:
-        """How many innovations tell of the motion."""
         return 2.0 * sum(int(np.count_nonzero(np.abs(m.mode) == 1)) for m in self.fit.problem.motions)
 
     @property
     def inverse(self) -> Float:
-        """The covariance (k, k) of all that is free."""
         return inverse_of(self.gram[np.ix_(self.free, self.free)])[0]
 
     def scores(self) -> _Scores:
-        """Return what each candidate explains."""
         free, inverse = self.free, self.inverse
         first, second = places = self.places[:, self.left]
         across = self.gram[free][:, places]  # (k, 2, c)
@@ -279,18 +265,18 @@ class _Bench:
         amplitudes = (powers[::-1] * s - both * s[::-1]) / determinant
         return _Scores(shares, powers, amplitudes, (amplitudes * s).sum(axis=0), seen.sum(axis=0) * 1.0)
 
-    def colour(self, scores: _Scores, asked: Rows) -> Float:
-        """Return by how much the scores of those ``asked`` (c,) vary more than were innovations independent.
+    def colour(self, scores: _Scores, tried: Rows) -> Float:
+        """Return by how much the scores of the candidates ``tried`` (c,) vary more than with independent innovations.
 
-        After Newey and West (1987), by rows, of what is left with the candidate: what it explains is no colour.
-        Bartlett's weights over lags are the mean square of moving sums.
+        After Newey and West (1987), of the residuals including the candidate, so that what it explains does not count
+        as colour. Bartlett's weights over lags are the mean square of moving sums.
         """
         basis = self.columns[:, self.free]
         rest = self.fit.residuals - basis @ (self.inverse @ self.pulls[self.free])
-        amplitudes, left = scores.amplitudes[:, asked], rest[:, None]
+        amplitudes, left = scores.amplitudes[:, tried], rest[:, None]
         beyond = []
-        for own, place in enumerate(self.places[:, self.left[asked]]):
-            beyond.append(self.columns[:, place] - basis @ scores.shares[:, own, asked])
+        for own, place in enumerate(self.places[:, self.left[tried]]):
+            beyond.append(self.columns[:, place] - basis @ scores.shares[:, own, tried])
             left = left - beyond[own] * amplitudes[own]
         meat = np.zeros(amplitudes.shape)
         for own, signal in enumerate(beyond):
@@ -299,15 +285,12 @@ class _Bench:
                 sums = np.cumsum(np.pad(by_row, ((SUMMED_LAGS + 1, SUMMED_LAGS), (0, 0))), axis=0)
                 moving = sums[SUMMED_LAGS + 1 :] - sums[: -SUMMED_LAGS - 1]
                 meat[own] += np.einsum("mc,mc->c", moving, moving) / (SUMMED_LAGS + 1)
-        colour: Float = np.maximum(1.0, (meat / scores.powers[:, asked]).max(axis=0, initial=1.0))
+        colour: Float = np.maximum(1.0, (meat / scores.powers[:, tried]).max(axis=0, initial=1.0))
         return colour
 
 
 def _worth(bench: _Bench, scores: _Scores, k: int) -> bool:
-    """Return whether a term's torque matters to the path, or without it one of the six is beyond its interval.
-
-    A delay must be one that the rows can tell.
-    """
+    """Return whether a term's torque matters to the path, or moves one of the six beyond its interval."""
     amplitudes, six = scores.amplitudes[:, k], slice(bench.doubts, bench.doubts + SIX)
     candidate = bench.candidates[bench.left[k]]
     if candidate.family == LATE and not _may_be_late(bench.fit, float(amplitudes[0])):
@@ -318,16 +301,8 @@ def _worth(bench: _Bench, scores: _Scores, k: int) -> bool:
     courses, base = candidate.courses, bench.fit
     if candidate.family == LATE or courses[0][0].kind != LOAD:
         return False
-    torque = sum(float(np.square(_torque(own, amplitudes)).sum()) for own in courses)
-    whole = sum(float(np.square(base.theta[2] * _sure(m)).sum()) for m in base.problem.motions)
+    torques = (amplitudes[: len(own)] @ np.stack([course.values for course in own]) for own in courses)
+    torque = sum(float(np.square(own).sum()) for own in torques)
+    currents = (m.current[np.abs(m.mode) == 1] for m in base.problem.motions)
+    whole = sum(float(np.square(base.theta[2] * current).sum()) for current in currents)
     return torque > WORTH**2 * whole
-
-
-def _torque(courses: Sequence[Course], amplitudes: Float) -> Float:
-    total: Float = amplitudes[: len(courses)] @ np.stack([course.values for course in courses])
-    return total
-
-
-def _sure(motion: Motion) -> Float:
-    current: Float = motion.current[np.abs(motion.mode) == 1]
-    return current

@@ -1,11 +1,8 @@
-"""Brings a recorded speed that is late to the instants of its rows: what drives call speed is often no reading.
+"""Aligns a late recorded speed to its samples: what drives report as speed is often not a direct reading.
 
-A difference of encoder positions is the mean of the row before, so half a row late; a filter behind it, or about a
-reading, adds its own lag. The recorded position has none, and tells how late the speed is. The lag is then undone on
-the speed itself, which is finer than the position as a rule: a filter by its inverse, a mean by a stencil.
+A difference of encoder positions is half a sample late; a filter adds its own lag. The position reveals the lag, which
+is removed from the speed itself: a filter by its inverse, a mean by a stencil.
 """
-
-from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
@@ -23,25 +20,25 @@ from fdhil.records import Bool, Float, Window, read_only
 
 SpeedSource = Literal["auto", "sensor", "difference", "filtered"]
 
-SURE = 5.0  # standard deviations beyond which a lag is believed
-LEAST = 0.05  # of a row: a smaller lag is less than the regulators' doing within a row
-LARGEST_S = 0.020  # no drive shows a speed that is older
-SMOOTHING_S = 0.005  # over which the acceleration is taken
-EXPLAINED = 2.0  # of its own scatter from row to row: what may be left between speed and position
-FLOOR = 1e-3  # of the top speed, of the same
-SURELY_LESS = 0.5  # of the squares that the most usual lag leaves: by less, another is not told from it
-FINER = 0.5  # noise of the position's derivative, of that of the mended speed, for it to take its place
+SURE = 5.0  # standard deviations of a significant lag
+LEAST = 0.05  # of a sample: a smaller lag is less than the regulators' effect within a sample
+LARGEST_S = 0.020  # no drive reports an older speed
+SMOOTHING_S = 0.005  # of the acceleration
+EXPLAINED = 2.0  # of the noise: allowed RMS difference between speed and position
+FLOOR = 1e-3  # of the top speed, added to it
+SURELY_LESS = 0.5  # of the squares by the most usual lag: another one must have fewer
+FINER = 0.5  # of the aligned speed's noise: the position's derivative must have less to replace it
 LEAST_ROWS = 32
-NIL = 1e-6  # of a filter's answer: what is left out of it
-REACH = 3  # rows about a lost one that cannot be mended
+NIL = 1e-6  # of a filter's response: the part that is left out
+REACH = 3  # samples about a lost one that cannot be aligned
 
 
 @dataclass(frozen=True, slots=True)
 class Lag:
-    """By how much a speed is late, with its standard deviation; of what it is the lag, and ``share`` of a filter.
+    """The lag of a speed with its standard deviation, and its cause.
 
-    The speed is a ``mean`` of the row before, or the instants; of it a first-order filter keeps ``share`` of a row
-    before. ``moved_s`` is a plain delay.
+    The speed is a ``mean`` over the sample before, or instants, behind a first-order filter that keeps ``share`` per
+    sample; ``moved_s`` is a pure delay.
     """
 
     late_s: float
@@ -51,14 +48,14 @@ class Lag:
     moved_s: float = 0.0
 
     def seen(self, angle: Float, dt_s: float) -> Float:
-        """Return the speed (n,) that a drive with this lag tells of ``angle`` (n,), rad."""
+        """Return the speed (n,) that a drive with this lag reports for ``angle`` (n,), rad."""
         speed = np.diff(angle, prepend=angle[0]) / dt_s if self.mean else of_position(angle, dt_s)
         if self.moved_s:
             return shifted(speed, -self.moved_s / dt_s)
         return filtered(speed, self.share) if self.share else speed
 
     def undone(self, speed: Float, dt_s: float) -> Float:
-        """Return the speed (n,) at the instants of the rows."""
+        """Return the speed (n,) at the instants of the samples."""
         if self.moved_s:
             return shifted(speed, self.moved_s / dt_s)
         if self.share:
@@ -67,7 +64,7 @@ class Lag:
 
 
 def mended(window: Window, source: SpeedSource = "auto") -> Window:
-    """Return the window with its speed at the instants of its rows; itself where the speed is not surely late.
+    """Return the window with its speed at the instants of its samples; the window itself without a significant lag.
 
     ``source`` is ``[identification] speed_source``.
     """
@@ -79,7 +76,7 @@ def mended(window: Window, source: SpeedSource = "auto") -> Window:
 
 @lru_cache(maxsize=12)
 def _mended(window: Window, source: SpeedSource) -> Window:
-    with np.errstate(over="ignore", invalid="ignore"):  # a signal that no drive has tells no lag
+    with np.errstate(over="ignore", invalid="ignore"):  # implausible signals yield no lag
         found = lag_of(window, source)
     if found is None:
         return window
@@ -96,15 +93,15 @@ def _mended(window: Window, source: SpeedSource) -> Window:
 
 
 def lag_of(window: Window, source: SpeedSource = "auto") -> Lag | None:
-    """Return the lag of a window's speed; None where there surely is none, or position and speed do not tell."""
+    """Return the lag of a window's speed; None without a significant lag, or where it is undetermined."""
     dt = window.dt_s
-    told = _lateness(window)
+    lateness = _lateness(window)
     if source == "difference":
-        std = told[1] if told is not None else 0.0
+        std = lateness[1] if lateness is not None else 0.0
         return Lag(0.5 * dt, min(std, 0.1 * dt), mean=True)
-    if told is None:
+    if lateness is None:
         return None
-    late, std = told
+    late, std = lateness
     if source == "auto" and late < max(SURE * std, LEAST * dt):
         return None
     if not 0.0 < late < LARGEST_S:
@@ -112,7 +109,7 @@ def lag_of(window: Window, source: SpeedSource = "auto") -> Lag | None:
     angle, speed, rows = _angle(window), bridged(window.speed_rad_s), _moving(window)
     possible = _possible(late, std, dt)
     left = [_left(speed, lag.seen(angle, dt), rows) for lag in possible]
-    # from row to row there is the position's own noise, of which a filter passes less
+    # between samples there is the position's own noise, of which a filter passes less
     powers = [float(np.square(moving_mean(e, 2 * round(SMOOTHING_S / dt) + 1)).sum()) for e in left]
     best = int(np.argmin(powers))
     best = best if powers[best] < SURELY_LESS * powers[0] else 0
@@ -120,7 +117,6 @@ def lag_of(window: Window, source: SpeedSource = "auto") -> Lag | None:
 
 
 def _possible(late: float, std: float, dt: float) -> list[Lag]:
-    """Return what may make a speed late by ``late``, the most usual first."""
     unsure = max(SURE * std, LEAST * dt)
     possible = [Lag(late, std, share=late / (dt + late)), Lag(late, std, moved_s=late)]
     rest = late - 0.5 * dt
@@ -130,7 +126,7 @@ def _possible(late: float, std: float, dt: float) -> list[Lag]:
 
 
 def _lateness(window: Window) -> tuple[float, float] | None:
-    """Return by how much (s) the speed is late against the position, and the standard deviation; None if not told.
+    """Return the lag (s) of the speed against the position and its standard deviation; None if undetermined.
 
     The speed is a scale times that of the position, a constant, and minus the acceleration times the lag.
     """
@@ -148,7 +144,7 @@ def _lateness(window: Window) -> tuple[float, float] | None:
     weights = inverse @ (columns.T @ speed)
     left = speed - columns @ weights
     scores = (columns @ inverse[:, :1]) * left[:, None]
-    variance = float(summed(scores)[0, 0])  # noise of either may hang together over rows
+    variance = float(summed(scores)[0, 0])  # noise of either may correlate over samples
     if not (math.isfinite(condition) and 0.0 <= variance < np.inf and weights[1] != 0.0):
         return None
     deviation = math.sqrt(variance)
@@ -156,28 +152,23 @@ def _lateness(window: Window) -> tuple[float, float] | None:
 
 
 def _moving(window: Window) -> Bool:
-    """Return the rows (n,) in which the shaft surely turns and nothing about them is lost."""
     known = np.isfinite(window.speed_rad_s) & np.isfinite(window.position_mm)
     whole = np.convolve(known, np.ones(2 * REACH + 1), "same") > 2 * REACH + 0.5
-    sure: Bool = whole & surely_moving(window.speed_rad_s, window.rapid_speed_rad_s)
-    return sure
+    return whole & surely_moving(window.speed_rad_s, window.rapid_speed_rad_s)
 
 
 def _angle(window: Window) -> Float:
-    turned: Float = bridged(window.position_mm) * (2 * math.pi / window.pitch_mm)
-    return turned
+    return bridged(window.position_mm) * (2 * math.pi / window.pitch_mm)
 
 
 def _left(speed: Float, seen: Float, rows: Bool) -> Float:
-    """Return what of the speed (m,) a scale and a constant do not make of what a drive would have ``seen``."""
     columns = np.column_stack([seen, np.ones(seen.size)])[rows]
     inverse, _ = inverse_gram(columns)
-    rest: Float = speed[rows] - columns @ (inverse @ (columns.T @ speed[rows]))
-    return rest
+    return speed[rows] - columns @ (inverse @ (columns.T @ speed[rows]))
 
 
 def _explained(left: Float, window: Window, rows: Bool) -> bool:
-    """Return whether no more is left between speed and position than noise, and the position's steps, explain."""
+    """Return whether noise and the position's resolution explain the difference between speed and position."""
     top = float(np.abs(window.speed_rad_s[rows]).max())
     step = resolution(_angle(window)) / window.dt_s / math.sqrt(6.0)  # of the difference of two positions
     allowed = EXPLAINED * math.hypot(noise_of(left), step) + FLOOR * top
@@ -197,7 +188,7 @@ def of_position(angle: Float, dt_s: float) -> Float:
 
 
 def between_means(means: Float) -> Float:
-    """Return a signal (n,) at the instants of its rows from its means over the row before each, exact for cubics."""
+    """Return a signal (n,) at the instants of its samples from means over the sample before each, exact for cubics."""
     instants = means.copy()
     instants[1:-2] = (-means[:-3] + 7.0 * means[1:-2] + 7.0 * means[2:-1] - means[3:]) / 12.0
     instants[[0, -2]] = (means[[0, -2]] + means[[1, -1]]) / 2.0
@@ -205,14 +196,14 @@ def between_means(means: Float) -> Float:
 
 
 def filtered(values: Float, share: float) -> Float:
-    """Return ``values`` (n,) behind a first-order filter that keeps ``share`` of what it gave a row before."""
+    """Return ``values`` (n,) through a first-order filter that keeps ``share`` of its output per sample."""
     weights = (1.0 - share) * share ** np.arange(math.ceil(math.log(NIL) / math.log(share)))
     padded = np.concatenate([np.full(weights.size - 1, values[0]), values])
     return np.convolve(padded, weights, "valid")
 
 
 def shifted(values: Float, rows: float) -> Float:
-    """Return ``values`` (n,) as they are ``rows`` later, by cubics through four rows; the ends are held."""
+    """Return ``values`` (n,) as they are ``rows`` samples later, by cubic interpolation; the ends are held."""
     whole = math.floor(rows)
     x = rows - whole
     at = np.clip(np.arange(values.size)[:, None] + whole + np.arange(-1, 3), 0, values.size - 1)

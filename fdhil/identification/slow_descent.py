@@ -1,11 +1,7 @@
-"""Climbs to the most likely parameters of windows with a slow voltage, by Fisher's scoring on all innovations.
+"""Maximises the likelihood of windows with a low-rate voltage, by Fisher scoring on all innovations.
 
-How sure an innovation is depends on the parameters too: half of what a slow voltage is off by is the current at the
-ends of its samples, times L / T. So the likelihood is taken whole, determinant and all; its steps are those of the
-innovations' squares, and of their variances beside them.
+The variance of an innovation depends on the parameters too, through L / T, so the determinant is included.
 """
-
-from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,21 +22,18 @@ DELAY_DIFFERENCE_S = 1e-6
 LEAST_DIFFERENCE_S = 1e-8
 LEAST_SHARE, MOST_SHARE = 1e-3, 256.0
 REACH, SPACING = 1.5, 0.125  # samples of the voltage
-GAIN = 1e-3  # of twice the log likelihood: a step that gains less moves nothing by more than some hundredths
+GAIN = 1e-3  # of twice the log likelihood: smaller gains move theta by some hundredths of a deviation
 
 
 @dataclass(frozen=True, slots=True)
 class Likelihood:
-    """Windows with a slow voltage and their noise levels."""
+    """Windows with a low-rate voltage and their noise levels."""
 
     motions: tuple[Motion, ...]
     noises: tuple[Noise, ...]
 
     def at(self, theta: Float, ordered_for_s: float | None = None) -> Innovations:
-        """Return all innovations for ``theta`` (7,), rows and samples in the order of a delay of ``ordered_for_s``.
-
-        That is its own when left out.
-        """
+        """Return all innovations for ``theta`` (7,), ordered for a delay of ``ordered_for_s`` (default: its own)."""
         pairs = zip(self.motions, self.noises, strict=True)
         made = [innovations_of(m, theta, s.vector() ** 2, ordered_for_s) for m, s in pairs]
         return Innovations(np.concatenate([one.values for one in made]), np.concatenate([one.variance for one in made]))
@@ -48,8 +41,8 @@ class Likelihood:
     def slopes(self, here: Innovations, theta: Float, free: Sequence[int], sizes: Float) -> tuple[Float, Float]:
         """Return minus the derivatives (m, k) of innovations by ``free``, in deviations, and of half the log variance.
 
-        The order of rows and samples is held: an innovation must stay the same row's. So the delay is varied to the
-        side on which the samples are further from a row that they would pass, and by no more than that.
+        The order of samples is kept, so that an innovation stays that of the same sample. The delay is varied to the
+        side with more room, and by no more than that.
         """
         deviation, order = np.sqrt(here.variance), float(theta[DELAY])
         of_mean, of_variance = np.empty((here.values.size, len(free))), np.empty((here.values.size, len(free)))
@@ -63,18 +56,16 @@ class Likelihood:
         return of_mean, of_variance
 
     def _delay_step(self, delay_s: float) -> float:
-        """Return a small change of the delay by which no sample passes a row."""
         rooms = [room_s(motion, delay_s) for motion in self.motions]
         earlier, later = min(room[0] for room in rooms), min(room[1] for room in rooms)
-        # a longer delay puts a sample earlier
+        # a longer delay moves a sample earlier
         step = min(DELAY_DIFFERENCE_S, max(max(earlier, later) / 2, LEAST_DIFFERENCE_S))
         return step if earlier >= later else -step
 
 
 def ascend(likelihood: Likelihood, theta: Float, free: Sequence[int], sizes: Float) -> tuple[Float, Float, Float, bool]:
-    """Step from ``theta`` (7,) until a step is nothing; return theta, innovations (m,), jacobian (m, k), and success.
-
-    ``sizes`` (7,) are the parameters' typical ones.
+    """Step from ``theta`` (7,), with typical ``sizes`` (7,); return theta, innovations (m,), jacobian (m, k), and
+    success.
     """
     here = likelihood.at(theta)
     for _ in range(STEPS):
@@ -88,7 +79,7 @@ def ascend(likelihood: Likelihood, theta: Float, free: Sequence[int], sizes: Flo
             return theta, white, mean, True
         found = _along(likelihood, theta, here, free, step)
         if found is None:
-            return theta, white, mean, True  # nothing more likely along the step: this is the top, to rounding
+            return theta, white, mean, True  # nothing likelier along the step: the maximum, to rounding
         gained, (theta, here) = here.cost - found[1].cost, found
         if gained < GAIN:
             return theta, here.whitened, mean, True
@@ -98,10 +89,10 @@ def ascend(likelihood: Likelihood, theta: Float, free: Sequence[int], sizes: Flo
 def _along(
     likelihood: Likelihood, theta: Float, here: Innovations, free: Sequence[int], step: Float
 ) -> tuple[Float, Innovations] | None:
-    """Return where along the ``step`` it is more likely, and the innovations there; None where it is nowhere.
+    """Return a likelier theta along the ``step`` and its innovations; None without one.
 
-    A step that is not more likely is halved, and a whole one doubled as long as that is more likely: innovations that
-    hold much noise seem to tell the delay better than they do, and steps are too short then.
+    A step that is not likelier is halved; a full one is doubled while that is likelier, because noisy innovations
+    overrate the information on the delay and make steps too short.
     """
 
     def tried(share: float) -> tuple[Float, Innovations] | None:
@@ -130,10 +121,10 @@ def _along(
 
 
 def likelier_delay(likelihood: Likelihood, theta: Float, information: Float, period_s: float) -> Float | None:
-    """Return theta (7,) with the delay, up to ``REACH`` samples off, that is surely likelier; None where none is.
+    """Return theta (7,) with a significantly likelier delay, up to ``REACH`` samples off; None without one.
 
-    Whether a sample ends before or after a row makes the likelihood uneven: it has tops a part of a sample apart. The
-    other parameters follow the delay as the ``information`` (7, 7) says.
+    Whether a sample ends before or after another makes the likelihood uneven, with local maxima a fraction of a sample
+    apart. The other parameters follow the delay by the ``information`` (7, 7).
     """
     inverse = inverse_of(information)[0]
     if not (np.isfinite(inverse).all() and inverse[DELAY, DELAY] > 0.0):

@@ -1,19 +1,14 @@
-"""Tells what is not known of voltage and current within rows that are longer than a current regulator needs.
+"""Models what is unknown of voltage and current within samples longer than a current regulator needs.
 
-* A current that runs straight from reading to reading has, by [1], a voltage that rises over a row by R times the
-  current's change and by L times the change of its slope, beside the back-EMF's. So it is where set-points are smooth;
-  where they have a kink at every row, the current is ahead of that. All of the rise is one standard deviation.
-* Where the speed that is fed forward steps at every SYNC, the current answers after the instant of its reading: its
-  mean is higher while the table accelerates, and inertia seems smaller (5 % in rows of 1 ms, 17 % in rows of 2 ms).
-* Where a drive draws straight lines between set-points, an accelerating table is ahead of the line between two of them,
-  by a T^2 / 8 in the middle, and the regulators answer that anew in every row: readings at the rows' ends are off the
-  mean of the current by a share of the accelerating one that grows with the square of the row.
+* A current interpolated between readings requires, by [1], a voltage that rises over a sample by R times the current's
+  change and by L times the change of its slope; with a kink at every sample, the current is ahead of that.
+* Where the speed feed-forward steps at every SYNC, the mean current is higher than its reading while the table
+  accelerates, and inertia seems smaller (5 % at 1 ms, 17 % at 2 ms).
+* Where a drive interpolates set-points linearly, an accelerating table is ahead of the line by a T^2 / 8 in the middle,
+  and readings deviate from the mean current by a share that grows with the square of the sample.
 
-Which it is depends on the drive, and is the same in all of its windows. Where the loops are known, the closed loop run
-along the demand tells it: the mean of a row's current is what [2] needs for the speeds at its ends.
+The case is the same in all windows of a drive; a simulation of known loops along the demand decides it.
 """
-
-from __future__ import annotations
 
 from dataclasses import replace
 
@@ -26,19 +21,20 @@ from fdhil.identification.windows import RUN_SHARE
 from fdhil.model.closed_loop import simulate
 from fdhil.records import PARAMETERS, Float, Parameters, Window, rms
 
-LEAST_ROW_S = 0.003  # in shorter rows the first two are less than a regulator's own doing
-ROW_S, OFF_MEAN = 0.010, 0.08  # at such rows, with a speed loop of 40 Hz; a slower loop answers less
-STEPPED_ROW_S, STEPPED = 0.0015, 0.08  # from such rows on, of the accelerating current, where set-points may step
-
-
-LEFT_OPEN = 0.2  # of what known loops tell: they are known to a tenth or so
-SAME_GRID = 1e-3  # of a row, by which it may differ from the cycle of the set-points
+LEAST_ROW_S = 0.003  # in shorter samples the first two are less than the regulator's own effect
+ROW_S, OFF_MEAN = 0.010, 0.08  # at such samples, with a speed loop of 40 Hz; a slower loop responds less
+STEPPED_ROW_S, STEPPED = (
+    0.0015,
+    0.08,
+)  # from such samples on, share of the accelerating current where set-points may step
+LEFT_OPEN = 0.2  # of what known loops determine: they are known to about a tenth
+SAME_GRID = 1e-3  # of a sample: tolerance of the set-points' cycle
 
 
 def with_open_course(motion: Motion, theta: Float, off_a: Float | None = None) -> Motion:
-    """Return the motion with what is open within its rows for ``theta`` (k,), where they are long and means.
+    """Return the motion with the unknowns within its samples for ``theta`` (k,), where these are long and means.
 
-    Where set-points step is a doubt, unless ``off_a`` (n,) says how far readings of the current may be from its means.
+    Stepping set-points count as a doubt, unless ``off_a`` (n,) gives the deviation of current readings from means.
     """
     if motion.voltage_sampling != "interval_mean" or motion.slow is not None:
         return motion
@@ -57,16 +53,15 @@ def with_open_course(motion: Motion, theta: Float, off_a: Float | None = None) -
 
 
 def leaves_steps_open(window: Window) -> bool:
-    """Return whether what is open in a window's rows is its set-points' steps alone: the same in all of a drive's."""
+    """Return whether the set-points' steps, common to all windows of a drive, are the only unknown within samples."""
     means = window.voltage_sampling == "interval_mean" and window.slow_voltage is None
     return means and (window.current_off_a is not None or window.dt_s >= STEPPED_ROW_S) and window.dt_s < LEAST_ROW_S
 
 
 def with_known_course(motion: Motion, theta: Float, axis: Axis, demand_mm: Float) -> Motion:
-    """Return the motion with what the ``axis``' loops, run along the demand (n,), do within its rows.
+    """Return the motion with the current within its samples as simulated by the ``axis``' loops along the demand (n,).
 
-    A row's current beyond the straight line between readings pulls the shaft, and its drop over R is no part of the
-    voltage that changes the current.
+    Current beyond the straight line between readings pulls the shaft, and its drop over R does not change the current.
     """
     beyond = beyond_line_a(theta, axis, demand_mm, motion.dt_s)
     pulls = Course("pull", LOAD, -theta[K] * beyond)
@@ -80,7 +75,7 @@ def with_known_course(motion: Motion, theta: Float, axis: Axis, demand_mm: Float
 
 
 def beyond_line_a(theta: Float, axis: Axis, demand_mm: Float, row_s: float) -> Float:
-    """Return by how much the mean current of each row (n,) is above that of its ends; 0 where friction is not known."""
+    """Return by how much each sample's mean current (n,) exceeds that of its ends; 0 where friction is unknown."""
     p = _moving_parameters(theta)
     response = simulate(p, axis, row_s, demand_mm)
     speed, current = response.speed_rad_s, response.current_a
@@ -92,7 +87,7 @@ def beyond_line_a(theta: Float, axis: Axis, demand_mm: Float, row_s: float) -> F
 
 
 def left_at_the_table_mm(theta: Float, axis: Axis, window: Window) -> float:
-    """Return the RMS by which the closed loop with ``theta`` (k,) misses the measured place."""
+    """Return the RMS difference between measured position and the closed loop with ``theta`` (k,)."""
     response = simulate(_moving_parameters(theta), axis, window.dt_s, window.demand_mm)
     return rms(window.position_mm - response.position_mm)
 
@@ -103,7 +98,7 @@ def _moving_parameters(theta: Float) -> Parameters:
 
 
 def told_by_loops(motion: Motion, sync_period_s: float | None) -> bool:
-    """Return whether loops tell what happens within these rows: they are long, and one set-point is one row."""
+    """Return whether known loops determine the signals within these samples: long ones, with one set-point each."""
     grid = sync_period_s if sync_period_s is not None else motion.dt_s
     long = motion.within is not None and motion.dt_s >= LEAST_ROW_S
     return long and abs(grid - motion.dt_s) < SAME_GRID * motion.dt_s

@@ -1,6 +1,4 @@
-"""Starts the fit of windows with a slow voltage: by [5] over the sensor's own samples, with the delay to some ms."""
-
-from __future__ import annotations
+"""Starts the fit of windows with a low-rate voltage: [5] over the sensor's samples, with the delay to some ms."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -29,18 +27,15 @@ from fdhil.records import Estimate, Float, Window
 SPAN_S = 0.025
 SPAN_SAMPLES = 3
 SHIFTS_PER_SAMPLE = 4
-IMPROVEMENT = 1.5  # the residual's power must fall by this factor before a shift is believed
+IMPROVEMENT = 1.5  # the residual's power must fall by this factor for a shift to be accepted
 LEAST_SAMPLES = 16
-BEYOND_NOISE = 3.0  # of the variance that noise gives: what five rows rarely exceed by chance
-TIME_CONSTANT_S, LEAST_TIME_CONSTANT_S = 3e-3, 1e-4  # of a winding: a usual one, and what none has
+BEYOND_NOISE = 3.0  # of the noise's variance: five samples rarely exceed it by chance
+TIME_CONSTANT_S, LEAST_TIME_CONSTANT_S = 3e-3, 1e-4  # of a winding: usual, and least possible
 FLOORS = 10.0 ** np.arange(-6.0, 1.01, 0.5)  # of the variance of the current's second difference that is noise
 
 
 def slow_start(windows: Sequence[Window], settings: Identification) -> tuple[Float, list[float], list[Motion]] | None:
-    """Return [R, L, K, Jt, ft, Cd] (6,), each window's coarse delay in s, and the windows prepared.
-
-    None when there are too few samples to start from.
-    """
+    """Return [R, L, K, Jt, ft, Cd] (6,), coarse delays in s, and the prepared windows; None with too few samples."""
     shifts = [_coarse_shift(w, settings.lowpass_hz) for w in windows]
     rows = _rows(windows, shifts, settings)
     if rows is None:
@@ -48,14 +43,14 @@ def slow_start(windows: Sequence[Window], settings: Identification) -> tuple[Flo
     electrical, mechanical = rows
     theta = solve_two_steps(electrical, mechanical)[0][ORDER]
     if theta[R] > 0.0 and theta[L] < LEAST_TIME_CONSTANT_S * theta[R]:
-        # so coarse a delay is taken for L: the voltage R i + L di/dt is that of R i, earlier by L / R
+        # so coarse a delay is mistaken for L: R i + L di/dt is like R i, earlier by L / R
         shifts = [shift + TIME_CONSTANT_S - float(theta[L] / theta[R]) for shift in shifts]
         theta[L] = TIME_CONSTANT_S * theta[R]
     return theta, shifts, [prepare(w) for w in windows]
 
 
 def _rows(windows: Sequence[Window], shifts: Sequence[float], settings: Identification) -> tuple[Float, Float] | None:
-    """Return rows (m, 4) of [u, Di, i, w] and (n, 4) of [i, Dw, w, sign w]; None where there are too few."""
+    """Return regressors (m, 4) of [u, Di, i, w] and (n, 4) of [i, Dw, w, sign w]; None with too few samples."""
     pairs = zip(windows, shifts, strict=True)
     electrical = np.vstack([sample_rows(w, s, settings.lowpass_hz)[0] for w, s in pairs])
     mechanical = np.vstack([mechanical_signals(w, settings) for w in windows])
@@ -65,9 +60,9 @@ def _rows(windows: Sequence[Window], shifts: Sequence[float], settings: Identifi
 
 
 def slow_least_squares(windows: Sequence[Window], settings: Identification) -> Estimate:
-    """Fit [5] to the sensor's samples and [6] to the rows: for windows from which no likely drive can be begun.
+    """Fit [5] to the sensor's samples and [6] to the drive's: for windows without a plausible start.
 
-    What it finds says what is wrong with them: a turned sign makes R, K or Jt negative.
+    The result shows what is wrong with them: an inverted sign makes R, K or Jt negative.
     """
     slow = [w for w in windows if w.slow_voltage is not None]
     rows = _rows(slow, [_coarse_shift(w, settings.lowpass_hz) for w in slow], settings)
@@ -83,7 +78,7 @@ def slow_least_squares(windows: Sequence[Window], settings: Identification) -> E
 
 
 def sample_rows(window: Window, delay_s: float, lowpass_hz: float) -> tuple[Float, Float]:
-    """Return the rows (m, 4) of [u, Di, i, w] of the voltage samples that lie wholly inside, and their begins (m,)."""
+    """Return (m, 4) of [u, Di, i, w] for voltage samples wholly inside the window, and their begins (m,)."""
     slow = window.slow_voltage
     assert slow is not None
     dt, last = window.dt_s, (window.n - 1) * window.dt_s
@@ -106,7 +101,7 @@ def sample_rows(window: Window, delay_s: float, lowpass_hz: float) -> tuple[Floa
 
 
 def _coarse_shift(window: Window, lowpass_hz: float) -> float:
-    """Return by how many seconds the voltage is late (early: negative), to a quarter of its sample; 0 unless sure."""
+    """Return the delay of the voltage in s (negative: early) to a quarter of its sample; 0 unless significant."""
     slow = window.slow_voltage
     assert slow is not None
     reach = max(SPAN_S, SPAN_SAMPLES * slow.period_s)
@@ -125,11 +120,11 @@ def _coarse_shift(window: Window, lowpass_hz: float) -> float:
 
 
 def with_course(motion: Motion, theta: Float) -> Motion:
-    """Return the motion with what is known of its signals between the rows, for ``theta`` (7,).
+    """Return the motion with the random walk of its current between samples, for ``theta`` (7,).
 
-    The current's slope walks: a rapid's current has corners where the acceleration begins and ends, and is smooth
-    between. A walk as strong everywhere as the corners need would follow noise, and a weaker one would take them for
-    the voltage's delay. The share of the walk that noise hides is the most likely one.
+    A rapid's current has corners where the acceleration begins and ends, and is smooth between. A walk that everywhere
+    suits the corners would follow noise, a weaker one would attribute the corners to the voltage's delay. The most
+    likely noise share of the walk is chosen.
     """
     sampled = replace(motion, shape_variance=_shape_variance(motion, theta))
     second = np.pad(np.diff(motion.current, 2), 1, mode="edge")
@@ -144,9 +139,9 @@ def with_course(motion: Motion, theta: Float) -> Motion:
 
 
 def _shape_variance(motion: Motion, theta: Float) -> Float:
-    """Return by how much (m,), V^2, an instant may be off [1] for what the regulators do within a row; a mean is not.
+    """Return the variance (m,), V^2, of an instant against [1] due to regulators within a sample; 0 for means.
 
-    What they do to L di/dt is the same wherever the current is on its way, and so is taken for L.
+    Their effect on L di/dt is the same wherever the current changes, and so is attributed to L.
     """
     share = aliasing(motion.voltage_sampling, motion.dt_s)[0]
     course = motion.aligned(float(theta[DELAY])).at_voltage(moving_mean(motion.current, CORNER_ROWS))

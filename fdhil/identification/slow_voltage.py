@@ -1,17 +1,15 @@
-"""Gives innovations of a window whose voltage is from a sensor slower than the drive: one row per voltage sample.
+"""Computes innovations of a window whose voltage sensor is slower than the drive: one for each voltage sample.
 
-The voltage is never brought to the drive's grid. A Kalman filter runs over the drive's rows: [2] drives the speed from
-the current, the current's slope is a random walk, and each voltage sample is one more measurement, of [1] over its
+The voltage is never resampled to the drive's grid. A Kalman filter runs over the drive's samples: [2] drives the speed
+from the current, the current's slope is a random walk, and each voltage sample is a measurement of [1] over its
 interval, or at its instant:
 
     mean u = (R int i dt + L (i(end) - i(start)) + K int w dt) / T,        u = R i + L di/dt + K w.
 
 The state is [i, w, di/dt, (R int i dt + K int w dt - L i(start)) / T], the integrals from the running sample's start.
-Current and speed of a row are taken one after the other, so every innovation is a single number with a variance of its
-own. A delay of the voltage moves the ends of its samples among the rows: it is a parameter like others.
+Current and speed are processed one after the other, so every innovation is scalar with its own variance. A delay of the
+voltage moves the ends of its samples among the drive's: it is a parameter like the others.
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
@@ -23,7 +21,7 @@ from fdhil.identification.kalman import DELAY, JT, NO_SAMPLE, K, Marks, Readings
 from fdhil.identification.motion import Motion
 from fdhil.records import Float, read_only
 
-CURRENT_LATE_S, CURRENT_LATE = 1e-5, 0.01  # in s, and of a row: one standard deviation, see course_effect()
+CURRENT_LATE_S, CURRENT_LATE = 1e-5, 0.01  # in s, and of a sample: one standard deviation, see below
 CURRENT_ABOVE = 2.5e-4  # of the accelerating current, one standard deviation
 CORNER_ROWS = 5
 SMOOTH_ROWS = 15
@@ -31,9 +29,9 @@ SMOOTH_ROWS = 15
 
 @dataclass(frozen=True, slots=True)
 class Innovations:
-    """Innovations (2 n + m,) of current and speed row by row, then of the voltage samples, and their ``variance``.
+    """Innovations (2 n + m,) of current and speed sample by sample, then of the voltage, and their ``variance``.
 
-    What was not measured has the innovation 0 and the variance 1.
+    Missing measurements have innovation 0 and variance 1.
     """
 
     values: Float
@@ -41,9 +39,8 @@ class Innovations:
 
     @property
     def whitened(self) -> Float:
-        """The innovations, each in standard deviations of its own."""
-        white: Float = self.values / np.sqrt(self.variance)
-        return white
+        """The innovations, each in its own standard deviations."""
+        return self.values / np.sqrt(self.variance)
 
     @property
     def logdet(self) -> float:
@@ -52,16 +49,16 @@ class Innovations:
 
     @property
     def cost(self) -> float:
-        """Minus twice the logarithm of their likelihood, but for its constant; infinite where it is none."""
+        """Minus twice their log likelihood, without its constant; infinite where it is not finite."""
         value = float(self.whitened @ self.whitened) + self.logdet
         return value if np.isfinite(value) else np.inf
 
 
 def marks_of(motion: Motion, delay_s: float, ordered_for_s: float) -> Marks:
-    """Return the marks of a voltage that is late by ``delay_s``, in the order that ``ordered_for_s`` gives.
+    """Return the marks of a voltage that is late by ``delay_s``, in the order of a delay of ``ordered_for_s``.
 
-    Where a delay is varied a little, an innovation must stay the same row's: a mark that passes a row would change
-    what the two are innovations of.
+    While a delay is varied slightly, an innovation must stay that of the same sample: a mark that passed a sample would
+    change the meaning of both.
     """
     slow, n = motion.slow, motion.n
     assert slow is not None
@@ -83,14 +80,14 @@ def marks_of(motion: Motion, delay_s: float, ordered_for_s: float) -> Marks:
 
 
 def room_s(motion: Motion, delay_s: float) -> tuple[float, float]:
-    """Return by how much all samples may be earlier, and later, before one of them passes a row."""
+    """Return by how much all voltage samples may move earlier, and later, before one passes a drive's sample."""
     marks = marks_of(motion, delay_s, delay_s)
     after = marks.time_s - marks.row * motion.dt_s
     return float(after.min(initial=motion.dt_s)), float((motion.dt_s - after).min(initial=motion.dt_s))
 
 
 def spread_of(motion: Motion, variances: Float) -> Float:
-    """Return the variances (n, 2) of each row's current and speed, infinite where they are lost."""
+    """Return the variances (n, 2) of each sample's current and speed, infinite where lost."""
     return np.where(motion.observed[:, None], variances[1:], np.inf)
 
 
@@ -102,11 +99,11 @@ def innovations_of(
     more_nm: Float | None = None,
     spread: Float | None = None,
 ) -> Innovations:
-    """Return the innovations by the filter that is right for ``theta`` (7,) = [R, L, K, Jt, ft, Cd, delay].
+    """Return the innovations by the filter matched to ``theta`` (7,) = [R, L, K, Jt, ft, Cd, delay].
 
-    ``variances`` (3,) are those of voltage, current and speed; ``ordered_for_s`` as in :func:`marks_of`, the delay
-    itself when left out; ``more_nm`` (n,) is one more torque against the positive direction over each row's interval;
-    ``spread`` (n, 2) stands in the place of what :func:`spread_of` gives.
+    ``variances`` (3,) are those of voltage, current and speed; ``ordered_for_s`` is the delay that orders the samples
+    (default: the own); ``more_nm`` (n,) is an additional torque against the positive direction; ``spread`` (n, 2)
+    replaces the variances of current and speed.
     """
     assert motion.slow is not None
     delay_s = float(theta[DELAY])
@@ -122,22 +119,22 @@ def innovations_of(
 
 
 def course_effect(motion: Motion, theta: Float, variances: Float) -> Float:
-    """Return how the whitened innovations (2 n + m,) change with what is not known of the current between its rows.
+    """Return the change (2 n + m,) of the whitened innovations with the unknown current between samples.
 
-    Regulators act in steps, and rows are taken where a step ends: there a current on its way is behind its mean course,
-    by 1.3 % of a row with steps of a quarter of it and a current loop of 400 Hz (half a row: 5 %, an eighth: 0.3 %).
-    Set-points that are interpolated by straight lines leave an accelerating current above its mean where they meet.
+    Regulators act in steps, and samples are taken at the end of a step: a changing current is then behind its mean, by
+    1.3 % of a sample with steps of a quarter of it and a current loop of 400 Hz (half a sample: 5 %, an eighth: 0.3 %).
+    Linearly interpolated set-points leave an accelerating current above its mean where they meet.
     """
     slope = np.gradient(moving_mean(motion.current, CORNER_ROWS))
     accelerating = theta[JT] / theta[K] * np.gradient(moving_mean(motion.speed, SMOOTH_ROWS), motion.dt_s)
-    late_rows = max(CURRENT_LATE, CURRENT_LATE_S / motion.dt_s)  # finer rows make no finer regulators
+    late_rows = max(CURRENT_LATE, CURRENT_LATE_S / motion.dt_s)  # shorter samples do not make regulators faster
     mean = replace(motion, current=motion.current + late_rows * slope - CURRENT_ABOVE * accelerating)
     changed: Float = innovations_of(mean, theta, variances).whitened
     return changed - innovations_of(motion, theta, variances).whitened
 
 
 def left_open_v(motion: Motion, theta: Float, variances: Float) -> float:
-    """Return the standard deviation (V) of what current and speed leave open of a voltage sample, in the median."""
+    """Return the median standard deviation (V) of a voltage sample predicted from current and speed."""
     made = innovations_of(motion, theta, variances)
     known = made.values[2 * motion.n :] != 0.0
     if not known.any():
@@ -147,7 +144,7 @@ def left_open_v(motion: Motion, theta: Float, variances: Float) -> float:
 
 
 def in_order(motion: Motion, delay_s: float, columns: Float) -> Float:
-    """Return sums (n, k) by row of what belongs to innovations (2 n + m, k): a voltage sample's is where it ends."""
+    """Return sums (n, k) by sample of values of innovations (2 n + m, k): a voltage sample counts where it ends."""
     n = motion.n
     by_row: Float = columns[: 2 * n].reshape(n, 2, -1).sum(axis=1)
     if motion.slow is None:

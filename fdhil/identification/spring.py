@@ -1,10 +1,7 @@
-"""Takes a spring between motor and table into a window's fit: what the motor's encoder shows of a resonance.
+"""Adds a spring between motor and table to a window's fit, from the resonance in the motor's own encoder.
 
-The spring's torque (:mod:`fdhil.identification.spring_torques`) is straight in the resonance f and in the table's share
-s of the inertia about the values found so far, so both are entries of the fit, a few times over.
+Its torque is linearised in the resonance f and in the table's share s of the inertia, over a few iterations.
 """
-
-from __future__ import annotations
 
 import math
 from collections.abc import Sequence
@@ -22,24 +19,24 @@ from fdhil.identification.spring_torques import LEAST_SHARE, MOST_OF_ROWS, MOST_
 from fdhil.records import Float
 
 RESONANCE, SHARE, DAMPING = "resonance", "resonance_share", "resonance_damping"
-USUAL_DAMPING, DAMPING_DOUBT = 0.03, 0.02  # the ratio of ordinary screws: it hardly shows
-USUAL_SHARE, SHARE_DOUBT = 0.5, 0.15  # of the inertia behind the spring, before any data
-TOLD_DOUBT = 0.05  # relative, of a resonance that is configured
-FOUND_DOUBT = 1.0  # relative, of one that is sought
-GRID = np.geomspace(40.0, 320.0, 24)  # Hz, where one is sought
-AROUND = np.array([0.92, 0.96, 1.0, 1.04, 1.08])  # of a configured resonance, where it may begin
-FAR, FIRM = 0.35, 1e4  # relative, of a resonance from the configured one; of the prior's information, to hold it
+USUAL_DAMPING, DAMPING_DOUBT = 0.03, 0.02  # of ordinary screws: the data hardly show it
+USUAL_SHARE, SHARE_DOUBT = 0.5, 0.15  # prior of the inertia behind the spring
+CONFIGURED_DOUBT = 0.05  # relative, of a configured resonance
+SEARCHED_DOUBT = 1.0  # relative, of a searched one
+GRID = np.geomspace(40.0, 320.0, 24)  # Hz, of the search
+AROUND = np.array([0.92, 0.96, 1.0, 1.04, 1.08])  # of a configured resonance: starts of the fit
+FAR, FIRM = 0.35, 1e4  # relative distance from the configured resonance; factor of the prior that fixes it
 TURNS = 4
 SETTLED = np.array([0.005, 0.01])  # relative in f, and in s
-STEP = 0.02  # of f and s, over which their derivatives are taken
-SURE = 40.0  # fall of minus twice the log likelihood, of which chance explains one in millions of a grid
-NEAR_REST_S = 0.025  # in which the motor does not tell when the table breaks loose, or stops
-LEAST_NOISE = 0.3  # of what readings show: with less, a swing that is not quite right would be no chance at all
+STEP = 0.02  # of f and s, for their derivatives
+SURE = 40.0  # fall of minus twice the log likelihood: by chance once in millions of grids
+NEAR_REST_S = 0.025  # in which the motor does not show when the table breaks away, or stops
+LEAST_NOISE = 0.3  # of the visible noise: with less, an inexact vibration would be impossible by chance
 
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What is known of a spring before the data: f in Hz with its standard deviation; of s what is usual."""
+    """Prior of a spring: f in Hz with its standard deviation; s as usual."""
 
     hertz: float
     hertz_std: float
@@ -53,54 +50,53 @@ class Told:
         return np.array([self.hertz_std, SHARE_DOUBT])
 
     def precision(self) -> Float:
-        """Return (2,) the information about f and s."""
+        """Return (2,) the prior information about f and s."""
         return self.std**-2.0 * (FIRM if self.firm else 1.0)
 
     def allows(self, spring: Spring) -> bool:
-        """Return whether data may tell such a spring: what they put far from it is something else."""
-        near = abs(spring.hertz / self.hertz - 1.0) < (FAR if self.hertz_std < self.hertz else FOUND_DOUBT)
+        """Return whether a spring is plausible: one far from the prior stands for something else."""
+        near = abs(spring.hertz / self.hertz - 1.0) < (FAR if self.hertz_std < self.hertz else SEARCHED_DOUBT)
         return near and LEAST_SHARE < spring.share < MOST_SHARE
 
     def away(self, spring: Spring) -> Float:
-        """Return (2,) how far f and s should move from ``spring`` by what is known alone."""
+        """Return (2,) the difference between the prior's f and s and those of ``spring``."""
         return np.array([self.hertz - spring.hertz, USUAL_SHARE - spring.share])
 
     def cost(self, spring: Spring) -> float:
-        """Return minus twice the log likelihood of a spring by what is known."""
+        """Return minus twice the log likelihood of a spring by the prior."""
         return float(self.precision() @ self.away(spring) ** 2)
 
 
 def sprung(base: Fit, axis: Axis | None) -> Fit | None:
-    """Return the fit of one window with the spring that the ``axis``' section tells of, or that the window shows.
+    """Return the fit of one window with the configured or a significant resonance; None without one.
 
-    f and s of a configured resonance are what both tell together. None where no spring is told, or surely shown.
+    f and s of a configured resonance combine prior and data.
     """
     motion = base.problem.motions[0]
     if motion.slow is not None or not base.converged or not np.isfinite(base.residuals).all():
         return None
-    told = None
+    expected = None
     if axis is not None and axis.resonance_hz is not None:
-        told = Told(axis.resonance_hz, TOLD_DOUBT * axis.resonance_hz, axis.resonance_damping)
-    grid = GRID if told is None else AROUND * told.hertz
-    # of a configured one that rows do not tell, they tell what it does below
-    grid = grid[grid * motion.dt_s < MOST_OF_ROWS * (1 if told is None else 2)]
+        expected = Told(axis.resonance_hz, CONFIGURED_DOUBT * axis.resonance_hz, axis.resonance_damping)
+    grid = GRID if expected is None else AROUND * expected.hertz
+    # a configured resonance above the samples' band still acts below it
+    grid = grid[grid * motion.dt_s < MOST_OF_ROWS * (1 if expected is None else 2)]
     if not grid.size:
         return None
     scores = _scores(base, grid)
     best = float(grid[int(np.argmax(scores))])
-    if told is None and scores.max() < SURE:
+    if expected is None and scores.max() < SURE:
         return None
-    known = told or Told(best, FOUND_DOUBT * best)
+    known = expected or Told(best, SEARCHED_DOUBT * best)
     found = _turned(base, Spring(best, USUAL_SHARE, known.damping), known)
-    if told is not None:
+    if expected is not None:
         if found is None:
-            found = _turned(base, Spring(told.hertz, USUAL_SHARE, told.damping), replace(told, firm=True))
+            found = _turned(base, Spring(expected.hertz, USUAL_SHARE, expected.damping), replace(expected, firm=True))
         return None if found is None else found[0]
     return found[0] if found is not None and _cost(base) - found[1] > SURE else None
 
 
 def _scores(base: Fit, grid: Float) -> Float:
-    """Return (g,) by how much minus twice the log likelihood would fall with a spring at each frequency."""
     motion, theta = base.problem.motions[0], base.theta
     torques = Torques.of(motion, theta)
     springs = [Spring(float(hertz), USUAL_SHARE, USUAL_DAMPING) for hertz in grid]
@@ -112,29 +108,27 @@ def _scores(base: Fit, grid: Float) -> Float:
     return scores
 
 
-def _turned(base: Fit, spring: Spring, told: Told) -> tuple[Fit, float] | None:
-    """Return the fit with the spring, and minus twice its log likelihood; None where it tells none."""
+def _turned(base: Fit, spring: Spring, expected: Told) -> tuple[Fit, float] | None:
     plain, theta = base.problem.motions[0], base.theta
     free = (*base.free, theta.size, theta.size + 1)
     noises: Sequence[Noise] = ()
     for _ in range(TURNS):
-        made = fit([_bent(plain, theta, spring)], np.append(theta, [0.0, 0.0]), free, noises)
-        if not made.converged or not np.isfinite(made.residuals).all():
+        fitted = fit([_bent(plain, theta, spring)], np.append(theta, [0.0, 0.0]), free, noises)
+        if not fitted.converged or not np.isfinite(fitted.residuals).all():
             return None
-        made, noises = _with_prior(made, spring, told), made.problem.noises
-        theta, before = made.theta[:-2], spring
-        spring = spring.moved(*made.theta[-2:])
-        if not told.allows(spring):
+        fitted, noises = _with_prior(fitted, spring, expected), fitted.problem.noises
+        theta, before = fitted.theta[:-2], spring
+        spring = spring.moved(*fitted.theta[-2:])
+        if not expected.allows(spring):
             return None
         if (np.abs([spring.hertz / before.hertz - 1, spring.share - before.share]) < SETTLED).all():
             break
     torques = Torques.of(plain, theta)
-    cost = _cost(made) + told.cost(spring) + torques.squeezed(torques.answer(spring))
-    return replace(made, delay_doubt_s=base.delay_doubt_s), cost
+    cost = _cost(fitted) + expected.cost(spring) + torques.squeezed(torques.answer(spring))
+    return replace(fitted, delay_doubt_s=base.delay_doubt_s), cost
 
 
 def _bent(plain: Motion, theta: Float, spring: Spring) -> Motion:
-    """Return the motion with the spring: its torque at ``theta`` is known, f and s move about what they are."""
     torques = Torques.of(plain, theta)
     answer = torques.answer(spring)
 
@@ -159,32 +153,28 @@ def _bent(plain: Motion, theta: Float, spring: Spring) -> Motion:
 
 
 def _surely(motion: Motion) -> Modes:
-    """Return the modes (n,) without the rows near rest."""
     reach = math.ceil(NEAR_REST_S / motion.dt_s)
     near = np.convolve(motion.mode == UNKNOWN, np.ones(2 * reach + 1), "same") > 0.0
-    mode: Modes = np.where(near & (motion.mode != BROKEN), UNKNOWN, motion.mode).astype(np.int8)
-    return mode
+    return np.where(near & (motion.mode != BROKEN), UNKNOWN, motion.mode).astype(np.int8)
 
 
-def _with_prior(made: Fit, spring: Spring, told: Told) -> Fit:
-    """Return the fit with what is known of f and s beforehand, as one more observation of each."""
-    prior, std = np.zeros((2, len(made.free)))
-    prior[-2:], std[-2:] = told.precision(), told.std
-    information = made.information + np.diag(prior)
-    theta, pull = made.theta.copy(), np.zeros(len(made.free))
-    pull[-2:] = prior[-2:] * (told.away(spring) - theta[-2:])
-    theta[list(made.free)] += inverse_of(information)[0] @ pull
-    problem = pose(made.problem.motions, theta, made.problem.noises)
+def _with_prior(fitted: Fit, spring: Spring, expected: Told) -> Fit:
+    prior, std = np.zeros((2, len(fitted.free)))
+    prior[-2:], std[-2:] = expected.precision(), expected.std
+    information = fitted.information + np.diag(prior)
+    theta, pull = fitted.theta.copy(), np.zeros(len(fitted.free))
+    pull[-2:] = prior[-2:] * (expected.away(spring) - theta[-2:])
+    theta[list(fitted.free)] += inverse_of(information)[0] @ pull
+    problem = pose(fitted.problem.motions, theta, fitted.problem.noises)
     residuals = problem.residuals(theta)
-    made = replace(made, theta=theta, information=information, residuals=residuals, problem=problem)
-    return replace(made, prior=prior, prior_std=std)
+    fitted = replace(fitted, theta=theta, information=information, residuals=residuals, problem=problem)
+    return replace(fitted, prior=prior, prior_std=std)
 
 
-def _cost(made: Fit) -> float:
-    """Return minus twice the log likelihood of a fit of one window, by its own noise, without the rows near rest."""
-    motion = made.problem.motions[0]
-    variances = np.maximum(made.problem.noises[0].vector(), LEAST_NOISE * motion.noise.vector()) ** 2
+def _cost(fitted: Fit) -> float:
+    motion = fitted.problem.motions[0]
+    variances = np.maximum(fitted.problem.noises[0].vector(), LEAST_NOISE * motion.noise.vector()) ** 2
     if not any(course.name == RESONANCE for course in motion.courses):
         motion = replace(motion, mode=_surely(motion))
-    white, logdet = whiten(motion, made.theta[None], variances[None])
+    white, logdet = whiten(motion, fitted.theta[None], variances[None])
     return float(np.square(white).sum() + logdet[0])

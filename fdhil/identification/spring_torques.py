@@ -1,12 +1,13 @@
-"""Tells the torque that a spring between motor and table adds to one stiff mass, over a window and by frequency.
+"""Computes the torque that a spring between motor and table adds to a rigid mass, over a window, in the frequency
+domain.
 
 With the masses (1 - s) Jt of the motor and s Jt of the table, a torque T on the motor and dry friction F at the table,
 the motor accelerates by
 
     Jt a = G T - (1 - H) F        G = 1 + H s / (1 - s)        H = p^2 / (p^2 + 2 zeta w p + w^2)
 
-where w = 2 pi f is the resonance of both against each other, the motor free to turn. Stiff masses have H = 0. All are
-means over intervals: what is linear makes of means the means of what it makes.
+where w = 2 pi f is the resonance of both against each other, the motor free to turn. Rigid masses have H = 0. All are
+means over intervals: linear systems map means to means.
 """
 
 from __future__ import annotations
@@ -26,10 +27,13 @@ from fdhil.records import Float
 
 Spectrum = npt.NDArray[np.complex128]
 
-MOST_OF_ROWS, SEEN_ORDER = 0.16, 12  # periods in a row, up to which rows tell a swing, and how sharply that ends
-RINGS_S = 0.5  # after which a spring has surely come to rest
+MOST_OF_ROWS, SEEN_ORDER = (
+    0.16,
+    12,
+)  # periods per sample up to which a vibration is visible, and the order of that limit
+RINGS_S = 0.5  # until a spring's vibration has decayed
 LEAST_SHARE, MOST_SHARE = 0.1, 0.9
-MOST_STEP = 0.25  # of f at once
+MOST_STEP = 0.25  # of f per step
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +45,7 @@ class Spring:
     damping: float
 
     def moved(self, hertz: float, share: float) -> Spring:
-        """Return the spring with steps of both, within what a spring can be."""
+        """Return the spring moved in f and s, within physical limits."""
         near = float(np.clip(hertz, -MOST_STEP * self.hertz, MOST_STEP * self.hertz))
         part = float(np.clip(self.share + share, LEAST_SHARE, MOST_SHARE))
         return replace(self, hertz=self.hertz + near, share=part)
@@ -49,11 +53,11 @@ class Spring:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What a spring makes of torques, by frequency (w,): ``swing`` H and ``motor`` G.
+    """Frequency response (w,) of a spring to torques: ``swing`` H and ``motor`` G.
 
-    Current and acceleration both tell the torque on the motor, each with its noise; ``of_current`` is the share of the
-    current's. Where the two differ, stiff masses feel ``shaped`` of it: near the resonance, where the motor moves much,
-    its acceleration tells the torque, and no noise of the current is taken for a swing.
+    Current and acceleration both measure the torque on the motor, each with noise; ``of_current`` is the weight of the
+    current. Where they differ, a rigid mass feels ``shaped`` of it: near the resonance, where the motor moves much, its
+    acceleration decides, so that noise of the current is not taken for a vibration.
     """
 
     ratio: float
@@ -63,7 +67,7 @@ class Answer:
 
     @property
     def shaped(self) -> Spectrum:
-        """What is left of a difference between what current and acceleration tell."""
+        """The remaining share of a difference between the torques by current and by acceleration."""
         return (1.0 + self.ratio * self.swing * self.of_current) / self.motor
 
     @property
@@ -77,17 +81,17 @@ class Answer:
         return self.shaped * (1.0 - self.swing) - 1.0
 
     def added(self, motor: Spectrum, table: Spectrum) -> Spectrum:
-        """Return the torque against the positive direction that the spring adds, of torques on motor and table."""
+        """Return the torque against the positive direction that the spring adds to torques on motor and table."""
         return -self.swing * (self.ratio * motor + table)
 
 
 @dataclass(frozen=True, slots=True)
 class Torques:
-    """Spectra (w,) of a window's torques, N.m, and the power of the noise in what tells the motor's.
+    """Spectra (w,) of a window's torques, N.m, and the noise power of the motor's torque.
 
-    ``motor`` is that of the current less what drags there, ``table`` the dry friction, both of the six alone, and
-    ``..._whole`` with the terms; ``inertial`` is what the acceleration takes. ``seen`` is how much of a swing rows
-    tell.
+    ``motor`` is the current's torque less viscous friction, ``table`` the dry friction, both of the six alone, and
+    ``..._whole`` with the terms; ``inertial`` is the torque of the acceleration. ``visible`` is the visible share of a
+    vibration at the sampling rate.
     """
 
     n: int
@@ -99,11 +103,11 @@ class Torques:
     inertial: Spectrum
     noise_current: Float
     noise_speed: Float
-    seen: Float
+    visible: Float
 
     @classmethod
     def of(cls, motion: Motion, theta: Float) -> Torques:
-        """Return the torques of a window: at rest friction holds whatever pulls."""
+        """Return the torques of a window; at standstill friction balances any torque."""
         moving, dt_s = np.abs(motion.mode) == 1, motion.dt_s
         motor = theta[K] * _means(motion.current) - theta[FT] * _means(motion.speed)
         held = np.clip(motor, -abs(theta[CD]), abs(theta[CD]))
@@ -126,27 +130,27 @@ class Torques:
             inertial=_spectrum(theta[JT] * np.diff(motion.speed, append=motion.speed[-1]) / dt_s, size),
             noise_current=np.square(theta[K] * motion.noise.current_a * np.cos(turn / 2)),
             noise_speed=np.square(theta[JT] * motion.noise.speed_rad_s * 2 * np.sin(turn / 2) / dt_s),
-            seen=np.asarray(1.0 / (1.0 + (turn / (2 * math.pi * MOST_OF_ROWS)) ** SEEN_ORDER), dtype=np.float64),
+            visible=np.asarray(1.0 / (1.0 + (turn / (2 * math.pi * MOST_OF_ROWS)) ** SEEN_ORDER), dtype=np.float64),
         )
 
     def answer(self, spring: Spring) -> Answer:
-        """Return what a spring makes of torques."""
+        """Return a spring's frequency response."""
         ratio, swing = spring.share / (1.0 - spring.share), self._swing(spring)
         motor = 1.0 + ratio * swing
-        told = np.square(np.abs(motor)) * self.noise_current
-        return Answer(ratio, swing, motor, self.noise_speed / np.maximum(self.noise_speed + told, 1e-300))
+        noise = np.square(np.abs(motor)) * self.noise_current
+        return Answer(ratio, swing, motor, self.noise_speed / np.maximum(self.noise_speed + noise, 1e-300))
 
     def _swing(self, spring: Spring) -> Spectrum:
         w, square = 2 * math.pi * spring.hertz, self.p**2
-        return self.seen * square / (square + (2 * spring.damping * w) * self.p + w**2)
+        return self.visible * square / (square + (2 * spring.damping * w) * self.p + w**2)
 
     def best(self, answer: Answer) -> Spectrum:
-        """Return the torque on the motor as current and acceleration tell it together."""
+        """Return the torque on the motor, combined from current and acceleration."""
         by_motion = (self.inertial + self.table_whole * (1.0 - answer.swing)) / answer.motor
         return by_motion + answer.of_current * (self.motor_whole - by_motion)
 
     def begun(self, springs: Sequence[Spring]) -> list[Float]:
-        """Return the torque (n,) that each spring would add to what so far is one stiff mass."""
+        """Return the torque (n,) that each spring would add to a rigid mass."""
         still = Spring(springs[0].hertz, 0.0, springs[0].damping)
         motor = self.best(self.answer(still))
         ratios = [one.share / (1.0 - one.share) for one in springs]
@@ -156,49 +160,47 @@ class Torques:
         ]
 
     def felt(self, answer: Answer) -> Float:
-        """Return the torque (n,) that the spring adds by the six alone: the terms' own courses have theirs."""
+        """Return the torque (n,) that the spring adds by the six alone; the terms' regressors include their own."""
         own = (answer.shaped - 1.0) * self.inertial - answer.on_motor * self.motor + answer.on_table * self.table
         return self.back(own)
 
     def slope(self, answer: Answer, high: Spring, low: Spring) -> Float:
-        """Return the torque (n,) by which two springs differ, about the one with this answer."""
+        """Return the torque (n,) by which two springs differ, linearised about the one with this response."""
         torque = self.best(answer)
         added = (self.answer(one).added(torque, self.table_whole) for one in (high, low))
         return self.back(answer.shaped * (next(added) - next(added)))
 
     def squeezed(self, answer: Answer) -> float:
-        """Return minus twice the logarithm of how much smaller innovations are than those of one stiff mass.
+        """Return minus twice the log of the scaling of the innovations against those of a rigid mass.
 
-        That is no likelihood: they are told by another measure.
+        It corrects the likelihood, because the innovations are measured on another scale.
         """
         return -2.0 * self.n * float(np.log(np.maximum(np.abs(answer.shaped), 1e-12)).mean())
 
     def with_answer(self, course: Course, answer: Answer) -> Course:
-        """Return the course of a term as stiff masses would feel it."""
+        """Return the regressor of a term as rigid masses would feel it."""
         if course.kind != LOAD:
             return course
         gain = answer.on_motor if of_motor(course) else answer.on_table
         return replace(course, values=course.values + self.back(gain * _spectrum(course.values, 2 * (self.p.size - 1))))
 
     def back(self, spectrum: Spectrum) -> Float:
-        """Return the course (n,) of a spectrum."""
-        course: Float = np.fft.irfft(spectrum, 2 * (self.p.size - 1))[: self.n]
-        return course
+        """Return the signal (n,) of a spectrum."""
+        return np.fft.irfft(spectrum, 2 * (self.p.size - 1))[: self.n]
 
 
 def of_motor(course: Course) -> bool:
-    """Return whether a term acts on the motor: a ripple of it or of the screw's bearing and nut."""
+    """Return whether a term acts on the motor: a ripple of the motor, or of the screw's bearing and nut."""
     return course.name.startswith("ripple")
 
 
 def _spectrum(values: Float, size: int) -> Spectrum:
-    """Return the spectrum (w,) of a course (n,), which was as at first for long, led back to that at its end."""
+    """Return the spectrum (w,) of a signal (n,), extended by a smooth return to its first value."""
     n = values.size
     whole = np.zeros(size)
     whole[:n] = values - values[0]
     whole[n:] = whole[n - 1] * (0.5 + 0.5 * np.cos(np.linspace(0.0, math.pi, size - n)))
-    spectrum: Spectrum = np.fft.rfft(whole).astype(np.complex128)
-    return spectrum
+    return np.fft.rfft(whole).astype(np.complex128)
 
 
 def _means(values: Float) -> Float:

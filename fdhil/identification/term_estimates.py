@@ -1,10 +1,7 @@
-"""Tells the terms of a fit beside the six: ripples as amplitude and phase, and what was not a free entry of the fit.
+"""Adds the terms of a fit to the estimate: ripples as amplitude and phase, and values that were fixed during the fit.
 
-The speed at which friction falls off is found beside the fit, and a speed's lag before it: neither is known without an
-error, and what that error makes of the others is added to their covariance.
+The errors of the Stribeck speed and of a speed's lag add to the covariance of the others.
 """
-
-from __future__ import annotations
 
 from dataclasses import replace
 
@@ -20,29 +17,29 @@ from fdhil.records import PARAMETERS, Estimate, Float
 
 
 def told_terms(six: Estimate, result: Fit, values: Float, beyond: Float) -> tuple[Estimate, Float]:
-    """Return the estimate with the terms, and what is ``beyond`` its covariance (k, k) turned in the same way.
+    """Return the estimate with the terms, and the additional covariance ``beyond`` (k, k) in the same coordinates.
 
     ``six`` is the estimate with the covariance of all entries of theta but the delay, whose ``values`` are given.
     """
     names = (*PARAMETERS, *(course.name for course in result.problem.motions[0].courses))
     assert six.systematic is not None
-    covariance, systematic, told = six.covariance, six.systematic, values.copy()
-    told[len(PARAMETERS) :] += [course.about for course in result.problem.motions[0].courses]
+    covariance, systematic, extended = six.covariance, six.systematic, values.copy()
+    extended[len(PARAMETERS) :] += [course.about for course in result.problem.motions[0].courses]
     for name, value, own, effect in _chosen_before(result):
-        moved = np.pad(effect, (0, told.size - effect.size))
-        wider = np.empty((told.size + 1, told.size + 1))
+        moved = np.pad(effect, (0, extended.size - effect.size))
+        wider = np.empty((extended.size + 1, extended.size + 1))
         wider[:-1, :-1] = covariance + np.outer(moved, moved)
         wider[-1, :-1] = wider[:-1, -1] = own * moved
         wider[-1, -1] = own**2
-        covariance, told, names = wider, np.append(told, value), (*names, name)
+        covariance, extended, names = wider, np.append(extended, value), (*names, name)
         systematic, beyond = np.pad(systematic, ((0, 1), (0, 0))), np.pad(beyond, (0, 1))
-    beyond = as_amplitude(names, told, beyond, systematic)[1]
-    told, covariance, systematic = as_amplitude(names, told, covariance, systematic)
-    return replace(six, names=names, values=told, covariance=covariance, systematic=systematic), beyond
+    beyond = as_amplitude(names, extended, beyond, systematic)[1]
+    extended, covariance, systematic = as_amplitude(names, extended, covariance, systematic)
+    return replace(six, names=names, values=extended, covariance=covariance, systematic=systematic), beyond
 
 
 def _chosen_before(result: Fit) -> list[tuple[str, float, float, Float]]:
-    """Return name, value and deviation of what no entry of theta is, and what one deviation makes of theta."""
+    """Return name, value and deviation of each value outside theta, and the effect of one deviation on theta."""
     motions = result.problem.motions
     kept = [k for k, j in enumerate(result.free) if j != DELAY]
     found = []

@@ -1,11 +1,8 @@
-"""Lists what may join the six: for each term the courses of one unit over a window, in which the model is linear.
+"""Lists the candidate terms: for each, the regressors of one unit over a window.
 
-Friction at low speed, falling or rising, has a speed of its own that is tried on a grid; a ripple is a sine and a
-cosine of the shaft's angle; of a commanded voltage the inverter's dead time keeps a part from the motor, and a bus that
-sags under power.
+Stribeck friction, falling or rising, is tried at a grid of speeds; a ripple is a sine and a cosine of the shaft's
+angle; of a commanded voltage the inverter's dead time, and a bus that sags under power, subtract a part.
 """
-
-from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,27 +14,27 @@ from fdhil.identification.kalman import LOAD, VOLTAGE
 from fdhil.identification.motion import Course, Motion
 from fdhil.records import Float
 
-SPEEDS = np.geomspace(0.02, 0.35, 8)  # of the top speed, at which friction at low speed may fall off
-SCREW_ORDERS = (1, 2)  # periods in a turn
+SPEEDS = np.geomspace(0.02, 0.35, 8)  # of the top speed: Stribeck speeds
+SCREW_ORDERS = (1, 2)  # periods per turn
 # of 2 to 8 pole pairs: sensors' zeros and gains once and twice an electrical turn, windings 6 times, slots
 MOTOR_ORDERS = (3, 4, 5, 6, 8, 10, 12, 16, 18, 20, 24, 30, 36)
-MOST_TURN = 0.9 * np.pi  # of a ripple in a row at top speed: beyond it another order looks the same
+MOST_TURN = 0.9 * np.pi  # of a ripple per sample at top speed: beyond it orders alias
 SMOOTHING_S = 0.005
-WHOLE_DEAD_TIME = 0.01  # of the peak current: from there on a dead time has its whole effect
-LEAST_TURN = 1e-9  # rad in an interval
-PHASE = "_phase"  # ends the name of a ripple's cosine, as of its phase
+WHOLE_DEAD_TIME = 0.01  # of the peak current: above it a dead time has its full effect
+LEAST_TURN = 1e-9  # rad per interval
+PHASE = "_phase"  # suffix of a ripple's cosine, and of its phase
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """A term that may join: for each window its courses, one or a pair, which no other of its ``family`` may follow."""
+    """A candidate term: for each window one or two regressors; only one of its ``family`` may be added."""
 
     family: str
     courses: tuple[tuple[Course, ...], ...]
 
 
 def candidates(motions: Sequence[Motion], command: bool) -> list[Candidate]:
-    """Return what may join in these windows; terms of the voltage only where it may be a ``command``."""
+    """Return the candidate terms of these windows; terms of the voltage only where it may be a ``command``."""
     top = max(float(np.abs(m.speed).max()) for m in motions)
     found = [Candidate("stribeck", tuple((stribeck(m, speed),) for m in motions)) for speed in SPEEDS * top]
     if all(m.angle_rad.size for m in motions):
@@ -51,19 +48,19 @@ def candidates(motions: Sequence[Motion], command: bool) -> list[Candidate]:
 
 
 def stribeck(motion: Motion, speed_rad_s: float) -> Course:
-    """Return dry friction that falls off as exp(-(w / ``speed_rad_s``)^2)."""
+    """Return dry friction that decays as exp(-(w / ``speed_rad_s``)^2)."""
     share = np.exp(-np.square(_between(_smoothed(motion, motion.speed)) / speed_rad_s))
     return Course("stribeck", LOAD, share * _side(motion), speed_rad_s)
 
 
 def stribeck_slope(motion: Motion, course: Course) -> Course:
-    """Return how that friction changes with its speed, N.m per rad/s and N.m."""
+    """Return the derivative of Stribeck friction by its speed, N.m per rad/s and N.m."""
     speed = _between(_smoothed(motion, motion.speed))
     return Course("stribeck_speed", LOAD, course.values * 2 * np.square(speed) / course.speed_rad_s**3)
 
 
 def ripples(motion: Motion) -> dict[str, tuple[Course, Course]]:
-    """Return sine and cosine of each order times the shaft's angle, as means over each interval, by name."""
+    """Return sine and cosine of each order of the shaft's angle, as means over each interval, by name."""
     turned = np.diff(motion.angle_rad, append=motion.angle_rad[-1])
     still = np.abs(turned) < LEAST_TURN
     share = np.abs(_side(motion)) / np.where(still, 1.0, turned)
@@ -82,21 +79,20 @@ def ripples(motion: Motion) -> dict[str, tuple[Course, Course]]:
 
 
 def dead_time(motion: Motion) -> Course:
-    """Return minus the sign of the current, which turns over where the current is about nil."""
+    """Return minus the sign of the current, smoothed about zero."""
     current = _between(_smoothed(motion, motion.current))
     whole = max(WHOLE_DEAD_TIME * float(np.abs(motion.current).max()), 3.0 * motion.noise.current_a, 1e-12)
     return Course("dead_time", VOLTAGE, -np.clip(current / whole, -1.0, 1.0))
 
 
 def bus_sag(motion: Motion) -> Course:
-    """Return minus the voltage times the power that the motor takes; braking does not lift a bus that is held."""
+    """Return minus the voltage times the motor's power; braking does not raise a regulated bus."""
     power = np.maximum(motion.voltage_mean * _between(_smoothed(motion, motion.current)), 0.0)
     return Course("bus_sag", VOLTAGE, -motion.voltage_mean * power)
 
 
 def _side(motion: Motion) -> Float:
-    side: Float = np.where(np.abs(motion.mode) == 1, motion.mode, 0).astype(np.float64)
-    return side
+    return np.where(np.abs(motion.mode) == 1, motion.mode, 0).astype(np.float64)
 
 
 def _smoothed(motion: Motion, values: Float) -> Float:
@@ -104,6 +100,5 @@ def _smoothed(motion: Motion, values: Float) -> Float:
 
 
 def _between(values: Float) -> Float:
-    """Return the values (n,) in the middle of each interval."""
     middle: Float = (values + np.append(values[1:], values[-1])) / 2
     return middle

@@ -1,14 +1,9 @@
-"""Makes a window ready for [2] alone: current, speed, acceleration and its derivatives, all filtered alike.
+"""Prepares a window for [2] alone: current, speed, acceleration and its derivatives through the same filter.
 
-The position is the better signal where its own noise makes less of an acceleration than the speed's does: a drive's
-speed may be a difference of positions, late by half a row, or filtered. Its second difference over a row is exactly the
-acceleration's mean weighted by a triangle two rows wide, so the current is taken through the same triangle.
-
-What is at rest, or lost, is nothing on either side of [2] before the low-pass, so that nothing of it leaks into the
-rows beside it: a shaft at rest is held by a friction that nobody knows.
+The acceleration comes from the position or the speed, whichever is less noisy. The position's second difference is the
+acceleration's mean weighted by a triangle two samples wide, so the current is averaged by the same triangle. Samples at
+standstill, or lost, are zeroed on both sides of [2] before the low-pass: unknown static friction must not leak.
 """
-
-from __future__ import annotations
 
 import math
 from dataclasses import dataclass
@@ -24,11 +19,11 @@ from fdhil.records import Bool, Float, Window
 
 @dataclass(frozen=True, slots=True)
 class TorqueRows:
-    """A window's signals (n,), filtered alike; ``usable`` marks the rows to fit, which surely move.
+    """A window's signals (n,), filtered alike; ``usable`` marks the samples in motion, which are fitted.
 
     ``jerk`` and ``snap`` are the first and second derivative of the acceleration. ``side`` is the direction of motion
-    (0 at rest) and not filtered, nor is ``angle`` = 2 pi x / pitch, rad.
-    ``error_rad_s2`` is the standard deviation of the noise on the acceleration.
+    (0 at standstill), unfiltered, and so is ``angle`` = 2 pi x / pitch, rad. ``error_rad_s2`` is the standard deviation
+    of the noise on the acceleration.
     """
 
     dt_s: float
@@ -45,17 +40,16 @@ class TorqueRows:
 
     @property
     def count(self) -> int:
-        """Number of rows to fit."""
+        """Number of samples to fit."""
         return int(np.count_nonzero(self.usable))
 
     def through(self, courses: Float) -> Float:
-        """Return ``courses`` (q, n) of a torque through the same low-pass, at the rows to fit (m, q)."""
-        filtered: Float = zero_phase(courses, self.lowpass_hz, self.dt_s)[:, self.usable].T
-        return filtered
+        """Return torque regressors (q, n) through the same low-pass, at the samples to fit (m, q)."""
+        return zero_phase(courses, self.lowpass_hz, self.dt_s)[:, self.usable].T
 
 
 def torque_rows(window: Window, settings: Identification) -> TorqueRows | None:
-    """Return the rows of a window, its acceleration from position or speed; None where hardly anything was read."""
+    """Return the torque samples of a window, its acceleration from position or speed; None with hardly any samples."""
     dt, corner = window.dt_s, settings.lowpass_hz
     broken = ~(np.isfinite(window.current_a) & np.isfinite(window.speed_rad_s) & np.isfinite(window.position_mm))
     if window.n - np.count_nonzero(broken) < 8:
@@ -88,7 +82,7 @@ def torque_rows(window: Window, settings: Identification) -> TorqueRows | None:
 
 
 def _motion(angle: Float, speed: Float, lowpass_hz: float, dt: float) -> tuple[Float, Float, float]:
-    """Return speed and acceleration (n,) from the signal whose noise disturbs the acceleration less, and that noise."""
+    """Return speed and acceleration (n,) from the signal that disturbs the acceleration less, and its noise."""
     second, slope = np.array([1.0, -2.0, 1.0]) / dt**2, np.array([-0.5, 0.0, 0.5]) / dt
     of_angle = _left(second, lowpass_hz, dt) * max(noise_of(angle), resolution(angle) / math.sqrt(12.0))
     of_speed = _left(slope, lowpass_hz, dt) * max(noise_of(speed), resolution(speed) / math.sqrt(12.0))
@@ -98,12 +92,11 @@ def _motion(angle: Float, speed: Float, lowpass_hz: float, dt: float) -> tuple[F
 
 
 def _left(stencil: Float, lowpass_hz: float, dt: float) -> float:
-    """Return the standard deviation of what stencil and low-pass leave of white noise of 1."""
     return float(np.linalg.norm(np.convolve(impulse_response(lowpass_hz, dt), stencil)))
 
 
 def _over_rows(values: Float, weights: tuple[float, ...]) -> Float:
-    """Return the weighted sum (n,) over three rows about each; the ends are those of their neighbours."""
+    """Return the weighted sum (n,) over three samples about each; the ends repeat their neighbours."""
     summed = np.empty_like(values)
     before, at, after = weights
     summed[1:-1] = before * values[:-2] + at * values[1:-1] + after * values[2:]

@@ -1,9 +1,4 @@
-"""Reads a parameter's history: its slope, where it stepped, when it will reach a limit, each with its interval.
-
-Pure: rows in, figures out; nothing here reads a clock.
-"""
-
-from __future__ import annotations
+"""Analyses a parameter's history: its slope, its steps, when it reaches a limit, each with an interval."""
 
 import math
 from collections.abc import Sequence
@@ -14,31 +9,31 @@ import numpy as np
 from fdhil.records import INTERVAL_95, PARAMETERS, Float
 
 LEAST_ROWS = 3
-LEAST_STRETCH = 3  # rows on either side of a step: fewer may be one bad estimate
-NEWEST = 2  # rows after the newest step: two that agree are believed, as they are when they are taken in
-ENOUGH_FOR_DRIFT = 8  # rows from which on a steady drift is told apart from a step
+LEAST_STRETCH = 3  # rows on either side of a step: fewer may be a single bad estimate
+NEWEST = 2  # rows after the newest step: two that agree are accepted
+ENOUGH_FOR_DRIFT = 8  # rows from which on a steady drift is distinguished from a step
 ENOUGH_FOR_CURVE = 16
-NEAR = 8  # rows on either side in which a step must be seen too
+NEAR = 8  # rows on either side in which a step must be visible too
 BEYOND_CHANCE = 5.0
-# a date is told only of a slope that is so sure, seen over so long, and only so far ahead
+# a date is predicted only from a significant slope, over a minimum span, and only so far ahead
 SURE_SLOPE = 3.0  # standard deviations
 LEAST_DAYS = 1.0
 FARTHEST_SPANS = 5.0
-COLLINEAR = 1e-4  # share of a covariate that the others must leave
-FRICTION = "friction_at_rapid"  # Cd + ft w at the rapid speed: where ft and Cd trade it is what is known of them
+COLLINEAR = 1e-4  # share of a covariate that must be independent of the others
+FRICTION = "friction_at_rapid"  # Cd + ft w at the rapid speed: well determined where ft and Cd compensate each other
 BY_DIRECTION = ("ft", "Cd", FRICTION)
-LEAST_TURNS = 3  # from which on it is told what friction owes to the direction
-# a smaller step is not told: drift that is no straight line looks like one
+LEAST_TURNS = 3  # least changes of direction
+# smaller steps are not reported: nonlinear drift resembles them
 LEAST_STEP: dict[str, float] = {"R": 0.05, "L": 0.08, "K": 0.03, "Jt": 0.02, "ft": 0.15, "Cd": 0.10, FRICTION: 0.10}
-LEAST_STEP |= {f"{name}/K": LEAST_STEP[name] for name in ("Jt", "ft", "Cd")}  # as K hardly moves
+LEAST_STEP |= {f"{name}/K": LEAST_STEP[name] for name in ("Jt", "ft", "Cd")}  # K hardly changes
 
 
 @dataclass(frozen=True, slots=True)
 class Slope:
-    """A straight line through a parameter's history: ``value`` per unit of what it was drawn against, with ``std``.
+    """A line through a parameter's history: slope ``value`` with ``std``.
 
     The line passes through ``level`` (with ``level_std``, independent of the slope's) at ``at``. ``freedom`` is the
-    degrees of freedom that the standard deviations rest on, infinite when they come from the estimates themselves.
+    degrees of freedom of the standard deviations, infinite when they come from the estimates themselves.
     """
 
     value: float
@@ -56,7 +51,7 @@ class Slope:
 
 @dataclass(frozen=True, slots=True)
 class Crossing:
-    """Where a line reaches a limit, with its 95 % interval, in units of what the line was drawn against."""
+    """Where a line reaches a limit, with its 95 % interval, in units of the line's abscissa."""
 
     at: float
     low: float
@@ -65,7 +60,7 @@ class Crossing:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A parameter stepped between rows ``row - 1`` and ``row``: by ``size`` with ``std``, from ``before`` on."""
+    """A step of a parameter between rows ``row - 1`` and ``row``: by ``size`` with ``std``, from ``before`` on."""
 
     name: str
     row: int
@@ -83,17 +78,17 @@ def student_95(freedom: float) -> float:
     return sum(term / v**k for k, term in enumerate(terms))
 
 
-def slope(points: Float, against: Float, stds: Float | None = None, beside: Float | None = None) -> Slope | None:
-    """Fit a line to ``points`` (n,) over ``against`` (n,), weighted by ``stds`` (n,); None when it has no slope.
+def slope(points: Float, against: Float, stds: Float | None = None, covariate: Float | None = None) -> Slope | None:
+    """Fit a line to ``points`` (n,) over ``against`` (n,), weighted by ``stds`` (n,); None without a slope.
 
-    ``beside`` (n,) is held constant: what of the points follows it is no slope against the other. The slope's standard
-    deviation is the larger of what ``stds`` promise and what the scatter about the line shows.
+    The effect of the ``covariate`` (n,) does not count towards the slope. The standard deviation is the larger of
+    that by ``stds`` and that by the scatter about the line.
     """
     known = np.isfinite(points) & np.isfinite(against)
-    if beside is not None:
-        known &= np.isfinite(beside)
+    if covariate is not None:
+        known &= np.isfinite(covariate)
     y, x = points[known], against[known]
-    terms = 2 if beside is None else 3
+    terms = 2 if covariate is None else 3
     if y.size <= terms - 1 + (terms == 2) or np.ptp(x) == 0.0:
         return None
     weights = np.ones(y.size) if stds is None else 1.0 / np.maximum(stds[known], 1e-300) ** 2
@@ -101,8 +96,8 @@ def slope(points: Float, against: Float, stds: Float | None = None, beside: Floa
     root = np.sqrt(weights)
     lever, left = root * (x - at), root * (y - level)
     whole = float(lever @ lever)
-    if beside is not None:
-        other = beside[known] - np.average(beside[known], weights=weights)
+    if covariate is not None:
+        other = covariate[known] - np.average(covariate[known], weights=weights)
         lever, left = (_without(root * other, column) for column in (lever, left))
     spread = float(lever @ lever)
     if not spread > COLLINEAR * whole:
@@ -117,17 +112,15 @@ def slope(points: Float, against: Float, stds: Float | None = None, beside: Floa
 
 
 def _without(other: Float, column: Float) -> Float:
-    """Return ``column`` (n,) without what of it follows ``other`` (n,)."""
     length = float(other @ other)
-    rest: Float = column - other * (float(other @ column) / length if length > 0 else 0.0)
-    return rest
+    return column - other * (float(other @ column) / length if length > 0 else 0.0)
 
 
 def without_direction(points: Float, direction: Float) -> Float:
-    """Return ``points`` (n,) without what they owe to the ``direction`` (n,), 1 or -1: a constant load, a screw's bias.
+    """Return ``points`` (n,) less the effect of the ``direction`` (n,), 1 or -1: a constant load, a screw's bias.
 
-    It is half the median difference between windows that follow each other in opposite directions, so that drift and
-    steps leave it alone; nothing where there are fewer than ``LEAST_TURNS``.
+    It is half the median difference between consecutive windows of opposite directions, which excludes drift and steps;
+    0 with fewer than ``LEAST_TURNS``.
     """
     known = np.isfinite(points)
     y, side = points[known], direction[known]
@@ -135,14 +128,11 @@ def without_direction(points: Float, direction: Float) -> Float:
     if turns.size < LEAST_TURNS:
         return points
     load = float(np.median(side[turns] * (y[turns] - y[turns + 1]) / 2))
-    freed: Float = points - load * direction
-    return freed
+    return points - load * direction
 
 
 def crossing(line: Slope, limit: float) -> Crossing | None:
-    """Return where the line reaches ``limit``, by Fieller's theorem; None when the slope may as well be nil: it is less
-    than ``SURE_SLOPE`` standard deviations.
-    """
+    """Return where the line reaches ``limit``, by Fieller's theorem; None for an insignificant slope."""
     sure = student_95(line.freedom) ** 2
     if line.value**2 <= sure * (SURE_SLOPE / INTERVAL_95 * line.std) ** 2:
         return None
@@ -155,7 +145,7 @@ def crossing(line: Slope, limit: float) -> Crossing | None:
 
 
 def reach_days(span_days: float) -> float:
-    """Return how many days ahead a slope may be followed that was seen over ``span_days``; 0 when that is too short."""
+    """Return how many days ahead a slope observed over ``span_days`` may be extrapolated; 0 for too short a span."""
     return FARTHEST_SPANS * span_days if span_days >= LEAST_DAYS else 0.0
 
 
@@ -164,7 +154,7 @@ def steps(
 ) -> list[Step]:
     """Return the steps of the parameters ``names`` (n, k) with ``stds`` (n, k), by row; rows are windows in order.
 
-    Steady drift, a slow curve and what follows ``temperature`` (n,) are no steps.
+    Steady drift, a slow curve and the effect of ``temperature`` (n,) are not steps.
     """
     found = [s for k, name in enumerate(names) for s in _steps_of(name, values[:, k], stds[:, k], temperature)]
     return sorted(found, key=lambda step: (step.row, names.index(step.name)))
@@ -188,13 +178,13 @@ def _steps_of(name: str, values: Float, stds: Float, temperature: Float | None) 
     if not rows:
         return []
     theta, covariance = _fit(y * weights, weights, [*columns, *_jumps(n, rows)])
-    told = zip(rows, theta[len(columns) :], np.sqrt(np.diag(covariance))[len(columns) :], strict=True)
+    stepped = zip(rows, theta[len(columns) :], np.sqrt(np.diag(covariance))[len(columns) :], strict=True)
     base = np.column_stack([*columns, *_jumps(n, rows)]) @ theta
-    return [Step(name, int(known[r]), float(s), float(d), float(base[r] - s)) for r, s, d in told if abs(s) >= least]
+    return [Step(name, int(known[r]), float(s), float(d), float(base[r] - s)) for r, s, d in stepped if abs(s) >= least]
 
 
 def _stands_out(y: Float, weights: Float, row: int, size: float) -> bool:
-    """Return whether the rows close to a step show it too: a smooth curve that is no parabola has none there."""
+    """Return whether the rows near a step show it too: a smooth curve that is not a parabola has none there."""
     first, last = max(0, row - NEAR), min(y.size, row + NEAR)
     columns = [np.ones(last - first), np.linspace(-1.0, 1.0, last - first), *_jumps(last - first, [row - first])]
     if last - first < ENOUGH_FOR_DRIFT:
@@ -204,7 +194,6 @@ def _stands_out(y: Float, weights: Float, row: int, size: float) -> bool:
 
 
 def _courses(n: int, temperature: Float | None) -> list[Float]:
-    """Return what a parameter may do without a step: columns (n,)."""
     order = np.linspace(-1.0, 1.0, n)
     columns = [np.ones(n)]
     if n >= ENOUGH_FOR_DRIFT:
@@ -221,7 +210,6 @@ def _jumps(n: int, rows: Sequence[int]) -> list[Float]:
 
 
 def _fit(y: Float, weights: Float, columns: Sequence[Float]) -> tuple[Float, Float]:
-    """Return coefficients and covariance of the weighted regression; scatter beyond the weights widens it."""
     phi = np.column_stack(columns) * weights[:, None]
     inverse = np.linalg.pinv(phi.T @ phi)
     theta = inverse @ (phi.T @ y)
@@ -231,11 +219,10 @@ def _fit(y: Float, weights: Float, columns: Sequence[Float]) -> tuple[Float, Flo
 
 
 def _best_row(y: Float, weights: Float, columns: Sequence[Float], taken: Sequence[int]) -> int | None:
-    """Return the row whose step explains most of what the columns leave; None when no row may have one."""
     n = y.size
     base = np.linalg.qr(np.column_stack(columns) * weights[:, None])[0]
     left = y - base @ (base.T @ y)
-    # the step from row s on, weighted: its products are sums from s to the end
+    # products with a weighted step from row s are sums from s to the end
     lever = np.cumsum((left * weights)[::-1])[::-1]
     shadow = np.cumsum((base * weights[:, None])[::-1], axis=0)[::-1]
     whole = np.cumsum((weights**2)[::-1])[::-1]

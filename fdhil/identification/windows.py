@@ -1,10 +1,8 @@
 """Finds rapid moves in a recording: where each begins and ends, and its stages.
 
-A window is a maximal run in which the smoothed speed is at least 2 % of the rapid speed, extended to rest. A run whose
-peak stays below 60 % of the rapid speed is a feed move and is not listed.
+A window is a maximal run in which the smoothed speed is at least 2 % of the rapid speed, extended to standstill. A run
+whose peak stays below 60 % of the rapid speed is a feed move and is left out.
 """
-
-from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
@@ -28,7 +26,7 @@ MARGIN_S = 0.100
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """Half-open rows of one move: where the smoothed speed passes 2 %, and that extended to rest."""
+    """Half-open sample range of one move: where the smoothed speed exceeds 2 %, and that extended to standstill."""
 
     start: int
     end: int
@@ -38,13 +36,13 @@ class Run:
 
 
 def smooth(values: Float, dt_s: float, seconds: float = SMOOTHING_S) -> Float:
-    """Return ``values`` (n,) averaged over ``seconds`` about each row; lost rows (NaN) take the last one before."""
+    """Return ``values`` (n,) averaged over ``seconds`` about each sample; a lost one (NaN) repeats the last."""
     width = 2 * round(seconds / dt_s / 2) + 1
     return moving_mean(carried(values), width)
 
 
 def carried(values: Float) -> Float:
-    """Return ``values`` with each non-finite row replaced by the last finite one before it (0 where there is none)."""
+    """Return ``values`` with each non-finite sample replaced by the last finite one before it (0 without any)."""
     finite = np.isfinite(values)
     if finite.all():
         return values
@@ -53,7 +51,7 @@ def carried(values: Float) -> Float:
 
 
 def bridged(values: Float) -> Float:
-    """Return ``values`` with a line across each gap of non-finite rows; some row must be finite."""
+    """Return ``values`` with gaps of non-finite samples interpolated linearly; some sample must be finite."""
     known = np.isfinite(values)
     return values if known.all() else np.interp(np.arange(values.size), np.flatnonzero(known), values[known])
 
@@ -62,13 +60,13 @@ def noise_of(values: Float) -> float:
     """Return the standard deviation of white noise on a smooth signal, from its third differences (robust)."""
     if values.size < 4:
         return 0.0
-    with np.errstate(invalid="ignore"):  # of two infinite readings; what is not finite is left out
+    with np.errstate(invalid="ignore"):  # inf - inf; non-finite values are left out
         d = np.abs(values[3:] - values[:-3] - 3.0 * (values[2:-1] - values[1:-2]))
     d = d[np.isfinite(d)]
     if not d.size:
         return 0.0
     middle = (d.size - 1) // 2, d.size // 2
-    ordered = np.partition(d, middle)  # a library's median takes five times longer
+    ordered = np.partition(d, middle)  # np.median takes five times longer
     return float(1.4826 * (ordered[middle[0]] + ordered[middle[1]]) / 2 / np.sqrt(20.0))
 
 
@@ -87,7 +85,7 @@ def find_windows(recording: Recording, rapid_speed_rad_s: float | None = None) -
         if np.abs(speed[run.start : run.end]).max() < RAPID_SHARE * rapid:
             continue
         floor = runs[k - 1].rest_end if k else 0
-        # a drive that settles is no next move: the window lasts until it rests
+        # settling is not another move: the window lasts until standstill
         later = (other for other in islice(runs, k + 1, None) if not _settles(speed, recording.dt_s, run, other))
         following = next(later, None)
         ceiling = speed.size if following is None else following.rest_start
@@ -96,10 +94,7 @@ def find_windows(recording: Recording, rapid_speed_rad_s: float | None = None) -
 
 
 def whole_window(recording: Recording) -> Window:
-    """Return all of a recording as one window of any move, whose top speed stands in for the rapid speed.
-
-    Its direction is that in which it goes farther.
-    """
+    """Return all of a recording as one window of any move, with its top speed as rapid speed and its net direction."""
     speed = smooth(recording.speed_rad_s, recording.dt_s)
     top, n = float(np.max(np.abs(speed), initial=0.0)), speed.size
     run = Run(0, n, 0, n, 1 if speed.sum() >= 0.0 else -1)
@@ -108,12 +103,11 @@ def whole_window(recording: Recording) -> Window:
 
 
 def _runs(speed: Float, rapid: float, dt: float, noise: float) -> list[Run]:
-    """Return the moves of either direction; ``speed`` is smoothed."""
     side = np.sign(speed) * (np.abs(speed) >= RUN_SHARE * rapid)
     edges = np.flatnonzero(np.diff(side)) + 1
     bounds = np.concatenate([[0], edges, [side.size]])
     spans = [(int(a), int(b)) for a, b in pairwise(bounds) if b > a and side[a] != 0]
-    # what the smoothed noise may reach at rest
+    # largest smoothed noise at standstill
     still = np.abs(speed) <= max(0.002 * rapid, 3 * noise / np.sqrt(max(1.0, SMOOTHING_S / dt)))
     reach = round(EXTENSION_S / dt)
     runs = []
@@ -128,16 +122,15 @@ def _runs(speed: Float, rapid: float, dt: float, noise: float) -> list[Run]:
 
 
 def _settles(speed: Float, dt: float, run: Run, other: Run) -> bool:
-    """Return whether ``other`` is how ``run`` comes to rest, swinging back or creeping on: at once, short and slow."""
+    """Return whether ``other`` is how ``run`` settles, overshooting or creeping: immediate, short and slow."""
     at_once = (other.start - run.end) * dt <= EXTENSION_S and (other.end - other.start) * dt <= SETTLING_S
     slow = np.abs(speed[other.start : other.end]).max() < SETTLING_SHARE * np.abs(speed[run.start : run.end]).max()
     return at_once and bool(slow)
 
 
 def _cut(recording: Recording, speed: Float, run: Run, floor: int, ceiling: int, rapid: float) -> Window:
-    """Cut one window with its margins of standstill."""
     margin = round(MARGIN_S / recording.dt_s)
-    # the moves beside it may take its margins, never a part of itself
+    # neighbouring moves may shorten the margins, not the move
     a = max(min(floor, run.rest_start), run.rest_start - margin)
     b = min(max(ceiling, run.rest_end), run.rest_end + margin)
     part = slice(a, b)
@@ -171,12 +164,11 @@ def _cut(recording: Recording, speed: Float, run: Run, floor: int, ceiling: int,
 
 
 def _seen(values: Float | None, part: slice) -> Float | None:
-    """Return the rows of a sensor that may be missing; None where it tells none of them."""
     return None if values is None or not np.isfinite(values[part]).any() else read_only(values[part])
 
 
 def _slow_part(recording: Recording, a: int, b: int) -> SlowVoltage | None:
-    """Return the samples of a slow sensor that lie wholly between rows ``a`` and ``b`` - 1; None without any."""
+    """Return the low-rate samples wholly between samples ``a`` and ``b`` - 1; None without any."""
     slow = recording.slow_voltage
     if slow is None:
         return None
@@ -191,7 +183,7 @@ def _slow_part(recording: Recording, a: int, b: int) -> SlowVoltage | None:
 
 
 def _stages(speed: Float, run: Run, offset: int, dt: float) -> Stages:
-    """Return the stages in rows of the window; a recording that begins or ends in the move lacks that stage."""
+    """Return the stages in samples of the window; a recording that begins or ends in the move lacks that stage."""
     moving = np.abs(speed[run.rest_start : run.rest_end])
     top = _plateau(moving)
     first, last = longest(np.abs(moving - top) <= PLATEAU_BAND * top)
@@ -207,7 +199,7 @@ def _stages(speed: Float, run: Run, offset: int, dt: float) -> Stages:
 
 
 def _plateau(moving: Float) -> float:
-    """Return the speed about which most rows lie: the plateau's, also where the drive overshoots it."""
+    """Return the speed with most samples about it: the plateau's, also where the drive overshoots it."""
     ordered = np.sort(moving[moving >= 0.5 * moving.max()])
     counts = np.searchsorted(ordered, ordered * (1 + PLATEAU_BAND)) - np.searchsorted(
         ordered, ordered * (1 - PLATEAU_BAND)
@@ -216,23 +208,23 @@ def _plateau(moving: Float) -> float:
 
 
 def spans(flags: Bool) -> Int:
-    """Return the half-open rows (k, 2) of the runs of True, in order."""
+    """Return the half-open ranges (k, 2) of the runs of True, in order."""
     return np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8))).reshape(-1, 2)
 
 
 def runs_of(flags: Bool, least: int = 1) -> list[tuple[int, int]]:
-    """Return the half-open rows of the runs of True that are ``least`` long or longer, the longest first."""
+    """Return the half-open ranges of the runs of True of at least ``least`` samples, the longest first."""
     runs = [(int(start), int(end)) for start, end in spans(flags) if end - start >= least]
     return sorted(runs, key=lambda run: run[0] - run[1])
 
 
 def longest(flags: Bool) -> tuple[int, int]:
-    """Return the half-open rows of the longest run of True; (0, 0) when there is none."""
+    """Return the half-open range of the longest run of True; (0, 0) without any."""
     return next(iter(runs_of(flags)), (0, 0))
 
 
 def moving_range(window: Window) -> tuple[int, int]:
-    """Return the half-open rows of the move itself, without the margins of standstill."""
+    """Return the half-open range of the move itself, without the margins of standstill."""
     stages = [s for s in (window.stages.accelerate, window.stages.cruise, window.stages.brake) if s is not None]
     if not stages:
         return 0, window.n

@@ -1,18 +1,12 @@
-"""Fits [2] alone where there is no voltage: Jt, ft and Cd from current and position, with the K that is given.
+"""Fits [2] alone where there is no voltage: Jt, ft and Cd from current and position, with a given K.
 
-Least squares on K i = Jt dw/dt + ft w + Cd sign(w), all filtered alike, and on what joins it: friction at low speed, a
-ripple with the screw's turn. A term joins where the Bayesian information criterion (Schwarz 1978) wants it at the
-number of rows that tell something new, and where it is worth it. The current may be late: the torque's own slope
--tau (Jt dj/dt + ft dw/dt) is always fitted, so that it biases nothing. So is the acceleration's second derivative, by
-which the torque of a table behind a screw that gives differs from that of one mass, to first order. A constant load is
-part of the friction of its direction; windows of both directions tell it.
+Least squares on K i = Jt dw/dt + ft w + Cd sign(w) through one filter, and on Stribeck friction and screw ripples that
+the Bayesian information criterion prefers (Schwarz 1978). The torque's slope (a late current) and the acceleration's
+second derivative (a compliant screw, to first order) are always fitted, to avoid their bias.
 
-What is left is friction that no model has, much more than noise, and coloured. So the intervals stand around the
-variance of the scores (Newey and West 1987), widened for what that variance itself scatters (Kiefer and Vogelsang
-2005). Without K, its ratios are told.
+Residuals are dominated by unmodelled, coloured friction, not by sensor noise: the intervals use the variance of the
+scores (Newey and West 1987), widened for its own scatter (Kiefer and Vogelsang 2005).
 """
-
-from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -34,11 +28,11 @@ BASE = ("Jt", "delay", "give", "ft", "Cd")
 STRIBECK_SHARES = (0.02, 0.03, 0.05, 0.08, 0.12, 0.18, 0.27)  # of the top speed
 SCREW_ORDERS = (1, 2)
 TERMS = ("stribeck", *(f"ripple_screw_{order}" for order in SCREW_ORDERS))
-WORTH = 0.005  # of the torque's RMS: what a term must explain, a tenth of what may be left
-SUMMED_SHARE = 0.1  # of a window's rows: over which its residuals may hang together
+WORTH = 0.005  # of the torque's RMS: least effect of a term, a tenth of the allowed residual
+SUMMED_SHARE = 0.1  # of a window's samples: range of correlation of its residuals
 WIDENED = 2.9694 / 1.96  # per share, of the 95 % interval: Kiefer and Vogelsang 2005, Bartlett's weights
-OPEN_SHARE = 3e-4  # of Jt: what a current that is read once a row leaves open
-OPEN_SHARE_ROWS = 3e-5  # the same in rows of 1 ms; it grows with their square
+OPEN_SHARE = 3e-4  # of Jt: doubt of a current that is read once a sample
+OPEN_SHARE_ROWS = 3e-5  # the same at 1 ms; it grows with the square of the sample
 NO_VOLTAGE = Reason("LowExcitation", "there is no voltage, so [1] gives no R and L", "connect the voltage sensor")
 NO_K = Reason(
     "LowExcitation",
@@ -49,9 +43,9 @@ NO_K = Reason(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Term:
-    """What may join: its ``names``, and one column (m,) for each value that is fitted linearly.
+    """A candidate term: its ``names``, and one column (m,) for each linear value.
 
-    ``slope`` (m,) is how the torque of one unit answers a value that is not, such as the Stribeck speed ``at``.
+    ``slope`` (m,) is the derivative of the torque of one unit by a nonlinear value, such as the Stribeck speed ``at``.
     """
 
     names: tuple[str, ...]
@@ -62,10 +56,10 @@ class Term:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TorqueFit:
-    """[2] in amperes, fitted to the rows of a window: ``design`` (m, k) and ``current`` (m,).
+    """[2] in amperes, fitted to the samples of a window: ``design`` (m, k) and ``current`` (m,).
 
-    ``theta`` (k,) are the columns' amplitudes: those of ``BASE``, then of each of ``terms``. ``shifts`` (k,) are
-    by how much they would move with a term that is there and was not worth joining, by its name.
+    ``theta`` (k,) are the columns' amplitudes: those of ``BASE``, then of each of ``terms``. ``shifts`` (k,) are their
+    changes with a significant term that was not worth adding, by its name.
     """
 
     rows: TorqueRows
@@ -77,22 +71,18 @@ class TorqueFit:
 
     @property
     def residual(self) -> Float:
-        """What is left of the current (m,), A."""
-        left: Float = self.current - self.design @ self.theta
-        return left
+        """The residual of the current (m,), A."""
+        return self.current - self.design @ self.theta
 
     @property
     def unexplained(self) -> float:
-        """RMS of what is left as a share of the current's."""
+        """RMS of the residual as a share of the current's."""
         return rms(self.residual) / max(rms(self.current), 1e-300)
 
 
 @lru_cache(maxsize=8)
 def fit(window: Window, settings: Identification) -> TorqueFit | None:
-    """Fit [2] and the terms that join it to a window; None where hardly any row surely moves.
-
-    Estimate and checks ask for it.
-    """
+    """Fit [2] and its terms to a window; None with hardly any samples in motion. Cached for the checks."""
     rows = torque_rows(window, settings)
     if rows is None or rows.count < LEAST_ROWS:
         return None
@@ -103,19 +93,12 @@ def fit(window: Window, settings: Identification) -> TorqueFit | None:
     return _joined(TorqueFit(rows, design, current, solve(design, current)[0], ()))
 
 
-def _beside(fitted: TorqueFit, term: Term) -> TorqueFit:
-    """Return the fit with one term more."""
-    design = np.column_stack([fitted.design, term.columns])
-    theta, _ = solve(design, fitted.current)
-    return replace(fitted, design=design, theta=theta, terms=(*fitted.terms, term))
-
-
 def _joined(fitted: TorqueFit) -> TorqueFit:
-    """Let the best term join as long as one is wanted and worth it; what is wanted only puts the others in doubt."""
     news = effective_rows(fitted.residual)
     while True:
         wanted = _wanted(fitted, news)
-        worth = [other for other in wanted if _explained(other, fitted) > WORTH * rms(fitted.current)]
+        torque, least = fitted.design @ fitted.theta, WORTH * rms(fitted.current)
+        worth = [other for other in wanted if rms(other.design @ other.theta - torque) > least]
         if not worth:
             size = fitted.theta.size
             shifts = {other.terms[-1].names[0]: other.theta[:size] - fitted.theta for other in wanted}
@@ -124,10 +107,12 @@ def _joined(fitted: TorqueFit) -> TorqueFit:
 
 
 def _wanted(fitted: TorqueFit, news: float) -> list[TorqueFit]:
-    """Return the fits with one term more that the criterion prefers, the best first, one for each kind of term."""
+    """Return the fits with one additional term that the criterion prefers, the best of each kind, best first."""
     power, found = float(np.square(fitted.residual).sum()), []
     for term in candidates(fitted):
-        tried = _beside(fitted, term)
+        design = np.column_stack([fitted.design, term.columns])
+        theta, _ = solve(design, fitted.current)
+        tried = replace(fitted, design=design, theta=theta, terms=(*fitted.terms, term))
         left = float(np.square(tried.residual).sum())
         gain = news * np.log(power / max(left, 1e-300)) - len(term.names) * np.log(news)
         if gain > 0.0:
@@ -139,13 +124,8 @@ def _wanted(fitted: TorqueFit, news: float) -> list[TorqueFit]:
     return list(best.values())
 
 
-def _explained(other: TorqueFit, fitted: TorqueFit) -> float:
-    """Return the RMS of the torque by which two fits differ, A."""
-    return rms(other.design @ other.theta - fitted.design @ fitted.theta)
-
-
 def effective_rows(e: Float) -> float:
-    """Return how many rows of residuals (n,) tell something new: n / (1 + 2 sum rho), rho up to where it is nil."""
+    """Return the effective number of residuals (n,): n / (1 + 2 sum rho), rho up to its first zero."""
     size = 1 << (2 * e.size).bit_length()
     correlation = np.fft.irfft(np.abs(np.fft.rfft(e, size)) ** 2, size)[: e.size]
     if correlation[0] <= 0.0:
@@ -156,7 +136,7 @@ def effective_rows(e: Float) -> float:
 
 
 def candidates(fitted: TorqueFit) -> list[Term]:
-    """Return the terms that have not joined and that these rows could tell."""
+    """Return the candidate terms that these samples can determine."""
     rows, joined = fitted.rows, {name for term in fitted.terms for name in term.names}
     found = []
     if "stribeck" not in joined:
@@ -180,13 +160,13 @@ def _stribeck(rows: TorqueRows, speed_rad_s: float) -> Term:
 
 
 def told(window: Window, fitted: TorqueFit | None, known: Mapping[str, float]) -> Estimate:
-    """Return what the fit of a window tells, with the K of the recording itself, else the one ``known``.
+    """Return the estimate of a window's fit, with the K of the recording itself, else the one ``known``.
 
-    ``known`` may hold K, R and L of the data sheet: they are ``given`` in the estimate. R and L that are not known are
-    missing. Without any K all six are, and ``RATIOS`` follow them.
+    ``known`` may hold K, R and L of the data sheet: they are ``given`` in the estimate. Unknown R and L are missing.
+    Without K all six are missing, and ``RATIOS`` follow them.
     """
     if fitted is None:
-        text = "hardly any row lies beyond the low-pass's reach from standstill"
+        text = "hardly any sample in motion lies beyond the low-pass's reach from standstill"
         reason = Reason("LowExcitation", text, "record a longer rapid or raise lowpass_hz")
         return empty_estimate(METHOD, Result.UNDER_EXCITED, reason)
     own = window.torque_constant_nm_per_a
@@ -195,7 +175,7 @@ def told(window: Window, fitted: TorqueFit | None, known: Mapping[str, float]) -
 
 
 def late_s(fitted: TorqueFit) -> tuple[float, float]:
-    """Return by how much the current is late against the motion (early: negative), and the standard deviation."""
+    """Return the lag of the current against the motion (negative: early), and its standard deviation."""
     inertia, lag = float(fitted.theta[0]), float(fitted.theta[1])
     if not inertia > 0.0:
         return 0.0, np.inf
@@ -204,10 +184,9 @@ def late_s(fitted: TorqueFit) -> tuple[float, float]:
 
 
 def _covariance(fitted: TorqueFit) -> Float:
-    """Return the covariance (k + s, k + s) of the amplitudes and of the values that enter in no linear way.
+    """Return the covariance (k + s, k + s) of the amplitudes and of the nonlinear values.
 
-    In every direction the larger of two counts: by the scores, and by what as many residuals would be that hang
-    together as these do; a lucky sample is not precision.
+    In every direction the larger of two counts: by the scores, and by as many residuals with this correlation.
     """
     slopes = [t.slope * fitted.theta[_first(fitted, t)] for t in fitted.terms if t.slope is not None]
     design = np.column_stack([fitted.design, *slopes])
@@ -215,15 +194,14 @@ def _covariance(fitted: TorqueFit) -> Float:
     meat = _summed(design * fitted.residual[:, None], round(SUMMED_SHARE * len(design)))
     meat *= (1.0 + WIDENED * SUMMED_SHARE) ** 2
     power = max(float(np.square(fitted.residual).sum()), 1e-12 * float(np.square(fitted.current).sum()))
-    alike = design.T @ design * power / max(effective_rows(fitted.residual) - design.shape[1], 1.0)
-    scale = np.sqrt(np.diag(alike))
+    correlated = design.T @ design * power / max(effective_rows(fitted.residual) - design.shape[1], 1.0)
+    scale = np.sqrt(np.diag(correlated))
     scaled = np.outer(scale, scale)
-    covariance: Float = inverse @ (larger(meat / scaled, alike / scaled) * scaled) @ inverse.T
+    covariance: Float = inverse @ (larger(meat / scaled, correlated / scaled) * scaled) @ inverse.T
     return covariance
 
 
 def _summed(scores: Float, lags: int) -> Float:
-    """Return the variance (k, k) of the sum of ``scores`` (n, k) that hang together, with Bartlett's weights."""
     meat = scores.T @ scores
     for lag in range(1, lags + 1):
         shifted = scores[lag:].T @ scores[:-lag]
@@ -232,20 +210,18 @@ def _summed(scores: Float, lags: int) -> Float:
 
 
 def _first(fitted: TorqueFit, term: Term) -> int:
-    """Return the column of a term's first amplitude."""
     at = next(k for k, other in enumerate(fitted.terms) if other is term)
     return len(BASE) + sum(int(t.columns.shape[1]) for t in fitted.terms[:at])
 
 
 def _with_constant(fitted: TorqueFit, given: Mapping[str, float]) -> Estimate:
-    """Return the parameters and terms with the torque constant that is ``given``, N.m/A, and R and L if they are."""
     values, rates = _values(fitted)
     doubts = _doubts(fitted, rates)
     covariance = rates @ _covariance(fitted) @ rates.T + doubts @ doubts.T
     units = np.array([1.0 if name.endswith(("_speed", "_phase")) else given["K"] for name in values])
     whole = np.zeros((len(TOLD_BY_SHEET) + len(values),) * 2)
     whole[len(TOLD_BY_SHEET) :, len(TOLD_BY_SHEET) :] = covariance * np.outer(units, units)
-    # whether the data tell enough is asked of what was fitted: what is given, or missing, has no interval
+    # identifiability is checked for the fitted parameters only: given and missing ones have no interval
     sheet = [given.get(name, 1.0) for name in TOLD_BY_SHEET]
     answer = Estimate(
         method=METHOD,
@@ -262,7 +238,6 @@ def _with_constant(fitted: TorqueFit, given: Mapping[str, float]) -> Estimate:
 
 
 def _without(estimate: Estimate, names: Sequence[str]) -> Estimate:
-    """Return the estimate with some parameters missing because there is no voltage."""
     values, covariance = estimate.values.copy(), estimate.covariance.copy()
     for name in names:
         k = estimate.names.index(name)
@@ -273,7 +248,6 @@ def _without(estimate: Estimate, names: Sequence[str]) -> Estimate:
 
 
 def _ratios(fitted: TorqueFit) -> Estimate:
-    """Return the estimate whose six parameters are missing, and whose ``RATIOS`` are known with their covariance."""
     values, rates = _values(fitted)
     known, k = len(RATIOS), len(PARAMETERS)
     whole = np.full((k + known, k + known), np.nan)
@@ -291,29 +265,28 @@ def _ratios(fitted: TorqueFit) -> Estimate:
 
 
 def _values(fitted: TorqueFit) -> tuple[dict[str, float], Float]:
-    """Return Jt, ft, Cd and the terms' values by name, per N.m/A, and how they follow from what was fitted."""
     inertia, lag, _, viscous, dry = fitted.theta[: len(BASE)]
-    told = {"Jt": float(inertia - lag / inertia * viscous), "ft": float(viscous), "Cd": float(dry)}
+    named = {"Jt": float(inertia - lag / inertia * viscous), "ft": float(viscous), "Cd": float(dry)}
     size, others = fitted.theta.size, sum(t.slope is not None for t in fitted.terms)
     rates = [np.eye(size + others)[k] for k in (0, 3, 4)]
     for term in fitted.terms:
         k, unit = _first(fitted, term), np.eye(size + others)
         if term.at is not None:
-            told |= dict(zip(term.names, (float(fitted.theta[k]), term.at), strict=True))
-            rates += [unit[k], unit[size]]  # of such terms there is one
+            named |= dict(zip(term.names, (float(fitted.theta[k]), term.at), strict=True))
+            rates += [unit[k], unit[size]]  # there is only one such term
             continue
         sine, cosine = fitted.theta[k : k + 2]
         whole = float(np.hypot(sine, cosine))
-        told |= dict(zip(term.names, (whole, float(np.arctan2(cosine, sine))), strict=True))
+        named |= dict(zip(term.names, (whole, float(np.arctan2(cosine, sine))), strict=True))
         rates.append((sine * unit[k] + cosine * unit[k + 1]) / whole)
         rates.append((sine * unit[k + 1] - cosine * unit[k]) / whole**2)
-    return told, np.array(rates)
+    return named, np.array(rates)
 
 
 def _doubts(fitted: TorqueFit, rates: Float) -> Float:
-    """Return what is in doubt of each value (v, q), the same in all windows of a drive: one deviation a column.
+    """Return the doubts (v, q) of each value, common to all windows of a drive: one deviation a column.
 
-    Noise on the acceleration takes from Jt; and each term that is there and did not join would move them all.
+    Noise on the acceleration reduces Jt; each significant term that was not added would move all values.
     """
     power = float(np.mean(np.square(fitted.design[:, 0])))
     noise = fitted.rows.error_rad_s2**2 / max(power, 1e-300)

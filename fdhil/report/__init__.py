@@ -1,4 +1,4 @@
-"""Reports: pictures for a machine, and one self-contained HTML page around them, printed as PDF where wanted.
+"""Reports: charts of a machine in one self-contained HTML page, printed as PDF on request.
 
 Needs the extra ``report`` (matplotlib, jinja2); importing this package does not import them.
 """

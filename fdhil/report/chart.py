@@ -1,4 +1,6 @@
-"""Curves over one common axis as data: drawn once for paper, and told to the page's script, which makes them live."""
+"""Charts over one common axis as data: drawn for print, and exported to the page's script, which makes them
+interactive.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +18,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MOST_POINTS = 2000  # of a curve
-FEW_POINTS = 40  # up to which bars have caps: each is an element of the picture
-DIGITS = 5  # of what the page's script is told
+FEW_POINTS = 40  # up to which bars have caps: each adds an element to the picture
+DIGITS = 5  # of the data for the page's script
 DAY_S = 86_400.0
 PANEL_GAP = 0.12  # inches
 WIDTHS = {"line": 1.3, "dashed": 1.3, "wide": 2.6, "points": 0.0}
@@ -27,7 +29,7 @@ Style = Literal["line", "dashed", "wide", "points"]
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """One labelled curve, or points, (n,); between ``low`` and ``high`` its band, or its bars where it is points."""
+    """One labelled curve, or points, (n,); ``low`` and ``high`` bound its band, or its error bars."""
 
     label: str
     x: Float
@@ -40,7 +42,7 @@ class Trace:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """Traces over one another; ``levels`` are labelled horizontal lines; ``share`` is its part of the height."""
+    """Traces in one panel; ``levels`` are labelled horizontal lines; ``share`` is its part of the height."""
 
     y_label: str
     traces: Sequence[Trace]
@@ -76,11 +78,11 @@ def thinned(x: Float, y: Float, most: int = MOST_POINTS) -> tuple[Float, Float]:
 
 
 def svg(chart: Chart, width: float = 6.4, height: float = 3.6) -> str:
-    """Return the chart as inline SVG that carries its own numbers."""
+    """Return the chart as inline SVG that contains its data."""
     from matplotlib.ticker import MaxNLocator
 
     columns, rows = legend_rows([trace.label for trace in chart.panels[0].traces], width - LEFT - RIGHT)
-    if shown := len(_labels(chart)) > 1:
+    if shown := sum(bool(trace.label) for trace in chart.panels[0].traces) > 1:
         height += max(0, rows - 1) * LEGEND_LINE
     above = rows * LEGEND_LINE + 0.15 if shown else 0.15
     with drawing(width, height, above) as made:
@@ -101,12 +103,7 @@ def svg(chart: Chart, width: float = 6.4, height: float = 3.6) -> str:
     return made.svg
 
 
-def _labels(chart: Chart) -> list[str]:
-    return [trace.label for trace in chart.panels[0].traces if trace.label]
-
-
 def _places(chart: Chart, height: float, above: float) -> list[tuple[float, float]]:
-    """Return bottom and height of each panel, the first on top, as shares of the figure."""
     free = height - BELOW - above - PANEL_GAP * (len(chart.panels) - 1)
     whole = sum(panel.share for panel in chart.panels)
     top, places = height - above, []
@@ -144,7 +141,6 @@ def draw(axes: Axes, panel: Panel, chart: Chart) -> None:
 
 
 def _decade_below(panel: Panel) -> float:
-    """Return the power of ten below all that is drawn."""
     least = min(float(np.nanmin(trace.y)) for trace in panel.traces)
     return float(10.0 ** math.floor(math.log10(least)))
 
@@ -176,7 +172,7 @@ def _dates(axes: Axes) -> None:
 
 
 def told(chart: Chart) -> dict[str, Any]:
-    """Return the chart as the page's script reads it (``page.js``)."""
+    """Return the chart in the format of the page's script (``page.js``)."""
     grids: list[list[float | None]] = []
     panels = [_told_panel(panel, grids) for panel in chart.panels]
     return {
@@ -201,7 +197,7 @@ def _told_panel(panel: Panel, grids: list[list[float | None]]) -> dict[str, Any]
 
 
 def _told_trace(trace: Trace, grids: list[list[float | None]]) -> dict[str, Any]:
-    """Return a trace whose ``x`` is the number of its grid; a grid that several have is told once."""
+    """Return a trace whose ``x`` is the number of its grid; traces share grids."""
     order = np.argsort(trace.x, kind="stable")
     columns: Mapping[str, Float | None] = {"low": trace.low, "high": trace.high}
     bounds = {name: _shortened(values[order]) for name, values in columns.items() if values is not None}
@@ -219,7 +215,6 @@ def _shortened(values: Float) -> list[float | None]:
 
 
 def _short(value: float) -> float | None:
-    """Return a number as short as it may be; seconds since 1970 keep all of theirs."""
     if not math.isfinite(value):
         return None
     kept = round(value) if abs(value) >= 1e6 else float(f"{value:.{DIGITS}g}")

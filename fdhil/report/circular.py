@@ -1,4 +1,4 @@
-"""The plot of a circular test, as ISO 230-4 shows it: the programmed circle, and both runs with deviations enlarged."""
+"""Draws a circular test as in ISO 230-4: the programmed circle, and both runs with magnified deviations."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 NOMINAL = 6  # divisions from the centre to the programmed circle
-RINGS = 4  # divisions that are drawn inside and outside of it
+RINGS = 4  # divisions inside and outside of it
 DIVISIONS_UM = tuple(m * 10.0**e for e in range(-3, 5) for m in (1, 2, 5))
 
 
@@ -26,7 +26,7 @@ def division_um(test: Circular) -> float:
 
 
 def polar(test: Circular, names: tuple[str, str] = ("X", "Y")) -> str:
-    """Both runs of a circular test about the programmed circle, as inline SVG."""
+    """Draw both runs of a circular test about the programmed circle as inline SVG."""
     division = division_um(test)
     angle = np.append(np.arange(GRID), 0) * 2 * np.pi / GRID
     with drawing(4.8, 4.9, 0.4) as made:

@@ -1,4 +1,4 @@
-"""Draws with matplotlib into inline SVG that says what it shows, in words and, for the page's script, in numbers."""
+"""Draws with matplotlib into inline SVG with alternative text and data for the page's script."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ COLOURS = ("#0072b2", "#b84f00", "#007a59", "#a3437c", "#8a5c00", "#5b5f97")
 SHADES = ("#a9bccb", "#7fa8c4", "#4f93b5", "#4379a8", "#6b5ba5", "#94407f", "#b3261e", "#6d0b12")
 LEFT, RIGHT, BELOW, ABOVE = 0.8, 0.2, 0.55, 0.35  # margins, inches
 LETTERS_PER_INCH = 15.5  # of a legend
-HANDLE_LETTERS = 8  # what a legend's line takes beside its name
+HANDLE_LETTERS = 8  # width of a legend's line next to its name
 LEGEND_LINE = 0.2  # inches
 
 
 @dataclass(slots=True)
 class Drawing:
-    """A figure under way: ``alt`` and ``data`` may be set until it is left, then ``svg`` holds it."""
+    """A figure in progress: set ``alt`` and ``data`` inside the context, then ``svg`` holds the result."""
 
     figure: Figure
     axes: Axes
@@ -41,7 +41,7 @@ class Drawing:
 
 @contextmanager
 def drawing(width: float = 6.4, height: float = 3.6, above: float = ABOVE) -> Iterator[Drawing]:
-    """A figure with one pair of axes, ``above`` them a margin, all in inches."""
+    """Open a figure with one pair of axes and a margin ``above``, all in inches."""
     from matplotlib import style
     from matplotlib.figure import Figure
 
@@ -57,28 +57,28 @@ def drawing(width: float = 6.4, height: float = 3.6, above: float = ABOVE) -> It
 
 
 def _inline(text: str, alt: str, data: Mapping[str, Any] | None) -> str:
-    """Return the SVG for a page that holds several: with identifiers of its own, what it shows, and its numbers."""
+    """Return SVG that may share a page with others: unique identifiers, alternative text, data."""
     body = text[text.index("<svg") :]
     mark = f"f{zlib.crc32(body.encode()):08x}"
     body = re.sub(r'id="', f'id="{mark}-', body)
     body = re.sub(r'(xlink:href="#|url\(#)', rf"\g<1>{mark}-", body)
-    told = (
+    metadata = (
         "" if data is None else f"<metadata>{escape(json.dumps(data, separators=(',', ':')), quote=False)}</metadata>"
     )
     words = f' role="img" aria-label="{escape(alt)}"' if alt else ""
     start, _, rest = body.partition(">")
-    return f"{start}{words}>{told}{rest}"
+    return f"{start}{words}>{metadata}{rest}"
 
 
 def legend_rows(labels: list[str], width: float) -> tuple[int, int]:
-    """Return columns and rows of a legend that is not wider than ``width`` inches."""
+    """Return columns and rows of a legend that is at most ``width`` inches wide."""
     letters = HANDLE_LETTERS + max(map(len, labels), default=0)
     columns = max(1, min(len(labels), int(width * LETTERS_PER_INCH / letters)))
     return columns, -(-len(labels) // columns)
 
 
 def legend_above(axes: Axes, columns: int, handles: list[Any] | None = None) -> None:
-    """Put the legend above the picture, where it covers nothing; a click on a name hides its curve."""
+    """Put the legend above the picture; a click on a name hides its curve."""
     found = axes.get_legend_handles_labels()[0] if handles is None else handles
     legend = axes.legend(
         handles=found, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, borderpad=0.1, borderaxespad=0.3

@@ -1,7 +1,7 @@
-"""The paper's figures as inline SVG: pure functions from records to text.
+"""Draws the paper's figures as inline SVG from records.
 
-Figure numbers in the docstrings are those of [DES] (Desforges, Habbadi, Dessein). Paths are drawn in
-:mod:`fdhil.report.maps`; its functions are offered here too.
+Figure numbers in the docstrings are those of [DES] (Desforges, Habbadi, Dessein). Paths are drawn by the maps module,
+whose functions are offered here too.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,13 +20,13 @@ __all__ = [
     "signals", "simulated_speed", "torque",
 ]  # fmt: skip
 
-FAR_APART = 20.0  # errors that differ by more are not seen on one linear scale
+FAR_APART = 20.0  # errors that differ by more need a logarithmic scale
 LEAST_UM = 0.01
 RESIDUAL_SHARE = 0.42  # of the height of the panel above
 
 
 def signals(window: Window) -> str:
-    """Measured voltage, current and speed of one rapid (Figure 4)."""
+    """Draw measured voltage, current and speed of one rapid (Figure 4)."""
     time_s = _time_s(window)
     traces = [
         Trace("current (A)", time_s, window.current_a, COLOURS[2]),
@@ -44,7 +44,7 @@ def _time_s(window: Window) -> Float:
 
 
 def torque(cases: Sequence[tuple[str, Window, Parameters]]) -> str:
-    """Estimated torque Jt dw/dt + ft w + Cd sign(w) of rapids at several temperatures (Figure 5)."""
+    """Draw the estimated torque Jt dw/dt + ft w + Cd sign(w) of rapids at several temperatures (Figure 5)."""
     traces = []
     for (label, window, parameters), colour in zip(cases, COLOURS, strict=False):
         speed = simulated_speed(window, parameters)
@@ -57,7 +57,7 @@ def torque(cases: Sequence[tuple[str, Window, Parameters]]) -> str:
 
 
 def simulated_speed(window: Window, parameters: Parameters) -> Float:
-    """Shaft speed (n,), rad/s, that the model answers to the measured voltage; the measured one without a voltage."""
+    """Return the shaft speed (n,), rad/s, simulated from the measured voltage; without a voltage the measured speed."""
     if window.voltage_v is None:
         return window.speed_rad_s
     voltage = np.nan_to_num(window.voltage_v)
@@ -66,7 +66,7 @@ def simulated_speed(window: Window, parameters: Parameters) -> Float:
 
 
 def drift(symbol: str, unit: str, series: Mapping[str, tuple[Float, Float, Float]]) -> str:
-    """A parameter against slide-way temperature with two-sigma bars (Figures 6 and 7).
+    """Draw a parameter against slide-way temperature with two-sigma bars (Figures 6 and 7).
 
     ``series`` maps an axis to (temperature_c, value, standard deviation), each (n,).
     """
@@ -79,38 +79,38 @@ def drift(symbol: str, unit: str, series: Mapping[str, tuple[Float, Float, Float
             per_kelvin = f"{slope:+.3g} {unit} per kelvin"
             traces.append(Trace(f"{label}: {per_kelvin}", span, start + slope * span, colour, "dashed"))
             words.append(f"axis {label} {per_kelvin}")
-    alt = f"{symbol} over the slide-way's temperature: {'; '.join(words) or 'no slope can be told'}."
+    alt = f"{symbol} over the slide-way's temperature: {'; '.join(words) or 'no slope can be determined'}."
     chart = Chart("temperature of the slide-ways (degC)", [Panel(f"{symbol} ({unit})", traces)], alt)
     return svg(chart, 4.8, 3.2)
 
 
 def model_against_drive(window: Window, parameters: Parameters, fit_percent: float | None) -> str:
-    """Measured speed and the model's answer to the same voltage, and below what is between them (Figure 8)."""
+    """Draw measured and simulated speed, and their difference below (Figure 8)."""
     time_s = _time_s(window)
     fit = "" if fit_percent is None else f", fit {fit_percent:.2f} %"
     answer = simulated_speed(window, parameters)
-    between = window.speed_rad_s - answer
-    left = rms(between[np.isfinite(between)])
+    difference = window.speed_rad_s - answer
+    left = rms(difference[np.isfinite(difference)])
     overlay = [
         Trace("drive, measured", time_s, window.speed_rad_s, REFERENCE, "wide"),
         Trace(f"model{fit}", time_s, answer, COLOURS[1]),
     ]
     panels = [
         Panel("speed (rad/s)", overlay),
-        Panel("between (rad/s)", [Trace("drive less model", time_s, between, INK)], RESIDUAL_SHARE),
+        Panel("difference (rad/s)", [Trace("drive less model", time_s, difference, INK)], RESIDUAL_SHARE),
     ]
-    alt = f"Axis {window.axis}: measured speed and the model's{fit}; {left:.2g} rad/s RMS are between them."
+    alt = f"Axis {window.axis}: measured speed and the model's{fit}; they differ by {left:.2g} rad/s RMS."
     return svg(Chart("time (s)", panels, alt), 6.4, 4.2)
 
 
 def far_apart(errors_um: Sequence[Float]) -> bool:
-    """Whether some of the errors are so much smaller than others that one linear scale would not show them."""
+    """Whether the errors differ too much for one linear scale."""
     largest = [float(error_um.max()) for error_um in errors_um]
     return max(largest) > FAR_APART * max(min(largest), LEAST_UM)
 
 
 def common_scale(errors_um: Sequence[Float]) -> tuple[float, float | None]:
-    """Return one scale of colours for maps that are compared: its largest, and its least where it is logarithmic."""
+    """Return one colour scale for maps to be compared: its largest value, and its least where it is logarithmic."""
     largest = max(float(error_um.max()) for error_um in errors_um)
     if not far_apart(errors_um):
         return largest, None
@@ -119,10 +119,9 @@ def common_scale(errors_um: Sequence[Float]) -> tuple[float, float | None]:
 
 
 def contour_errors(dt_s: float, cases: Mapping[str, Float]) -> str:
-    """Contour error (um) along the path on a grid of ``dt_s``, one curve a case.
+    """Draw contour errors (um) along the path on a grid of ``dt_s``, one curve a case.
 
-    Where one is far smaller than another the scale is logarithmic; what is longer than the picture is wide is drawn by
-    its largest values.
+    The scale is logarithmic where one is far smaller than another; long curves are drawn by their largest values.
     """
     log = far_apart(list(cases.values()))
     traces = []
@@ -137,14 +136,13 @@ def contour_errors(dt_s: float, cases: Mapping[str, Float]) -> str:
 
 
 def _peaks(values: Float, dt_s: float) -> tuple[Float, Float]:
-    """Return times and values (m,), the largest of each stretch where there are more than can be drawn."""
     per = -(-values.size // MOST_POINTS)
     peaks: Float = np.maximum.reduceat(values, np.arange(0, values.size, per))
     return np.asarray(np.arange(peaks.size) * (per * dt_s)), peaks
 
 
 def axis_errors(time_s: Float, cases: Mapping[str, Float], axis: str) -> str:
-    """A place of one axis enlarged: its position less the desired one over time, um, one curve a case."""
+    """Draw the error of one axis over time, um, one curve a case."""
     desired = Trace("desired", time_s[[0, -1]], np.zeros(2), REFERENCE, "wide")
     traces = [Trace(label, time_s, um, colour) for (label, um), colour in zip(cases.items(), COLOURS, strict=False)]
     words = "; ".join(f"{label} {np.abs(um).max():.3g} um at most" for label, um in cases.items())

@@ -1,4 +1,4 @@
-"""The course of one parameter as a chart: its estimates over time or temperature, its line, nominal value and limit."""
+"""Charts a parameter's history: estimates over time or temperature, trend line, nominal value and limit."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,13 +14,12 @@ from fdhil.report.parameter_view import DISPLAY, cell, half_of, spoken
 
 MANY = 200  # estimates: more are shown by their daily medians
 BAND = (5.0, 95.0)  # percentiles of a day's estimates
-IN_VIEW = 4.0  # of the estimates' own range: a limit farther away would flatten them
-LEVELS_APART = 0.1
+IN_VIEW = 4.0  # of the estimates' range: a farther limit would flatten the curve
 
 
 @dataclass(frozen=True, slots=True)
 class AxisHistory:
-    """What is known of one axis: its revisions, its health (see ``fdhil history --json``), its nominal values."""
+    """The history of one axis: its revisions, its health (see ``fdhil history --json``), its nominal values."""
 
     axis: str
     rows: Sequence[Mapping[str, Any]] = ()
@@ -28,7 +27,7 @@ class AxisHistory:
     nominal: Mapping[str, float] = field(default_factory=dict)
 
     def names(self) -> list[str]:
-        """Return the parameters that have a course, in the order in which they are told."""
+        """Return the parameters with a history, in the order of display."""
         of_windows = [window["parameters"] for window in (self.told or {}).get("windows", ())]
         known = dict.fromkeys(name for parameters in of_windows for name in parameters)
         known |= dict.fromkeys(name for row in self.rows for name in row["parameters"])
@@ -41,23 +40,25 @@ class AxisHistory:
 
 
 def over_time(history: AxisHistory, name: str) -> Chart:
-    """Return a parameter's course in time: estimates or their daily medians, what was published, its line."""
+    """Return the chart of a parameter over time: estimates or daily medians, published values, trend."""
     unit, factor = DISPLAY[name]
     traces = [*_published(history, name), *_estimated(history, name)]
-    told = history.told or {}
-    if line := told.get("trends", {}).get(name):
-        at, newest = _second(line["at"]), _second(told["windows"][-1]["time"])
+    health = history.told or {}
+    if line := health.get("trends", {}).get(name):
+        at, newest = _second(line["at"]), _second(health["windows"][-1]["time"])
         ends = np.array([_second(line["since"]), at, newest])
         traces.append(_line("trend", ends, (ends - at) / DAY_S, line, "per_day", factor))
     marks = [
-        (change["cause"], _second(change["time"])) for change in told.get("changes", ()) if name in change["parameters"]
+        (change["cause"], _second(change["time"]))
+        for change in health.get("changes", ())
+        if name in change["parameters"]
     ]
     panel = Panel(f"{name.partition('_')[0]} ({unit})", traces, levels=_levels(history, name, traces))
     return Chart("time (UTC)", [panel], _words(history, name), in_time=True, marks=marks)
 
 
 def over_temperature(history: AxisHistory, name: str) -> Chart | None:
-    """Return a parameter's course over the slide-way's temperature; None where it does not surely follow it."""
+    """Return the chart of a parameter over the slide-way's temperature; None without a significant slope."""
     line = (history.told or {}).get("slopes", {}).get(name)
     known = [window for window in history.estimates(name) if window["temperature_c"] is not None]
     if not known or line is None or line["low"] <= 0.0 <= line["high"]:
@@ -71,13 +72,12 @@ def over_temperature(history: AxisHistory, name: str) -> Chart | None:
         _points(drawn, name, celsius),
         _line("slope", ends, ends - line["at_celsius"], line, "per_kelvin", factor),
     ]
-    told = cell(name, line["per_kelvin"], half_of(line), " ")
-    alt = f"Axis {history.axis}: {spoken(name)} over the temperature of the slide-way, {told} {unit} per kelvin."
+    slope = cell(name, line["per_kelvin"], half_of(line), " ")
+    alt = f"Axis {history.axis}: {spoken(name)} over the temperature of the slide-way, {slope} {unit} per kelvin."
     return Chart("temperature of the slide-way (degC)", [Panel(f"{name.partition('_')[0]} ({unit})", traces)], alt)
 
 
 def _published(history: AxisHistory, name: str) -> list[Trace]:
-    """Return what was published; of many sets the last of each day."""
     rows = [row for row in history.rows if name in row["parameters"]]
     if len(rows) > MANY or len(history.estimates(name)) > MANY:
         rows = list({row["time"][:10]: row for row in rows}.values())
@@ -88,7 +88,6 @@ def _published(history: AxisHistory, name: str) -> list[Trace]:
 
 
 def _estimated(history: AxisHistory, name: str) -> list[Trace]:
-    """Return each estimate with its interval; of many, the median of each day and where nine in ten of them lie."""
     known = history.estimates(name)
     if not known:
         return []
@@ -111,13 +110,11 @@ def _points(windows: Sequence[Mapping[str, Any]], name: str, at: Float) -> Trace
 
 
 def _line(label: str, ends: Float, away: Float, line: Mapping[str, Any], key: str, factor: float) -> Trace:
-    """Return a line through its centre with the fan of its slope's interval."""
     value, one, other = (factor * (line["level"] + line[which] * away) for which in (key, "low", "high"))
     return Trace(label, ends, value, INK, "dashed", np.minimum(one, other), np.maximum(one, other))
 
 
 def _levels(history: AxisHistory, name: str, traces: Sequence[Trace]) -> list[tuple[str, float]]:
-    """Return nominal value and limit where they are near enough to be drawn; the table tells them all the same."""
     shown = [values for trace in traces for values in (trace.low, trace.y, trace.high) if values is not None]
     if not shown:
         return []
@@ -134,7 +131,7 @@ def _words(history: AxisHistory, name: str) -> str:
     known = [row["parameters"][name]["value"] for row in history.rows if name in row["parameters"]]
     known = known or [window["parameters"][name]["value"] for window in history.estimates(name)]
     ends = f", first {known[0] * factor:.4g} {unit}, latest {known[-1] * factor:.4g} {unit}" if known else ""
-    return f"Axis {history.axis}: course of {spoken(name)} in time{ends}."
+    return f"Axis {history.axis}: history of {spoken(name)}{ends}."
 
 
 def _second(date: str) -> float:

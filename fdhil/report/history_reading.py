@@ -1,4 +1,4 @@
-"""Reads what the store knows of a machine's drives, as ``fdhil history --json`` and the pages have it."""
+"""Reads a machine's history from the store, for ``fdhil history --json`` and the pages."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ PASS = "PassMeasured"
 def read_history(
     machine: MachineConfig, axis: str | None = None, tell: Callable[[str], object] | None = None
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Return the published revisions and, by axis, what the windows tell of the drive's health. StoreError.
+    """Return the published revisions and the drives' health by axis. StoreError.
 
-    ``tell`` hears of damaged rows that were left out.
+    ``tell`` receives a message about damaged rows that were left out.
     """
     from fdhil.store.history import History
 
@@ -35,9 +35,9 @@ def read_history(
 def read_axes(
     machine: MachineConfig, axis: str | None = None, newest: int = 1
 ) -> tuple[list[AxisHistory], dict[str, Refusals]]:
-    """Return the history of each axis, or of one, and which of its newest windows were not believed. StoreError.
+    """Return the history of each axis, or of one, and the refusals among its newest windows. StoreError.
 
-    Of the published sets of one axis there are the first and the ``newest``.
+    Of the published sets of one axis the first and the ``newest`` are read.
     """
     from fdhil.store.history import History
 
@@ -47,13 +47,14 @@ def read_axes(
         if axis is not None and len(revisions) == newest > 1:
             first = stored.first_revision(axis)
             revisions = [first, *revisions[1:]] if first is not None else revisions
-        told = health(windows, stored, machine)
+        assessed = health(windows, stored, machine)
     refused = _refused(windows)
-    return by_axis(machine, [_row(revision) for revision in revisions], told, [*machine.axis, *refused]), refused
+    rows = [_row(revision) for revision in revisions]
+    return by_axis(machine, rows, assessed, [*machine.axis, *refused]), refused
 
 
 def read_refusals(machine: MachineConfig) -> dict[str, Refusals]:
-    """Return by axis which of the newest windows were not believed. StoreError."""
+    """Return the refusals among the newest windows, by axis. StoreError."""
     from fdhil.store.history import History
 
     with History.read(machine.store.directory) as stored:
@@ -66,7 +67,7 @@ def _refused(windows: Sequence[StoredWindow]) -> dict[str, Refusals]:
 
 
 def read_notices(machine: MachineConfig, axis: str | None = None) -> list[dict[str, Any]]:
-    """Return the newest notices that ask to be acknowledged, and who did, oldest first. StoreError."""
+    """Return the newest notices that require acknowledgement, and who acknowledged them, oldest first. StoreError."""
     from fdhil.store.history import RECENT_NOTICES, History
     from fdhil.store.notice_document import notice_document
 
@@ -77,7 +78,7 @@ def read_notices(machine: MachineConfig, axis: str | None = None) -> list[dict[s
 
 
 def read_passes(machine: MachineConfig) -> list[dict[str, Any]]:
-    """Return the notices of the passes that were cut corrected, oldest first. StoreError."""
+    """Return the notices of passes that were cut with correction, oldest first. StoreError."""
     from fdhil.store.history import RECENT_NOTICES, History
     from fdhil.store.notice_document import notice_document
 
@@ -98,16 +99,16 @@ def _row(revision: Revision) -> dict[str, Any]:
 
 
 def by_axis(
-    machine: MachineConfig, rows: Sequence[Mapping[str, Any]], told: Mapping[str, Any], seen: Iterable[str] = ()
+    machine: MachineConfig, rows: Sequence[Mapping[str, Any]], assessed: Mapping[str, Any], seen: Iterable[str] = ()
 ) -> list[AxisHistory]:
-    """Return the history of each axis that is known of, in the order of the config."""
-    known = {*(row["axis"] for row in rows), *told, *seen}
+    """Return the history of each axis, in the order of the configuration."""
+    known = {*(row["axis"] for row in rows), *assessed, *seen}
     axes = [axis for axis in machine.axis if axis in known] + sorted(known - set(machine.axis))
     return [
         AxisHistory(
             axis,
             [row for row in rows if row["axis"] == axis],
-            told.get(axis),
+            assessed.get(axis),
             _nominal(machine, axis) if axis in machine.axis else {},
         )
         for axis in axes
@@ -115,6 +116,5 @@ def by_axis(
 
 
 def _nominal(machine: MachineConfig, axis: str) -> dict[str, float]:
-    """Return the nominal values that somebody knows: a guess is none."""
     settings = machine.axis[axis]
     return settings.nominal.model_dump(exclude=set[str](settings.guessed))

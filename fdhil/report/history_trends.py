@@ -1,4 +1,4 @@
-"""Finds the drives' health in the stored windows: slopes, steps, and the dates of the maintenance limits."""
+"""Assesses the drives' health from stored windows: slopes, steps, and the dates of maintenance limits."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 NEWEST_WINDOWS = 2000
 DAY_S = 86_400.0
-LEAST_SPAN_S = 3_600.0  # below it a course in time is warming, not wear
-WEAR_SPAN_S = 2 * DAY_S  # from it on what follows the temperature is told apart from wear
+LEAST_SPAN_S = 3_600.0  # below it a trend is warming, not wear
+WEAR_SPAN_S = 2 * DAY_S  # from it on temperature effects are distinguished from wear
 FARTHEST_DAYS = 3_650.0
 TOGETHER = 2  # windows within which steps have one cause
 CAUSES = {
@@ -33,47 +33,45 @@ CAUSES = {
 
 
 def health(windows: Sequence[StoredWindow], history: History, machine: MachineConfig) -> dict[str, dict[str, Any]]:
-    """Return by axis ``slopes``, ``trends``, ``limits``, ``changes`` and their ``windows``, as JSON has them.
+    """Return by axis ``slopes``, ``trends``, ``limits``, ``changes`` and their ``windows``, for JSON.
 
-    ``windows`` are the newest of ``history``, oldest first.
-
-    An axis without voltage has no accepted windows; its ratios to K follow friction and load all the same.
+    ``windows`` are the newest of ``history``, oldest first. An axis without voltage has no accepted windows; its ratios
+    to K still track friction and load.
     """
     stored = [window for window in windows if window.parameters]
-    told = {}
+    assessed = {}
     for name in dict.fromkeys(window.axis for window in stored):
         own = [window for window in stored if window.axis == name]
         accepted = [window for window in own if window.accepted]
         if not accepted:
             if ratios := [window for window in own if _tells_ratios(window)]:
-                told[name] = of_axis(ratios, {}, RATIOS)
+                assessed[name] = of_axis(ratios, {}, RATIOS)
             continue
         first = history.first_revision(name)
         limits = {}
         if first is not None:
             shares = machine.maintenance.model_dump()
             limits = {symbol: (value, shares[symbol]) for symbol, value in first.set.parameters.as_dict().items()}
-        told[name] = of_axis(accepted, limits)
-    return told
+        assessed[name] = of_axis(accepted, limits)
+    return assessed
 
 
 def _tells_ratios(window: StoredWindow) -> bool:
-    """Return whether nothing but its missing voltage speaks against a window."""
-    told = (window.parameters or {}).get(RATIOS[0], {}).get("value") is not None
-    return told and len(window.reasons) == 1
+    has_ratios = (window.parameters or {}).get(RATIOS[0], {}).get("value") is not None
+    return has_ratios and len(window.reasons) == 1
 
 
 def of_axis(
     windows: Sequence[StoredWindow], limits: Mapping[str, tuple[float, float]], symbols: Sequence[str] = PARAMETERS
 ) -> dict[str, Any]:
-    """Return an axis' health; ``limits`` maps a symbol to its first published value and the change that it may have."""
+    """Return an axis' health; ``limits`` maps a symbol to its first published value and its allowed relative change."""
     import numpy as np
 
     from fdhil.identification.trends import BY_DIRECTION, FRICTION, slope, steps, without_direction
 
     symbols = (*symbols, FRICTION) if symbols == PARAMETERS else symbols
     values, stds = (_columns(windows, key, symbols) for key in ("value", "std"))
-    values[stds == 0.0] = np.nan  # given, not estimated: a data sheet's value has no course
+    values[stds == 0.0] = np.nan  # given, not estimated: a data sheet's value has no trend
     direction = np.array([window.direction for window in windows], dtype=np.float64)
     for k in (k for k, symbol in enumerate(symbols) if symbol in BY_DIRECTION):
         values[:, k] = without_direction(values[:, k], direction)
@@ -81,14 +79,14 @@ def of_axis(
     celsius = np.array([np.nan if w.temperature_c is None else w.temperature_c for w in windows], dtype=np.float64)
     known = bool(np.isfinite(celsius).all())
     found = steps(values, stds, celsius if known else None, symbols)
-    told: dict[str, Any] = {"slopes": {}, "trends": {}, "limits": {}, "changes": _changes(found, windows)}
+    axis: dict[str, Any] = {"slopes": {}, "trends": {}, "limits": {}, "changes": _changes(found, windows)}
     for k, symbol in enumerate(symbols):
         since = max((step.row for step in found if step.name == symbol), default=0)
         y, std, kelvin = values[since:, k], stds[since:, k], celsius[since:]
         span_s = float(np.ptp(time_s[since:]))
         if line := slope(y, kelvin, std, time_s[since:] if span_s >= WEAR_SPAN_S else None):
             centre = {"level": line.level, "at_celsius": line.at}
-            told["slopes"][symbol] = {"per_kelvin": line.value, "std": line.std, **_interval(line.interval())} | centre
+            axis["slopes"][symbol] = {"per_kelvin": line.value, "std": line.std, **_interval(line.interval())} | centre
         if span_s < LEAST_SPAN_S:
             continue
         held = known and bool(np.ptp(kelvin) > 0)
@@ -96,21 +94,20 @@ def of_axis(
         if line is not None:
             rest: dict[str, Any] = {"level": line.level, "at": _date(line.at * DAY_S), "since": _date(time_s[since])}
             rest["at_constant_temperature"] = held
-            told["trends"][symbol] = {"per_day": line.value, "std": line.std, **_interval(line.interval())} | rest
+            axis["trends"][symbol] = {"per_day": line.value, "std": line.std, **_interval(line.interval())} | rest
             if symbol in limits:
-                told["limits"] |= _limit(symbol, line, limits[symbol], float(time_s[-1]), span_s / DAY_S)
-    return told | {"windows": _rows(windows, values, stds, symbols)}
+                axis["limits"] |= _limit(symbol, line, limits[symbol], float(time_s[-1]), span_s / DAY_S)
+    return axis | {"windows": _rows(windows, values, stds, symbols)}
 
 
 def _columns(windows: Sequence[StoredWindow], key: str, symbols: Sequence[str]) -> Float:
-    """Return (n, k) of the windows' values or standard deviations, NaN where one was not told."""
     import numpy as np
 
     from fdhil.identification.trends import FRICTION
 
     known: list[dict[str, Any]] = [{**(window.parameters or {}), FRICTION: window.friction or {}} for window in windows]
-    told = [[parameters.get(name, {}).get(key) for name in symbols] for parameters in known]
-    return np.array(told, dtype=np.float64).reshape(-1, len(symbols))
+    columns = [[parameters.get(name, {}).get(key) for name in symbols] for parameters in known]
+    return np.array(columns, dtype=np.float64).reshape(-1, len(symbols))
 
 
 def _interval(interval: tuple[float, float]) -> dict[str, float]:
@@ -124,7 +121,6 @@ def _date(seconds: float) -> str:
 def _limit(
     symbol: str, line: Any, limit: tuple[float, float], newest_s: float, span_days: float
 ) -> dict[str, dict[str, Any]]:
-    """Return when the line reaches the limit that lies ahead of it, and nothing when no date can be told."""
     from fdhil.identification.trends import crossing, reach_days
 
     first, share = limit
@@ -136,7 +132,6 @@ def _limit(
 
 
 def _dates(reached: Crossing, newest_s: float) -> dict[str, str | None]:
-    """Return the date and its interval; one that ends in a farther future has no latest date."""
     late = reached.high - newest_s / DAY_S > FARTHEST_DAYS
     return {
         "date": _date(reached.at * DAY_S),
@@ -146,7 +141,6 @@ def _dates(reached: Crossing, newest_s: float) -> dict[str, str | None]:
 
 
 def _changes(found: Sequence[Step], windows: Sequence[StoredWindow]) -> list[dict[str, Any]]:
-    """Return the steps with those of other parameters at about the same window taken together."""
     from fdhil.identification.trends import FRICTION
 
     changes: list[list[Step]] = []
@@ -155,24 +149,23 @@ def _changes(found: Sequence[Step], windows: Sequence[StoredWindow]) -> list[dic
             changes[-1].append(step)
         else:
             changes.append([step])
-    told = []
+    described = []
     for together in changes:
         window = windows[together[0].row]
         parameters = {
             s.name: {"before": s.before, "after": s.before + s.size, "std": s.std, "unit": unit_of(s.name)}
             for s in together
         }
-        # the sum of ft and Cd tells no cause beside either
+        # the sum of ft and Cd adds no cause to either of them
         moved_by = frozenset(name.removesuffix("/K") for name in parameters) - {FRICTION} or frozenset({"ft", "Cd"})
         cause = CAUSES.get(moved_by, "a changed drive or sensor")
-        told.append(
+        described.append(
             {"window": window.number, "time": _date(window.stamp.wall_s), "cause": cause, "parameters": parameters}
         )
-    return told
+    return described
 
 
 def _rows(windows: Sequence[StoredWindow], values: Float, stds: Float, symbols: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the windows as the plot and JSON have them: number, time, temperature, NC, value and deviation."""
     import numpy as np
 
     def told(number: float) -> float | None:
@@ -192,9 +185,9 @@ def _rows(windows: Sequence[StoredWindow], values: Float, stds: Float, symbols: 
     ]
 
 
-def slope_rows(told: Mapping[str, Any]) -> list[list[str]]:
+def slope_rows(health: Mapping[str, Any]) -> list[list[str]]:
     """Return a row per parameter that has a slope: per kelvin, per day, and its limit's date."""
-    slopes, trends, limits = (told[key] for key in ("slopes", "trends", "limits"))
+    slopes, trends, limits = (health[key] for key in ("slopes", "trends", "limits"))
     rows = []
     for name in DISPLAY:
         if name in slopes or name in trends:
@@ -207,7 +200,7 @@ def slope_rows(told: Mapping[str, Any]) -> list[list[str]]:
 
 
 def moved(change: Mapping[str, Any]) -> str:
-    """Return what moved in a change, in words."""
+    """Describe a change in words."""
     parts = ((name, DISPLAY[name], p) for name, p in change["parameters"].items())
     return ", ".join(
         f"{name} {p['before'] * factor:.4g} -> {p['after'] * factor:.4g} {unit}" for name, (unit, factor), p in parts
@@ -219,6 +212,6 @@ def _when(name: str, limit: Mapping[str, Any] | None) -> str:
         return "-"
     value = f"{limit['limit'] * DISPLAY[name][1]:.4g}"
     if limit["reached"]:
-        return f"{value} has been reached"
+        return f"{value} reached"
     latest = limit["latest"][:10] if limit["latest"] else "open"
     return f"{value} on {limit['date'][:10]}\n({limit['earliest'][:10]} to {latest})"

@@ -1,6 +1,4 @@
-"""Draws an identification: signals with the model's, whiteness of the residuals, parameters and their correlation."""
-
-from __future__ import annotations
+"""Draws an identification: measured and modelled signals, residuals' whiteness, parameters and their correlation."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -10,12 +8,12 @@ from typing import Any, Protocol
 import numpy as np
 
 from fdhil.identification.next_move import predict_next_moves
-from fdhil.records import INTERVAL_95, PARAMETERS, Estimate, Float, Verdict, Window, WindowOutcome, unit_of
+from fdhil.records import INTERVAL_95, PARAMETERS, Estimate, Float, Verdict, WindowOutcome, unit_of
 from fdhil.report.chart import Chart, Panel, Trace, svg, thinned
 from fdhil.report.drawing import COLOURS, INK, REFERENCE
 from fdhil.report.page import Page, Section, Table
 from fdhil.report.parameter_view import MEANING, MEANINGS, cell, head
-from fdhil.validation.simulation import Simulated, simulated
+from fdhil.validation.simulation import simulated
 
 MOST_WINDOWS = 6
 LAGS = 40
@@ -23,7 +21,7 @@ INCHES = 6.4, 6.8
 
 
 class Identified(Protocol):
-    """What was found of one recording, or of several together."""
+    """The result of one recording, or of several together."""
 
     @property
     def file(self) -> str: ...
@@ -50,7 +48,7 @@ def identification_page(found: Identified) -> Page:
 
 
 def save_picture(found: Identified, path: Path) -> None:
-    """Draw the first window into a picture of the format that the name ends in."""
+    """Save a picture of the first window in the format of the file's suffix."""
     from fdhil.store.output import open_output
 
     figure = draw_identification(found)
@@ -59,7 +57,7 @@ def save_picture(found: Identified, path: Path) -> None:
 
 
 def draw_identification(found: Identified, number: int = 0) -> Any:
-    """Return a matplotlib figure of one window: each signal with the model's, the residual, and its whiteness."""
+    """Return a matplotlib figure of one window: measured and modelled signals, the residual, and its whiteness."""
     from matplotlib import style
     from matplotlib.figure import Figure
 
@@ -89,7 +87,7 @@ def _parameters(found: Identified) -> Section:
     rows = [_row(name, found.pooled, found.verdict) for name in (*PARAMETERS, *terms)]
     reasons = [[str(r), r.advice] for r in dict.fromkeys((*found.verdict.reasons, *found.verdict.warnings))]
     tables = [Table(("parameter", "value", "unit", "what it is"), rows, MEANING)]
-    tables += [Table(("what was found", "what to do"), reasons)] if reasons else []
+    tables += [Table(("finding", "what to do"), reasons)] if reasons else []
     return Section("Parameters", tables=tables)
 
 
@@ -102,15 +100,15 @@ def _row(name: str, estimate: Estimate | None, verdict: Verdict) -> tuple[str, s
         return name, f"{estimate.value(name):.4g}", unit_of(name) or "", "given, not estimated"
     shown = cell(name, estimate.value(name), INTERVAL_95 * estimate.std(name), " ")
     unit = head(name).split("\n")[1] if name in PARAMETERS else unit_of(name) or ""
-    return name, shown, unit, MEANINGS.get(name, "joined the six")
+    return name, shown, unit, MEANINGS.get(name, "additional term")
 
 
 def _window(outcome: WindowOutcome) -> Section:
     window, verdict = outcome.window, outcome.verdict
     title = f"From {window.start_s:.2f} s"
-    figures = [("Signals, and the model's answer to the measured voltage", svg(_signals(outcome), 6.4, 5.6))]
+    figures = [("Measured signals, and the model's response to the measured voltage", svg(_signals(outcome), 6.4, 5.6))]
     figures += [
-        ("Correlation of the residuals; white ones stay between the lines", svg(c, 6.4, 2.4))
+        ("Correlation of the residuals; white residuals stay between the lines", svg(c, 6.4, 2.4))
         for c in _whiteness(outcome)
     ]
     text = "Validated." if verdict.accepted else "; ".join(map(str, verdict.reasons))
@@ -118,10 +116,9 @@ def _window(outcome: WindowOutcome) -> Section:
 
 
 def _signals(outcome: WindowOutcome) -> Chart:
-    """Return the chart of a window's signals with the model's."""
     window = outcome.window
     time_s = np.arange(window.n, dtype=np.float64) * window.dt_s
-    model = _model(outcome)
+    model = None if outcome.estimate is None else simulated(window, outcome.estimate, None)
     panels = []
     if window.voltage_v is not None:
         panels.append(Panel("voltage (V)", [Trace("measured voltage", time_s, window.voltage_v, COLOURS[1])], 0.7))
@@ -139,12 +136,7 @@ def _signals(outcome: WindowOutcome) -> Chart:
     return Chart("time (s)", panels, f"Axis {window.axis}: signals of {time_s[-1]:.2f} s with the model's{fit}.")
 
 
-def _model(outcome: WindowOutcome) -> Simulated | None:
-    return None if outcome.estimate is None else simulated(outcome.window, outcome.estimate, None)
-
-
 def _whiteness(outcome: WindowOutcome) -> Iterator[Chart]:
-    """Yield the chart of the correlation of each equation's residuals over lags, between 95 % limits."""
     residuals = {} if outcome.estimate is None else outcome.estimate.residuals
     traces, rows = [], 0
     for colour, (equation, values) in zip(COLOURS, residuals.items(), strict=False):
@@ -177,13 +169,13 @@ def _correlation(estimate: Estimate | None) -> Iterator[Section]:
     deviations = np.sqrt(np.diag(part))
     shares = part / np.outer(deviations, deviations)
     rows = [(name, *(f"{value:+.2f}" for value in row)) for name, row in zip(names, shares, strict=True)]
-    text = "Two parameters with a correlation near 1 or -1 can be separated only by another kind of move."
+    text = "Two parameters with a correlation near 1 or -1 can only be separated by another kind of move."
     yield Section("Correlation of the estimates", text, [Table(("", *names), rows)])
 
 
 def _next(found: Identified) -> Iterator[Section]:
-    """Yield what would narrow the widest interval."""
-    estimate, window = found.pooled, _longest(found.outcomes)
+    estimate = found.pooled
+    window = max((outcome.window for outcome in found.outcomes), key=lambda window: window.n, default=None)
     if estimate is None or window is None or estimate.missing or estimate.given:
         return
     p = estimate.parameters()
@@ -195,13 +187,9 @@ def _next(found: Identified) -> Iterator[Section]:
     best = min(moves, key=lambda move: move.shares[widest], default=None)
     if best is None:
         return
-    left = f"leaves {best.shares[widest]:.0%} of it at best"
+    left = f"reduces it to {best.shares[widest]:.0%} at best"
     text = (
-        f"{widest} has the widest interval of its size. One more recording as long, {best.name}, {left}. What "
-        "the model itself leaves open stays. The table has the least share of each interval that is left."
+        f"{widest} has the widest relative interval. One more recording of this length, {best.name}, {left}. What "
+        "the model itself leaves open remains. The table lists the smallest share of each interval that remains."
     )
-    yield Section("What would tell more", text, [Table(("further move", *PARAMETERS), rows)])
-
-
-def _longest(outcomes: Sequence[WindowOutcome]) -> Window | None:
-    return max((o.window for o in outcomes), key=lambda window: window.n, default=None)
+    yield Section("Most informative further recording", text, [Table(("further move", *PARAMETERS), rows)])

@@ -1,4 +1,4 @@
-"""Paths in a plane as inline SVG: their start and direction, their named places, their error by colour."""
+"""Draws paths in a plane as inline SVG: start and direction, named positions, error by colour."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fdhil.identification.windows import longest
 from fdhil.records import Float
 from fdhil.report.drawing import COLOURS, INK, LEGEND_LINE, REFERENCE, SHADES, drawing, legend_above, legend_rows
 
@@ -21,14 +22,14 @@ if TYPE_CHECKING:
     from matplotlib.image import AxesImage
 
 PIECES = 600  # of a coloured path
-LONGEST_PIECE = 60  # rows: a longer one would hide where in it the error is
+LONGEST_PIECE = 60  # samples: a longer one would hide the position of the error
 POINTS = 300  # of a picture of a long path
 MOST_POINTS = 6000
 LEAST_UM = 0.01
 WIDTH = 4.8  # inches
-TALL = 0.71  # of its width, an enlarged place
+TALL = 0.71  # of its width: height of an enlarged detail
 ARROWS = 5  # along a path
-ARROW = 0.035  # of the picture, the stretch of path that an arrow lies on
+ARROW = 0.035  # of the picture: length of path under an arrow
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +43,7 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A named place of a path, mm."""
+    """A named position on a path, mm."""
 
     name: str
     x_mm: float
@@ -50,25 +51,25 @@ class Place:
 
 
 def error_colours() -> Colormap:
-    """Return the colours of an error from little to much, those of the map on the page *Program*."""
+    """Return the colour map of errors, the same as on the page *Program*."""
     from matplotlib.colors import LinearSegmentedColormap
 
     return LinearSegmentedColormap.from_list("error", SHADES)
 
 
 def magnified(reference_mm: Float, actual_mm: Float, factor: float) -> Float:
-    """Return the actual path (n, 2) with its deviation from the reference ``factor`` times as large."""
+    """Return the actual path (n, 2) with its deviation from the reference magnified by ``factor``."""
     return reference_mm + factor * (actual_mm - reference_mm)
 
 
 def path(reference_mm: Float, points: Mapping[str, tuple[float, float]]) -> str:
-    """The programmed path with its start, its direction and its named points (Figures 10 and 19)."""
+    """Draw the programmed path with its start, its direction and its named points (Figures 10 and 19)."""
     with drawing(6.4, _height(reference_mm, 6.4), 0.25) as made:
         made.axes.plot(*reference_mm.T, color=REFERENCE, lw=2.0)
         _equal(made.axes)
         _way(made.axes, reference_mm)
         _mark(made.axes, [Place(name, *at) for name, at in points.items()])
-        made.alt = f"The programmed path, {_extent(reference_mm)}, with {', '.join(points) or 'no'} places named."
+        made.alt = f"The programmed path, {_extent(reference_mm)}, with {', '.join(points) or 'no'} named points."
         made.data = _frame(made.axes, ("X", "Y"))
     return made.svg
 
@@ -80,7 +81,7 @@ def corner(
     names: tuple[str, str] = ("X", "Y"),
     on_path: bool = True,
 ) -> str:
-    """A place of the path enlarged (Figures 11-15, 17, 18, 20): reference grey, the others in colour.
+    """Draw a magnified detail of the path (Figures 11-15, 17, 18, 20): reference grey, the others in colour.
 
     The NC rounds its corners by far more than the drives err, so the view is centred on the point of the reference (the
     first curve) that is nearest to ``place_mm``, unless ``on_path`` is false.
@@ -104,7 +105,7 @@ def corner(
         axes.set_xlabel(f"{names[0]} (mm)")
         axes.set_ylabel(f"{names[1]} (mm)")
         inside = np.all(np.abs(reference - centre) < [half_width_mm, TALL * half_width_mm], axis=1)
-        _arrow(axes, reference[_longest_run(inside)], 0.3)
+        _arrow(axes, reference[slice(*longest(inside))], 0.3)
         legend_above(axes, columns)
         shown = ", ".join(curve.label for curve in curves)
         made.alt = f"The path around {names[0]} {x:.1f} mm, {names[1]} {y:.1f} mm: {shown}."
@@ -113,20 +114,10 @@ def corner(
 
 
 def _near(curves: Sequence[Curve], centre_mm: Float, distance_mm: float) -> Iterator[Curve]:
-    """Blank what lies outside the view: a page with twenty whole paths would be large and slow."""
+    """Blank the curves outside the view: a page with twenty whole paths would be large and slow."""
     for curve in curves:
         inside = np.all(np.abs(curve.path_mm - centre_mm) < distance_mm, axis=1, keepdims=True)
         yield Curve(curve.label, np.where(inside, curve.path_mm, np.nan), curve.dashed)
-
-
-def _longest_run(inside: np.ndarray[Any, Any]) -> slice:
-    """Return the longest run of rows that are inside: one pass through the view."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8)))
-    if edges.size == 0:
-        return slice(0, 0)
-    runs = edges.reshape(-1, 2)
-    first, last = runs[np.argmax(np.diff(runs, axis=1))]
-    return slice(int(first), int(last))
 
 
 def error_map(
@@ -137,10 +128,11 @@ def error_map(
     places: Sequence[Place] = (),
     least_um: float | None = None,
 ) -> str:
-    """The path (n, 2) coloured by its contour error, from 0 to ``largest_um``; by its logarithm from ``least_um`` on.
+    """Draw the path (n, 2) coloured by its contour error, from 0 to ``largest_um``, or logarithmically from
+    ``least_um``.
 
     It is drawn in at most ``PIECES`` pieces, each in the colour of its largest error, the larger on top; a longer path
-    by points, each in the colour of the largest error there. Maps to be compared are given the same scale.
+    by points. Maps to be compared need the same scale.
     """
     with drawing(WIDTH, _height(path_mm, WIDTH - 0.3), 0.35) as made:
         axes = made.axes
@@ -152,9 +144,9 @@ def error_map(
         drawn.set_norm(_scale(largest_um, least_um))
         left, bottom, _, tall = axes.get_position().bounds
         axes.set_position((left, bottom, 1 - left - 0.95 / WIDTH, tall))
-        beside = made.figure.add_axes((1 - 0.75 / WIDTH, bottom, 0.13 / WIDTH, tall))
-        made.figure.colorbar(drawn, cax=beside, format=None if least_um is None else "{x:g}")
-        beside.set_title("um", fontsize=8.5)
+        scale = made.figure.add_axes((1 - 0.75 / WIDTH, bottom, 0.13 / WIDTH, tall))
+        made.figure.colorbar(drawn, cax=scale, format=None if least_um is None else "{x:g}")
+        scale.set_title("um", fontsize=8.5)
         _equal(axes, names)
         _way(axes, path_mm)
         _mark(axes, places)
@@ -195,11 +187,11 @@ def _pieces(n: int) -> list[tuple[int, int]]:
 
 
 def _as_points(axes: Axes, path_mm: Float, error_um: Float) -> AxesImage:
-    """Draw a picture of ``POINTS`` points along the longer side: as large a file however long the path is."""
+    """Draw a picture of ``POINTS`` points along the longer side: its size does not depend on the length of the path."""
     low = path_mm.min(axis=0)
     size_mm = max(float(np.ptp(path_mm, axis=0).max()), 1e-9) / POINTS
     columns, rows = (np.ptp(path_mm, axis=0) / size_mm).astype(np.int64) + 1
-    # a step longer than a point leaves points between its rows
+    # a step longer than a point needs points between its samples
     between = math.ceil(float(np.abs(np.diff(path_mm, axis=0)).max()) / size_mm) + 1
     largest = np.full((rows, columns), -1.0)
     for part in np.arange(between) / between:
@@ -212,14 +204,13 @@ def _as_points(axes: Axes, path_mm: Float, error_um: Float) -> AxesImage:
 
 
 def _readings(path_mm: Float, error_um: Float) -> list[list[float]]:
-    """Return x, y (mm) and error (um) of the worst row of each piece: what is shown under the pointer."""
+    """Return x, y (mm) and error (um) of the worst sample of each piece, shown under the pointer."""
     rows = [first + int(np.argmax(error_um[first : last + 1])) for first, last in _pieces(len(path_mm))]
-    told = np.column_stack([path_mm[rows], error_um[rows]])
-    return [[round(x, 2), round(y, 2), float(f"{um:.3g}")] for x, y, um in told.tolist()]
+    worst = np.column_stack([path_mm[rows], error_um[rows]])
+    return [[round(x, 2), round(y, 2), float(f"{um:.3g}")] for x, y, um in worst.tolist()]
 
 
 def _height(path_mm: Float, width: float) -> float:
-    """Return the height in inches at which the path fills a picture of ``width`` inches."""
     across, along = np.maximum(np.ptp(path_mm, axis=0), 1e-9)
     return float(np.clip((width - 1.3) * along / across, 1.4, 4.6)) + 0.9
 
@@ -237,7 +228,6 @@ def _way(axes: Axes, path_mm: Float) -> None:
 
 
 def _arrow(axes: Axes, path_mm: Float, share: float) -> None:
-    """Lay an arrow's head on the path, at a share of its length; none on a path without any."""
     run = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path_mm, axis=0).T))]) if len(path_mm) > 1 else np.zeros(1)
     if run[-1] <= 0.0:
         return
@@ -263,7 +253,7 @@ def _mark(axes: Axes, places: Sequence[Place]) -> None:
 
 
 def _frame(axes: Axes, names: tuple[str, str]) -> dict[str, Any]:
-    """Return where in the picture (points, from its top left) which millimetres are."""
+    """Return the position of the axes in the picture (points, from its top left) and their limits in mm."""
     axes.apply_aspect()
     height = axes.get_figure(root=True).bbox_inches.height * 72  # type: ignore[union-attr]
     (left, bottom), (right, top) = (axes.transAxes.transform(at) * 72 / axes.figure.dpi for at in ((0, 0), (1, 1)))

@@ -1,5 +1,5 @@
-// Makes the pictures of a report live: zoom, readings under the pointer, curves that can be hidden. Each picture carries
-// its numbers in its <metadata>; without this script, and on paper, the pictures are shown as they were drawn.
+// Makes the pictures of a report interactive: zoom, readings under the pointer, hidden curves. Each picture contains
+// its data in its <metadata>; without this script, and in print, the pictures are static.
 "use strict";
 
 const INK = "#1d2733", SOFT = "#5b6876", GRID = "#e6eaee";
@@ -11,7 +11,7 @@ function figures4(value) {
   return size !== 0 && (size < 1e-4 || size >= 1e6) ? value.toExponential(3) : String(Number(value.toPrecision(4)));
 }
 
-// the widest of what is shown of a panel, its bands, bars and levels included
+// the range of all visible traces of a panel, including bands, bars and levels
 function limits(panel, grids) {
   return (plot) => {
     const { min: from, max: to } = plot.scales.x;
@@ -34,8 +34,8 @@ function limits(panel, grids) {
   };
 }
 
-// bands, bars, levels and marks are no series of uPlot: they are drawn beside its curves
-function drawBeside(told, panel) {
+// bands, bars, levels and marks are not series of uPlot: they are drawn over its curves
+function drawOverlay(data, panel) {
   return (plot) => {
     const pen = plot.ctx, ratio = devicePixelRatio;
     const { left, top, width, height } = plot.bbox;
@@ -44,7 +44,7 @@ function drawBeside(told, panel) {
     pen.beginPath(); pen.rect(left, top, width, height); pen.clip();
     panel.traces.forEach((trace, k) => {
       if (!trace.low || !plot.series[k + 1].show) return;
-      const grid = told.grids[trace.x];
+      const grid = data.grids[trace.x];
       pen.strokeStyle = pen.fillStyle = trace.colour; pen.lineWidth = ratio; pen.globalAlpha = trace.style === "points" ? 0.8 : 0.2;
       const known = grid.map((x, i) => i).filter((i) => trace.low[i] != null && trace.high[i] != null);
       pen.beginPath();
@@ -64,7 +64,7 @@ function drawBeside(told, panel) {
       pen.fillText(name, left + width - 4 * ratio, up(level) - 2 * ratio);
     }
     pen.setLineDash([2 * ratio, 3 * ratio]); pen.textAlign = "left"; pen.textBaseline = "top";
-    for (const [name, at] of told.marks) {
+    for (const [name, at] of data.marks) {
       pen.beginPath(); pen.moveTo(right(at), top); pen.lineTo(right(at), top + height); pen.stroke();
       pen.fillText(name, right(at) + 4 * ratio, top + 2 * ratio);
     }
@@ -72,11 +72,11 @@ function drawBeside(told, panel) {
   };
 }
 
-// days as month-day; within days the time, and the day where it begins
+// days as month-day; within a day the time, and the date at its begin
 function dates(plot, ticks, number, space, step) {
-  const told = ticks.map((tick) => new Date(tick * 1e3).toISOString());
-  if (step >= 86400) return told.map((date, k) => k && date.slice(0, 4) === told[k - 1].slice(0, 4) ? date.slice(5, 10) : `${date.slice(5, 10)}\n${date.slice(0, 4)}`);
-  return told.map((date, k) => k && date.slice(0, 10) === told[k - 1].slice(0, 10) ? date.slice(11, 16) : `${date.slice(11, 16)}\n${date.slice(5, 10)}`);
+  const data = ticks.map((tick) => new Date(tick * 1e3).toISOString());
+  if (step >= 86400) return data.map((date, k) => k && date.slice(0, 4) === data[k - 1].slice(0, 4) ? date.slice(5, 10) : `${date.slice(5, 10)}\n${date.slice(0, 4)}`);
+  return data.map((date, k) => k && date.slice(0, 10) === data[k - 1].slice(0, 10) ? date.slice(11, 16) : `${date.slice(11, 16)}\n${date.slice(5, 10)}`);
 }
 
 function reading(trace) {
@@ -92,15 +92,15 @@ function reading(trace) {
   };
 }
 
-function chart(picture, told, number) {
+function chart(picture, data, number) {
   const live = document.createElement("div");
   live.className = "live";
   picture.after(live);
   picture.classList.add("still");
   const sync = uPlot.sync(`chart ${number}`);
-  told.panels.forEach((panel, k) => {
-    for (const trace of panel.traces) trace.grid = told.grids[trace.x];
-    const last = k === told.panels.length - 1;
+  data.panels.forEach((panel, k) => {
+    for (const trace of panel.traces) trace.grid = data.grids[trace.x];
+    const last = k === data.panels.length - 1;
     const series = panel.traces.map((trace) => ({
       label: trace.label, stroke: trace.colour, value: reading(trace), spanGaps: new Set(panel.traces.map((t) => t.x)).size > 1,
       width: { wide: 4, points: 0 }[trace.style] ?? 1.6, dash: trace.style === "dashed" ? [8, 5] : undefined,
@@ -112,27 +112,27 @@ function chart(picture, told, number) {
     const plot = new uPlot({
       width: live.clientWidth || 480, height: PANEL_PX * panel.share + (last ? 40 : 0),
       tzDate: (seconds) => uPlot.tzDate(new Date(seconds * 1e3), "Etc/UTC"),
-      scales: { x: { time: told.time }, y: { distr: panel.log ? 3 : 1, range: limits(panel, told.grids) } },
+      scales: { x: { time: data.time }, y: { distr: panel.log ? 3 : 1, range: limits(panel, data.grids) } },
       axes: [
-        { ...axis, label: last ? told.x : undefined, labelSize: 20, size: last ? 34 : 8, ...(last ? {} : { values: () => [] }), space: 70, ...(last && told.time ? { values: dates } : {}) },
+        { ...axis, label: last ? data.x : undefined, labelSize: 20, size: last ? 34 : 8, ...(last ? {} : { values: () => [] }), space: 70, ...(last && data.time ? { values: dates } : {}) },
         { ...axis, label: panel.y, labelSize: 20, size: 62, space: panel.share < 1 ? 22 : 34, ...(panel.log ? {} : { values: numbers }) },
       ],
-      series: [{ label: told.time ? "time (UTC)" : told.x, value: told.time ? (p, value) => value == null ? "" : new Date(value * 1e3).toISOString().slice(0, 16).replace("T", " ") : (p, value) => figures4(value) }, ...series],
+      series: [{ label: data.time ? "time (UTC)" : data.x, value: data.time ? (p, value) => value == null ? "" : new Date(value * 1e3).toISOString().slice(0, 16).replace("T", " ") : (p, value) => figures4(value) }, ...series],
       cursor: { sync: { key: sync.key, setSeries: false }, y: false, drag: { x: true, y: false } },
-      hooks: { draw: [drawBeside(told, panel)] },
+      hooks: { draw: [drawOverlay(data, panel)] },
     }, uPlot.join(panel.traces.map((trace) => [trace.grid, trace.y])), live);
     panel.traces.forEach((trace, n) => { if (!trace.label) plot.root.querySelectorAll(".u-series")[n + 1].hidden = true; });
     new ResizeObserver(() => plot.setSize({ width: live.clientWidth, height: plot.height })).observe(live);
   });
 }
 
-function map(picture, told) {
+function map(picture, data) {
   const whole = picture.getAttribute("viewBox").split(" ").map(Number);
   const point = (event) => new DOMPoint(event.clientX, event.clientY).matrixTransform(picture.getScreenCTM().inverse());
   const millimetres = ({ x, y }) => {
-    const [left, top, right, bottom] = told.box;
-    return [told.x[0] + (x - left) / (right - left) * (told.x[1] - told.x[0]),
-            told.y[0] + (bottom - y) / (bottom - top) * (told.y[1] - told.y[0])];
+    const [left, top, right, bottom] = data.box;
+    return [data.x[0] + (x - left) / (right - left) * (data.x[1] - data.x[0]),
+            data.y[0] + (bottom - y) / (bottom - top) * (data.y[1] - data.y[0])];
   };
   const note = document.createElement("output");
   const frame = document.createElementNS("http://www.w3.org/2000/svg", "rect");
@@ -144,12 +144,12 @@ function map(picture, told) {
   picture.addEventListener("pointermove", (event) => {
     const here = point(event);
     if (start) setBox(frame, start, here);
-    if (!told.names) return;
+    if (!data.names) return;
     const [x, y] = millimetres(here);
-    let text = `${told.names[0]} ${x.toFixed(3)} mm, ${told.names[1]} ${y.toFixed(3)} mm`;
-    if (told.at) {
-      const near = told.at.reduce((a, b) => Math.hypot(b[0] - x, b[1] - y) < Math.hypot(a[0] - x, a[1] - y) ? b : a);
-      text = `${told.names[0]} ${near[0].toFixed(2)} mm, ${told.names[1]} ${near[1].toFixed(2)} mm: ${figures4(near[2])} ${told.unit}`;
+    let text = `${data.names[0]} ${x.toFixed(3)} mm, ${data.names[1]} ${y.toFixed(3)} mm`;
+    if (data.at) {
+      const near = data.at.reduce((a, b) => Math.hypot(b[0] - x, b[1] - y) < Math.hypot(a[0] - x, a[1] - y) ? b : a);
+      text = `${data.names[0]} ${near[0].toFixed(2)} mm, ${data.names[1]} ${near[1].toFixed(2)} mm: ${figures4(near[2])} ${data.unit}`;
     }
     note.textContent = text;
   });
@@ -179,8 +179,8 @@ function setBox(box, a, b) {
 document.querySelectorAll("figure > svg").forEach((picture, number) => {
   const metadata = picture.querySelector(":scope > metadata");
   if (!metadata) return;
-  let told;
-  try { told = JSON.parse(metadata.textContent); } catch { return; }
-  if (told.kind === "chart") chart(picture, told, number);
-  else if (told.kind === "map") map(picture, told);
+  let data;
+  try { data = JSON.parse(metadata.textContent); } catch { return; }
+  if (data.kind === "chart") chart(picture, data, number);
+  else if (data.kind === "map") map(picture, data);
 });

@@ -1,4 +1,4 @@
-"""One self-contained HTML page: it carries its pictures and its scripts, and loads nothing from elsewhere."""
+"""Renders one self-contained HTML page: pictures and scripts are embedded, nothing is loaded from elsewhere."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -18,7 +18,7 @@ from fdhil.store.output import open_output
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table: ``head`` names the columns, each row has as many cells; ``folded`` is the line it opens from."""
+    """A table: ``head`` names the columns; ``folded`` is the summary line of a collapsed one."""
 
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
@@ -30,7 +30,7 @@ class Table:
 class Section:
     """A titled part of the page: text, tables, then figures as (caption, inline SVG), one a row when ``wide``.
 
-    Sections of one ``chapter`` follow one another under its title.
+    Sections of one ``chapter`` appear together under its title.
     """
 
     title: str
@@ -52,18 +52,17 @@ class Page:
 
 
 def _is_word(table: Table, column: int) -> bool:
-    """Whether a column holds words, which begin at one edge, not numbers, which end at one."""
     return any(row[column][:1].isalpha() for row in table.rows)
 
 
 def require() -> None:
-    """Raise FdhilError where what draws and renders a report is not installed."""
+    """Raise FdhilError where the libraries for reports are not installed."""
     if any(find_spec(name) is None for name in ("jinja2", "matplotlib")):
         raise FdhilError("a report needs two libraries (the extra 'report'): pip install jinja2 matplotlib")
 
 
 def write(page: Page, path: Path) -> None:
-    """Render ``page`` to ``path``, whole or not at all. OutputError when it cannot be written."""
+    """Render ``page`` to ``path`` atomically. OutputError when it cannot be written."""
     text = html(page)
     with open_output(path) as file:
         file.write(text.encode())
@@ -98,7 +97,6 @@ def _carried(name: str) -> str:
 
 
 def _picture(svg: str, caption: str) -> str:
-    """Return a picture with its text typeset; one that does not say what it shows says its caption."""
     if "aria-label=" not in svg[:1000]:
         svg = svg.replace("<svg", f'<svg role="img" aria-label="{escape(caption)}"', 1)
     return typeset_markup(svg)

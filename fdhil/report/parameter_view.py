@@ -1,4 +1,4 @@
-"""Shows parameters to people: one unit each, and one meaning of ±, in every table."""
+"""Formats parameters for display: one unit each, and ± as half the 95 % interval, in every table."""
 
 import math
 from collections.abc import Mapping
@@ -7,7 +7,7 @@ from typing import Any
 from fdhil.records import UNITS
 
 MEANING = "± is half the width of the 95 % interval"
-# what people read: unit and factor; the ratios to K and all of JSON stay in SI units
+# displayed unit and factor; the ratios to K and all of JSON stay in SI units
 DISPLAY: Mapping[str, tuple[str, float]] = {name: (unit, 1.0) for name, unit in UNITS.items()} | {
     "R": ("mohm", 1e3),
     "L": ("mH", 1e3),
@@ -30,7 +30,7 @@ MEANINGS: Mapping[str, str] = {
 
 
 def minute(time: str) -> str:
-    """Return a time of JSON (ISO 8601, UTC) to the minute, with its time zone.
+    """Format a time of JSON (ISO 8601, UTC) to the minute, with its time zone.
 
     >>> minute("2026-11-28T01:15:09+00:00")
     '2026-11-28 01:15 UTC'
@@ -39,27 +39,27 @@ def minute(time: str) -> str:
 
 
 def spoken(name: str) -> str:
-    """Return a parameter's symbol, or what has none in words."""
+    """Return a parameter's symbol, or its description if it has none."""
     return MEANINGS[name] if "_" in name else name
 
 
 def head(name: str) -> str:
-    """Return the head of a parameter's column: its symbol above its unit."""
+    """Return the heading of a parameter's column: its symbol above its unit."""
     return f"{name}\n{DISPLAY[name][0]}"
 
 
-def half_of(told: Mapping[str, Any]) -> float | None:
-    """Return half the width of a value's 95 % interval as JSON has it; None where it has none."""
-    if told.get("low") is None or told.get("high") is None:
+def half_of(interval: Mapping[str, Any]) -> float | None:
+    """Return half the width of a 95 % interval in JSON; None without an interval."""
+    if interval.get("low") is None or interval.get("high") is None:
         return None
-    return float(told["high"] - told["low"]) / 2
+    return float(interval["high"] - interval["low"]) / 2
 
 
 def cell(name: str, value: float | None, half: float | None, between: str = "\n") -> str:
-    """Return a value and half of its interval in the parameter's unit, both to the place where the half begins."""
+    """Format a value and half of its interval in the parameter's unit, both to the half's first digit."""
     if value is None or not math.isfinite(value):
         return "-"
-    factor = DISPLAY[name][1] if name in DISPLAY else 1.0  # terms are shown in SI units
+    factor = DISPLAY[name][1] if name in DISPLAY else 1.0  # terms are displayed in SI units
     shown = value * factor
     if half is None or not math.isfinite(half):
         return f"{shown:.4g}{between}(no ±)"
@@ -76,7 +76,6 @@ def cell(name: str, value: float | None, half: float | None, between: str = "\n"
 
 
 def _with_exponent(value: float, width: float, between: str) -> str:
-    """Return value and half width with one exponent for both, to the same place."""
     exponent = math.floor(math.log10(max(abs(value), width)))
     places = max(0, exponent - math.floor(math.log10(width)))
     scale = 10.0**exponent

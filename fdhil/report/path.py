@@ -1,4 +1,4 @@
-"""A program's path error as a report: before and after the correction, as a map and with its worst places enlarged."""
+"""Reports a program's path error: before and after the correction, as a map and with its worst positions magnified."""
 
 from collections.abc import Sequence
 
@@ -12,22 +12,25 @@ from fdhil.report.figures import Curve, Place
 from fdhil.report.page import Page, Section, Table
 
 MOST_PLACES, FEW_PLACES = 8, 4
-APART_MM = 3.0  # places nearer to each other are one picture
+APART_MM = 3.0  # nearer positions share one picture
 FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-SEEN = 0.25  # of the picture's half width that the largest error may take
-NEAR_MIDDLE = 0.4  # of half the picture: how far from its middle the largest error may lie
+SEEN = 0.25  # of the picture's half width: largest error
+NEAR_MIDDLE = 0.4  # of half the picture: largest distance of the largest error from the middle
 LEAST_HALF_MM, MOST_HALF_MM = 0.5, 30.0
-BEFORE_S, ASIDE_S = 0.05, 0.25  # what led to a zone is shown too, and no other pass over the same place
-BESIDE = 1.5  # of the largest error of a place: more is another place's
+BEFORE_S, ASIDE_S = 0.05, 0.25  # shown before a zone; wider would show other passes over the same position
+BESIDE = 1.5  # of a position's largest error: larger ones belong to another position
 MOST_ROWS = 50
 
 
 def prediction_page(name: str, machine: str, predicted: Prediction, parameters: str = "") -> Page:
-    """Lay a prediction out: where the error is, its zones, its worst places. ``parameters`` says whose they are."""
+    """Build the page of a prediction: the error's map, its zones, its worst positions. ``parameters`` names their
+    source.
+    """
+    duration_s = predicted.reference.time_s[-1] - predicted.reference.time_s[0]
     return Page(
         title=f"Path error of {name}",
         subtitle=f"Predicted for {machine} before the cut{_with(parameters)}.",
-        headline=[*_figures("predicted", predicted), ("duration", f"{_duration(predicted.reference):.2f} s")],
+        headline=[*_figures("predicted", predicted), ("duration", f"{duration_s:.2f} s")],
         sections=[_along([("predicted", predicted)]), _places([("predicted", predicted)]), _zones(predicted, None)],
     )
 
@@ -35,25 +38,26 @@ def prediction_page(name: str, machine: str, predicted: Prediction, parameters: 
 def correction_page(
     name: str, machine: str, planned: Correction, parameters: str = "", predicted: Gain | None = None
 ) -> Page:
-    """Lay a correction out, before and after; a refused one with its reasons. ``parameters`` says whose they are.
+    """Build the page of a correction, before and after; a refused one with its reasons. ``parameters`` names their
+    source.
 
-    ``predicted`` is the gain with what its prediction knows of itself; without it no factor is told.
+    ``predicted`` is the gain with its uncertainty; without it no factor is reported.
     """
     before, after = planned.before, planned.after
     if planned.refused:
         cases = [("uncorrected", before)]
-        told = " ".join(f"{reason}; {reason.advice}." for reason in planned.refused)
+        reasons = " ".join(f"{reason}; {reason.advice}." for reason in planned.refused)
         verdict = [("correction", "refused")]
     else:
         cases = [("uncorrected", before), (f"{planned.method} correction", after)]
-        told = ""
+        reasons = ""
         verdict = _promise(after, predicted)
     return Page(
         title=f"Correction of {name}",
         subtitle=f"Planned for {machine} with the method {planned.method}{_with(parameters)}; nothing was sent.",
         headline=[*_figures("uncorrected, predicted", before), *verdict],
         sections=[
-            *([Section("Why it was refused", told)] if told else []),
+            *([Section("Why it was refused", reasons)] if reasons else []),
             _along(cases),
             _places(cases),
             _zones(before, None if planned.refused else after),
@@ -62,7 +66,6 @@ def correction_page(
 
 
 def _promise(after: Prediction, predicted: Gain | None) -> list[tuple[str, str]]:
-    """Say what is predicted to be left, and how far that goes; the model against itself is no gain."""
     left, largest = _figures("corrected, predicted", after)
     if predicted is None or predicted.half_um is None:
         return [left, largest, ("how well the model fits this machine", "not known here")]
@@ -71,7 +74,7 @@ def _promise(after: Prediction, predicted: Gain | None) -> list[tuple[str, str]]
         (f"{left[0]}, at most (95 %)", f"{after.rms_um + predicted.half_um:.2f} um"),
         (f"{left[0]}, by the model", f"{after.rms_um:.2f} um"),
         largest,
-        ("predicted smaller by at least", "not sure" if sure is None else f"{sure:.1f} x"),
+        ("predicted smaller by at least", "not significant" if sure is None else f"{sure:.1f} x"),
     ]
 
 
@@ -92,12 +95,8 @@ def _figures(label: str, predicted: Prediction) -> list[tuple[str, str]]:
     ]
 
 
-def _duration(reference: Trajectory) -> float:
-    return float(reference.time_s[-1] - reference.time_s[0])
-
-
 def planes(reference: Trajectory, rows: slice = slice(None)) -> list[tuple[str, str]]:
-    """Return the planes in which the path moves, the one with most of it first; empty when one axis moves alone."""
+    """Return the planes in which the path moves, the one with most travel first; empty when one axis moves alone."""
     reach = {axis: float(np.ptp(reference.position_mm[axis][rows])) for axis in reference.table_axes}
     moving = sorted((axis for axis in reach if reach[axis] > 1e-6), key=lambda axis: -reach[axis])
     if len(moving) < 2:
@@ -108,13 +107,11 @@ def planes(reference: Trajectory, rows: slice = slice(None)) -> list[tuple[str, 
 
 
 def _names(reference: Trajectory, plane: tuple[str, str]) -> tuple[str, str]:
-    """Return what a map's edges are called; a rotary axis is drawn as the length of arc at its radius."""
-    across, along = (f"{axis} along its rim" if axis in reference.mm_per_degree else axis for axis in plane)
+    across, along = (f"{axis} along its circumference" if axis in reference.mm_per_degree else axis for axis in plane)
     return across, along
 
 
 def _flat(reference: Trajectory, positions: Prediction | None, plane: tuple[str, str]) -> Float:
-    """Return the reference's, or a prediction's, path (n, 2) in a plane."""
     path = reference.path_mm if positions is None else reference.table_mm(positions.predicted_mm)
     return path[:, [reference.table_axes.index(axis) for axis in plane]]
 
@@ -123,7 +120,7 @@ def _along(cases: Sequence[tuple[str, Prediction]]) -> Section:
     reference = cases[0][1].reference
     pictures = []
     largest, least = figures.common_scale([predicted.contour_um for _, predicted in cases])
-    same = "" if len(cases) == 1 else "; the colours mean the same in each of these maps"
+    same = "" if len(cases) == 1 else "; all these maps share one colour scale"
     for plane in planes(reference):
         path = _flat(reference, None, plane)
         named = [Place(str(k), *path[row]) for k, (_, row) in enumerate(worst_places(cases[0][1]), 1)]
@@ -135,16 +132,16 @@ def _along(cases: Sequence[tuple[str, Prediction]]) -> Section:
     pictures.append(("Contour error over time", figures.contour_errors(reference.dt_s, errors)))
     return Section(
         "Where the error is",
-        "The contour error is the distance of the table from the path, wherever on the path it should be. The numbers "
-        "are the places that are enlarged below.",
+        "The contour error is the distance of the table from the path, regardless of timing. The numbers mark the "
+        "positions that are enlarged below.",
         figures=pictures,
     )
 
 
 def worst_places(predicted: Prediction) -> list[tuple[Zone, int]]:
-    """Return the largest zone of each cause and size, then others up to ``FEW_PLACES``, and the row of each.
+    """Return the largest zone of each cause and size, then others up to ``FEW_PLACES``, and the sample of each.
 
-    They are apart from each other and in the path's order; of equal ones the first is taken.
+    They are apart from each other and in the path's order; of equal ones the first is used.
     """
     reference = predicted.reference
     path = reference.path_mm
@@ -169,12 +166,11 @@ def _places(cases: Sequence[tuple[str, Prediction]]) -> Section:
     for number, (zone, row) in enumerate(worst_places(before), 1):
         caption, picture = _place(cases, zone, row)
         pictures.append((f"{number}: {caption}", picture))
-    text = "The largest zones, in the order of the path, with the numbers that they have in the map."
-    return Section("Its worst places enlarged", text if pictures else "No zone stands out.", figures=pictures)
+    text = "The largest zones in the order of the path, numbered as in the map."
+    return Section("Worst positions enlarged", text if pictures else "No zone stands out.", figures=pictures)
 
 
 def _place(cases: Sequence[tuple[str, Prediction]], zone: Zone, row: int) -> tuple[str, str]:
-    """Return caption and picture of one zone: in the plane of its motion, or over time where one axis moves alone."""
     reference = cases[0][1].reference
     inside = cases[0][1].rows(zone)
     first, last = inside.start, inside.stop
@@ -198,14 +194,14 @@ def _place(cases: Sequence[tuple[str, Prediction]], zone: Zone, row: int) -> tup
     for label, predicted in cases:
         at = nearest_mm(predicted, rows)[:, columns]
         drawn = figures.magnified(at, _flat(reference, predicted, plane)[rows], factor)
-        # so many times as large, a worse place beside this one would cover it
+        # magnified, a worse position nearby would cover this one
         drawn[predicted.contour_um[rows] > BESIDE * zone.max_um] = np.nan
         curves.append(Curve(label, drawn))
-    # the errors of the zone are in the picture too
+    # the picture includes the zone's errors
     worst = curves[1].path_mm[first - rows.start : last - rows.start]
     low, high = (np.vstack([seen, worst]).min(axis=0), np.vstack([seen, worst]).max(axis=0))
     half = min(MOST_HALF_MM, max(half, 0.55 * float(max(high[0] - low[0], (high[1] - low[1]) / figures.TALL))))
-    # what is too large for the picture leaves it where the error is smaller
+    # a zone too large for the picture is cut where its error is smaller
     worst_mm = (path[row] + curves[1].path_mm[row - rows.start]) / 2
     reach = NEAR_MIDDLE * half * np.array([1.0, figures.TALL])
     across, along = np.clip((low + high) / 2, worst_mm - reach, worst_mm + reach)
@@ -216,7 +212,9 @@ def _place(cases: Sequence[tuple[str, Prediction]], zone: Zone, row: int) -> tup
 
 
 def nearest_mm(predicted: Prediction, rows: slice) -> Float:
-    """Return for each predicted point of ``rows`` the point (m, d) of the path from which its contour error counts."""
+    """Return for each predicted point of ``rows`` the nearest point (m, d) of the path, from which its contour error
+    counts.
+    """
     reference = predicted.reference
     actual = reference.table_mm(predicted.predicted_mm)[rows]
     return nearest_points_mm(reference.path_mm, actual, reference.dt_s, rows.start)
@@ -237,5 +235,5 @@ def _zones(before: Prediction, after: Prediction | None) -> Section:
         return Section("Zones", "No zone stands out.")
     left_out = len(before.zones) - len(rows)
     text = f"The {MOST_ROWS} largest; {left_out} smaller ones are left out (--json lists them)." if left_out else ""
-    head = ["place", "time (s)", "line", "where", "cause", "at most (um)"]
+    head = ["position", "time (s)", "line", "where", "cause", "at most (um)"]
     return Section("Zones", text, [Table(head if after is None else [*head, "corrected, at most (um)"], rows)])

@@ -1,4 +1,4 @@
-"""Prints a page as PDF with the browser of this computer: a browser sets tables and text better than we would."""
+"""Prints a page as PDF with the browser of this computer."""
 
 import os
 import shutil
@@ -13,19 +13,19 @@ from fdhil.report.page import Page, html, write
 from fdhil.store.output import open_output
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "microsoft-edge", "brave-browser")
-LONGEST_S = 120.0  # a start from a cold disk takes some seconds
+LONGEST_S = 120.0  # a start from a cold disk takes several seconds
 SWITCHES = (
     "--headless", "--disable-gpu", "--no-first-run", "--disable-extensions", "--disable-background-networking",
     "--disable-component-update", "--no-pdf-header-footer", "--host-resolver-rules=MAP * ~NOTFOUND",
 )  # fmt: skip
 MISSING = (
-    "a PDF is printed by a browser, and there is none here: install one (apt-get install chromium), or write the HTML "
-    "page, open it on any computer and print it there"
+    "a PDF needs a browser to print it, and none is installed: install one (apt-get install chromium), or write the "
+    "HTML page, open it on another computer and print it there"
 )
 
 
 def deliver(page: Page, html_file: Path | None, pdf_file: Path | None) -> None:
-    """Write the page to the files that were asked for. FdhilError as :func:`write` and :func:`write_pdf` raise it."""
+    """Write the page to the requested files. FdhilError or OutputError."""
     if html_file is not None:
         write(page, html_file)
     if pdf_file is not None:
@@ -33,7 +33,7 @@ def deliver(page: Page, html_file: Path | None, pdf_file: Path | None) -> None:
 
 
 def find_browser() -> str:
-    """Return the browser's path; FdhilError where there is none."""
+    """Return the browser's path; FdhilError without one."""
     found = next(filter(None, map(shutil.which, BROWSERS)), None)
     if found is None:
         raise FdhilError(MISSING)
@@ -41,25 +41,25 @@ def find_browser() -> str:
 
 
 def write_pdf(page: Page, path: Path) -> None:
-    """Print ``page`` to ``path``, A4, whole or not at all. FdhilError without a browser or when it prints nothing."""
+    """Print ``page`` to ``path``, A4, atomically. FdhilError without a browser or when it prints nothing."""
     browser = find_browser()
     with tempfile.TemporaryDirectory(prefix="fdhil-pdf-") as name:
         folder = Path(name)
         source, printed = folder / "page.html", folder / "page.pdf"
         source.write_text(html(page), "utf-8")
-        told = run_browser(browser, folder, f"--print-to-pdf={printed}", source.as_uri())
+        message = run_browser(browser, folder, f"--print-to-pdf={printed}", source.as_uri())
         if not printed.is_file():
-            raise FdhilError(f"{browser} printed nothing ({told}); print the HTML page from a browser instead")
+            raise FdhilError(f"{browser} printed nothing ({message}); print the HTML page from a browser instead")
         with open_output(path) as file:
             file.write(printed.read_bytes())
 
 
 def run_browser(browser: str, folder: Path, *arguments: str, output: IO[str] | None = None) -> str:
-    """Run the browser with a profile of its own below ``folder``; return the last it said. FdhilError when it hangs.
+    """Run the browser with its own profile below ``folder``; return its last message. FdhilError when it hangs.
 
-    ``output`` gets what it prints.
+    ``output`` receives what it prints.
     """
-    # the browser's own sandbox needs a user that is not root; what it opens is a page that we wrote
+    # the browser's sandbox needs a non-root user; it opens only a page written here
     sandbox = ["--no-sandbox"] if os.geteuid() == 0 else []
     command = [browser, *SWITCHES, *sandbox, f"--user-data-dir={folder / 'profile'}", *arguments]
     try:
@@ -75,6 +75,6 @@ def run_browser(browser: str, folder: Path, *arguments: str, output: IO[str] | N
         text = f"{browser} did not print within {LONGEST_S:.0f} s; print the HTML page from a browser instead"
         raise FdhilError(text) from None
     except OSError as error:
-        raise FdhilError(f"{browser} cannot be started: {error.strerror}; install it anew") from None
-    said = ended.stderr.strip().splitlines()
-    return said[-1] if said else f"exit {ended.returncode}"
+        raise FdhilError(f"{browser} cannot be started: {error.strerror}; reinstall it") from None
+    lines = ended.stderr.strip().splitlines()
+    return lines[-1] if lines else f"exit {ended.returncode}"

@@ -1,8 +1,8 @@
-"""Sets units and signs as they are printed: ASCII in data and terminals, µm, ±, °C and N·m in pages."""
+"""Typesets units and signs: ASCII in data and terminals, µm, ±, °C and N·m in pages."""
 
 import re
 
-# longer ones first: each is replaced where it stands alone
+# longer units match first
 _PRINTED = {
     "N.m.s/rad": "N·m·s/rad",
     "N.m/A": "N·m/A",
@@ -29,11 +29,11 @@ _TEXT = re.compile(r">[^<>]+<|aria-label=\"[^\"]*\"")
 
 
 def typeset(text: str) -> str:
-    """Return plain text with its units and signs as they are printed; names of files stay as they are."""
+    """Return plain text with typeset units and signs; file names stay unchanged."""
     text = _EXPONENT.sub(lambda found: "·10" + found[1].translate(_RAISED), text)
     return _TIMES.sub(" ×", _ALONE.sub(lambda found: _PRINTED[found[0]], text))
 
 
 def typeset_markup(markup: str) -> str:
-    """Return a picture's markup with the text in it typeset."""
+    """Return a picture's markup with its text typeset."""
     return _TEXT.sub(lambda found: typeset(found[0]), markup)

@@ -1,4 +1,4 @@
-"""A DC motor of another hand: midpoint steps and Karnopp's friction, sharing no code with fdhil."""
+"""An independent DC motor: midpoint steps and Karnopp's friction, without code from fdhil."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def speed_loop(profile: Callable[[float], float], dt: float = 1e-3, gain: float 
 
 
 def trapezium(time_s: float) -> float:
-    """Return a rapid move there and back, rad/s."""
+    """Return a rapid move in both directions, rad/s."""
 
     def one(t: float) -> float:
         return float(np.clip(min(t, 0.8 - t) / 0.15, 0.0, 1.0)) * 120.0

@@ -1,4 +1,4 @@
-"""Recordings of a motor of another hand, each simulated once."""
+"""Recordings of the independent motor, each simulated once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``fdhil identify`` for laboratories: any move, proposed maps, pictures, pages; and how to cite."""
+"""``fdhil identify`` for laboratories: any move, proposed maps, pictures, pages; and the citation."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture
 def trace(tmp_path: Path) -> Path:
-    """Return a scope's file of steps of the voltage."""
+    """Return an oscilloscope's file of voltage steps."""
     return write_csv(tmp_path / "scope.csv", "Time [s],CH1,CH2,Speed [rpm]", "tuiw", rpm=True)
 
 
@@ -74,7 +74,12 @@ def test_picture_and_page_are_written(trace: Path, tmp_path: Path) -> None:
     assert result.return_value == 0, result.output
     assert trace.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     text = page.read_text("utf-8")
-    for title in ("Parameters", "Correlation of the residuals", "Correlation of the estimates", "What would tell more"):
+    for title in (
+        "Parameters",
+        "Correlation of the residuals",
+        "Correlation of the estimates",
+        "Most informative further recording",
+    ):
         assert title in text
 
 

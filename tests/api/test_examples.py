@@ -1,4 +1,4 @@
-"""The examples of the Python interface's docstrings, run as they stand."""
+"""The examples in the docstrings of the Python interface are run."""
 
 from __future__ import annotations
 

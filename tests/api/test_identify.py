@@ -1,4 +1,4 @@
-"""Identification from arrays alone, of a motor that another program simulated."""
+"""Identification from arrays alone, of a motor simulated by another program."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from fdhil.errors import FdhilError, RecordingError
 from tests.api.foreign_motor import TRUTH, run, speed_loop
 from tests.api.moves import measured
 
-DEVIATIONS = 4.0  # within which every one of some dozen values must lie
+DEVIATIONS = 4.0  # every one of some dozen values must lie within
 
 
 def recorded(move: str, **options: Any) -> fdhil.Recording:
@@ -85,7 +85,7 @@ def test_locked_rotor_gives_resistance_and_inductance_and_the_reason_for_the_res
     for name in ("K", "Jt", "ft", "Cd"):
         assert result.parameters[name].value is None
         assert "does not turn" in str(result.parameters[name].reason)
-    with pytest.raises(FdhilError, match="no whole model"):
+    with pytest.raises(FdhilError, match="is incomplete"):
         _ = result.model
 
 
@@ -148,11 +148,11 @@ def test_result_shows_itself_as_text_html_json_picture_and_page(tmp_path: Path) 
     result.report(tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text("utf-8")
     assert "Correlation of the estimates" in page
-    assert "What would tell more" in page
+    assert "Most informative further recording" in page
 
 
 def test_next_move_promises_no_narrower_interval_than_it_brings() -> None:
-    """What is predicted is the best that a second recording can do."""
+    """The prediction is the best that a second recording can achieve."""
     from fdhil.identification.next_move import predict_next_moves
 
     result = fdhil.identify(recorded("rapids"), any_move=True)

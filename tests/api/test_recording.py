@@ -1,4 +1,4 @@
-"""Arrays as recordings: what is taken, and what is refused with its cause and remedy."""
+"""Arrays as recordings: what is accepted, and what is refused with cause and action."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ GIVEN: dict[str, Any] = {
 
 
 class Column:
-    """A column of another library: it becomes an array on request, as those of pandas, polars and xarray do."""
+    """A column of another library that converts to an array on request, like those of pandas, polars and xarray."""
 
     def __init__(self, values: Any) -> None:
         self._values = np.asarray(values)
@@ -59,9 +59,9 @@ def changed(name: str, row: int, value: float) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ({"current": TIME[1:]}, "unlike lengths.*'current_A': 999.*give all n samples"),
-        (changed("voltage", 5, np.nan), "voltage_V that is not finite at index 5: leave out rows of lost samples"),
-        (changed("time", 7, 0.0), r"time does not rise at index 7 \(0 s\): sort or cut"),
+        ({"current": TIME[1:]}, "different lengths.*'current_A': 999.*give all n samples"),
+        (changed("voltage", 5, np.nan), "voltage_V that is not finite at index 5: leave out lost samples"),
+        (changed("time", 7, 0.0), r"time does not increase at index 7 \(0 s\): sort or cut"),
         ({"voltage": ["a"] * 1000}, "voltage_V is not an array of numbers"),
         ({"speed": np.ones((1000, 2))}, r"speed_rad_per_s has shape \(1000, 2\)"),
         ({"voltage": 24e3 + 0 * TIME}, "more than any drive has.*mV"),
@@ -70,7 +70,7 @@ def changed(name: str, row: int, value: float) -> dict[str, Any]:
         ({"time": 1e3 * TIME}, "is time in ms"),
         ({"position": TIME}, "no header pitch_m_per_rev"),
         ({"position": TIME, "pitch_m_per_rev": 20.0}, "write 0.02"),
-        ({"speed": None, "position": TIME}, "only with pitch_m_per_rev"),
+        ({"speed": None, "position": TIME}, "needed to derive a speed"),
         ({"speed": None}, "no column speed_rad_per_s"),
         ({name: values[:3] for name, values in GIVEN.items()}, "3 rows are no recording"),
         ({name: values[:0] for name, values in GIVEN.items()}, "0 rows are no recording"),

@@ -110,7 +110,7 @@ def test_the_plot_and_the_report_show_it(worn: Path, tmp_path: Path, capsys: Any
 
 @pytest.mark.usefixtures("long_computation")
 def test_the_report_begins_with_how_the_drives_are(worn: Path, tmp_path: Path, capsys: Any) -> None:
-    """What to do next, the newest values beside nominal ones, then a course of each parameter with both."""
+    """What to do next, the newest values against nominal ones, then a course of each parameter with both."""
     document = json.loads(fdhil("history", worn, "--json", capsys=capsys)[1])
     assert fdhil("report", worn, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
     page = (tmp_path / "report.html").read_text()
@@ -138,7 +138,7 @@ def test_rapids_that_were_not_believed_are_in_the_report(tmp_path: Path, capsys:
             history.add_window(outcome(of=window(axis="X")), "", stamp)
     assert fdhil("report", path, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
     page = (tmp_path / "report.html").read_text()
-    assert "None of 3 rapids was believed, most often (3 ×) because of MissingStage(cruise): no plateau." in page
+    assert "None of 3 rapids was accepted, most often (3 ×) because of MissingStage(cruise): no plateau." in page
     assert "Rapids that were not believed: 3 of 3" in page
     assert "<dt>axis Y</dt><dd>not identified</dd>" in page
     assert "<h2>Axis Y</h2>" in page

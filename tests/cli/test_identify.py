@@ -272,7 +272,7 @@ def test_a_rapid_recorded_too_slowly_is_refused_by_its_rate(tmp_path: Path) -> N
     trace, columns = _trace(tmp_path, every=50, sampling="instant")
     pooled = told_document(invoke(trace, "--columns", columns, "--json"))["files"][0]["pooled"]
     assert not pooled["validated"]
-    assert pooled["reasons"][0] == "LowExcitation: 20 Hz is too slow to follow how a drive accelerates"
+    assert pooled["reasons"][0] == "LowExcitation: 20 Hz is too slow to resolve a drive's acceleration"
 
 
 @pytest.mark.usefixtures("processes")

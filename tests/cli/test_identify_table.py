@@ -76,7 +76,7 @@ def test_an_encoder_at_the_table_tells_resonance_and_true_error(tmp_path: Path) 
         assert found["value"] == pytest.approx(HERTZ, rel=0.08)
         assert abs(found["value"] - HERTZ) < 3 * found["std"]
         assert {"resonance_damping", "resonance_share"} <= set(window["terms"])
-        assert any("ResonanceDiffers: the table swings at" in text for text in window["warnings"])
+        assert any("ResonanceDiffers: the table resonates at" in text for text in window["warnings"])
         assert window["at_table"]["unseen_rms_um"] > 5.0
         assert window["at_table"]["left_rms_um"] < window["at_table"]["unseen_rms_um"] / 2
     assert file["pooled"]["terms"]["resonance"]["value"] == pytest.approx(HERTZ, rel=0.08)

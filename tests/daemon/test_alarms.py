@@ -74,7 +74,7 @@ def test_event_that_does_not_last_is_gone_at_once_and_waits() -> None:
 
 
 def test_active_alarms_are_in_front_of_graver_ones_that_are_gone() -> None:
-    due = Notice("MaintenanceDue", "minor", "ft has moved by 55 %, limit 50 %", "Y")
+    due = Notice("MaintenanceDue", "minor", "ft has changed by 55 %, limit 50 %", "Y")
     assert [alarm["code"] for alarm in documents(table(due, TRIP, LOST))] == [
         "HeartbeatLost", "MaintenanceDue", "GuardTripped",
     ]  # fmt: skip
@@ -95,7 +95,7 @@ def test_end_of_one_bus_leaves_the_alarm_of_another(ends: Notice, left: list[str
 
 
 def test_parameter_that_is_back_leaves_the_alarm_of_another_parameter() -> None:
-    due = [Notice("MaintenanceDue", "minor", f"{name} has moved by 55 %", "X") for name in ("ft", "Cd")]
+    due = [Notice("MaintenanceDue", "minor", f"{name} has changed by 55 %", "X") for name in ("ft", "Cd")]
     alarms = documents(table(*due, Notice("MaintenanceDue", "info", "ft is back at 0.05", "X")))
     assert {alarm["text"][:2]: alarm["state"] for alarm in alarms} == {"ft": "gone", "Cd": "active"}
 

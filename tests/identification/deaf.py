@@ -15,7 +15,7 @@ from studies import real_plant
 from studies.bench import Array
 from studies.real_plant import Mechanics
 
-# 95 kg behind a 10 mm screw, 20 N dry and 204 N.s/m viscous friction, 3 N always to one side
+# 95 kg on a 10 mm screw, 20 N dry and 204 N.s/m viscous friction, 3 N constant load
 TO_TORQUE = 0.01 / (2 * np.pi)
 RAPID_M_S = 0.15
 SCREW = Mechanics(
@@ -42,7 +42,7 @@ LOOPS = real_plant.Loops(
 SENSORS = real_plant.Sensors(noise=1e-4, speed="middle", encoder_bits=16)
 
 
-# [axis.X] of that machine, whose data sheet has another winding and K
+# [axis.X] of that machine; its data sheet has another winding and K
 SECTION: Mapping[str, Any] = {
     "screw_pitch_mm": 10.0,
     "rapid_speed_mm_s": 150.0,
@@ -79,22 +79,20 @@ def to_and_fro(moves: int, distance_m: float = 0.2, speed_m_s: float = RAPID_M_S
 
 @lru_cache(maxsize=4)
 def screw_run(moves: int = 4, mechanics: Mechanics = SCREW) -> real_plant.Run:
-    """Return what truly happens on the ball-screw axis."""
+    """Simulate the ball-screw axis without noise."""
     return real_plant.run(mechanics, to_and_fro(moves), LOOPS)
 
 
 def screw_csv(moves: int = 4, seed: int = 0) -> str:
-    """Return the text of its recording, which tells the torque constant in a header."""
+    """Return its recording as text, with the torque constant in a header."""
     return real_plant.as_csv(screw_run(moves), SCREW, SENSORS, RAPID_M_S, seed, voltage=False)
 
 
 def screw_recording(moves: int = 4, seed: int = 0, mechanics: Mechanics = SCREW, **sensors: Any) -> Recording:
-    """Return its recording."""
     run, told = screw_run(moves, mechanics), replace(SENSORS, **sensors)
     read = real_plant.recording(run, mechanics, told, RAPID_M_S, seed, voltage=False)
     return replace(read, torque_constant_nm_per_a=mechanics.K)
 
 
 def screw_windows(moves: int = 4, seed: int = 0, mechanics: Mechanics = SCREW, **sensors: Any) -> list[Window]:
-    """Return its rapids."""
     return find_windows(screw_recording(moves, seed, mechanics, **sensors))

@@ -1,4 +1,4 @@
-"""Rapids of machines as they are (:mod:`studies.real_plant`), ready to be identified."""
+"""Rapids of realistic machines (:mod:`studies.real_plant`), ready to be identified."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A screw that gives, seen from the table: an independent plant of known resonance, encoder and accelerometer."""
+"""A compliant screw seen from the table: an independent plant of known resonance, encoder and accelerometer."""
 
 from __future__ import annotations
 
@@ -29,7 +29,9 @@ DAMPING, SHARE = 0.02, 0.6  # of the plant
 
 
 def accelerations(mechanics: Mechanics, demand_m: Float, rows: int) -> Float:
-    """Return the table's acceleration, mean about each row, from a run whose rows are steps of the simulation."""
+    """Return the table's acceleration, averaged about each sample, from a run whose samples are steps of the
+    simulation.
+    """
     fine = real_plant.run(mechanics, demand_m, None, real_plant.STEP_S).table_m
     every = round(DT_S / real_plant.STEP_S)
     steps = np.gradient(np.gradient(fine, real_plant.STEP_S), real_plant.STEP_S)
@@ -38,7 +40,7 @@ def accelerations(mechanics: Mechanics, demand_m: Float, rows: int) -> Float:
 
 @cache
 def rapid(hertz: float, seed: int = 1) -> Window:
-    """Return a rapid of an axis with this resonance (0: stiff), its table seen by both sensors, with noise."""
+    """Return a rapid of an axis with this resonance (0: rigid), with both table sensors and noise."""
     mechanics, demand_m = Mechanics(resonance_hz=hertz), shuttle()
     run = real_plant.run(mechanics, demand_m, None, DT_S)
     sensors = Sensors(noise=0.001, speed="difference")
@@ -67,7 +69,7 @@ def test_an_encoder_tells_resonance_damping_and_share(hertz: float) -> None:
     found = seen(rapid(hertz), table_m_s2=None)
     within(found, hertz)
     assert found is not None
-    held_hz = found.values[0] * math.sqrt(1 - found.values[2])  # what bends the screw: told much better
+    held_hz = found.values[0] * math.sqrt(1 - found.values[2])  # the deflection of the screw: determined much better
     assert held_hz == pytest.approx(hertz * math.sqrt(1 - SHARE), rel=2e-3)
     assert math.sqrt(found.covariance[0, 0]) < 0.1 * hertz
 
@@ -119,7 +121,7 @@ def test_it_joins_the_estimate_with_the_doubt_that_windows_share() -> None:
     assert estimate.systematic.shape[0] == len(estimate.names) == estimate.covariance.shape[0]
     found = seen(rapid(50.0), table_m_s2=None)
     assert found is not None
-    again = joined(estimate, found)  # it takes the place of what was there
+    again = joined(estimate, found)  # it replaces the first one
     assert again.names == estimate.names
     assert again.value("resonance") == pytest.approx(50.0, rel=0.1)
 
@@ -143,7 +145,7 @@ def test_the_table_s_true_error_is_told() -> None:
     assert at_table is not None
     assert window.table_mm is not None
     unseen_um = 1e3 * np.abs(window.table_mm - window.position_mm)
-    assert at_table.unseen_max_um == pytest.approx(unseen_um.max(), abs=3.0)  # the zero is taken where it stands
+    assert at_table.unseen_max_um == pytest.approx(unseen_um.max(), abs=3.0)  # the zero is at standstill
     assert at_table.error_rms_um > at_table.unseen_rms_um > 5.0
     assert analyse(replace(window, table_mm=None), Identification()).at_table is None
 

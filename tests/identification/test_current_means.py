@@ -1,4 +1,4 @@
-"""Where a drive's speed set-point steps at every SYNC, readings of the current are moved to its means."""
+"""Where a drive's speed set-point steps at every SYNC, current readings are corrected to means."""
 
 from __future__ import annotations
 

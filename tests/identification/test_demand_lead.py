@@ -1,4 +1,4 @@
-"""A set-point that an NC's trace shows whole cycles before the drive's own is taken later, and reported."""
+"""A set-point recorded by the NC whole cycles before the drive's own is delayed and reported."""
 
 from __future__ import annotations
 

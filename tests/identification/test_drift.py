@@ -1,4 +1,4 @@
-"""Drift: held jumps, a changed load, alarms with hysteresis."""
+"""Parameter drift: jumps held back, a changed load, alarms with hysteresis."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_a_change_that_stays_about_its_limit_is_one_alarm_and_not_a_flood() -> N
     tracker = DriftTracker(limits, "X")
     tracker.update(BENCH, COVARIANCE)
     told = []
-    for k in range(600):  # one standard deviation of an estimate is 1.6 %, the change wanders from 9 to 13 % and back
+    for k in range(600):  # the deviation of an estimate is 1.6 %, the change varies between 9 and 13 %
         share = 1.11 + 0.02 * np.sin(k / 15)
         cd = 5.0 * share + 0.08 * rng.standard_normal()
         told += tracker.update(replace(BENCH, Cd=cd), COVARIANCE, k)

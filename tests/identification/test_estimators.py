@@ -1,4 +1,6 @@
-"""Every listed estimator on the bench: accurate, with honest intervals, equivariant, and silent where it must be."""
+"""Every listed estimator on the bench: accurate, with valid intervals, equivariant, and empty where nothing is
+determined.
+"""
 
 from __future__ import annotations
 
@@ -22,15 +24,14 @@ from tests.identification.recorded import signals, windows
 
 SETTINGS = Identification()
 TRUTH = np.array([bench.Plant().truth()[name] for name in PARAMETERS])
-# per cent of the truth that one rapid at 0.1 % noise must reach, in the order of PARAMETERS: any estimator, and the one
-# that promises more
+# largest error of one rapid at 0.1 % noise, %, in the order of PARAMETERS: any estimator, and the most accurate one
 REACH = (0.3, 0.6, 0.1, 0.5, 8.0, 12.0)
 CLOSER: dict[str, tuple[float, ...]] = {"maximum_likelihood": (0.1, 0.2, 0.05, 0.1, 1.5, 2.0)}
 
 
 @pytest.fixture(params=[*tables.ESTIMATORS, instrumental_variables.NAME])
 def name(request: pytest.FixtureRequest) -> str:
-    """The name of a listed estimator, or of the one that only studies compare."""
+    """The name of a listed estimator, or of the one that only studies use."""
     return str(request.param)
 
 
@@ -46,7 +47,7 @@ def _errors_percent(estimate: Estimate) -> Float:
 
 
 def _chance(estimate: Estimate) -> Float:
-    """Return the variances (6,) without the doubts about the model, which no number of windows lessens."""
+    """Return the variances (6,) without the model doubts, which more windows do not reduce."""
     shared = estimate.systematic
     doubts = np.zeros(6) if shared is None else np.square(shared[:6]).sum(axis=1)
     variances: Float = np.diag(estimate.covariance)[:6] - doubts
@@ -106,7 +107,7 @@ def test_scaled_units_scale_the_parameters(name: str) -> None:
     assert window.voltage_v is not None
     in_kilovolt = replace(window, voltage_v=frozen(window.voltage_v * 1e-3))
     plain, scaled = (_estimator(name)([w], SETTINGS) for w in (window, in_kilovolt))
-    # torque = K i is in kilo-units too, so every parameter shrinks alike
+    # torque = K i is in kilo-units too, so every parameter shrinks by the same factor
     np.testing.assert_allclose(scaled.values, plain.values * 1e-3, rtol=1e-4)
 
 
@@ -192,7 +193,7 @@ def test_what_may_be_the_voltages_course_is_a_doubt_and_no_delay(share: float) -
         assert estimate.delay_s is None
         apart = np.abs(estimate.values - TRUTH) / np.sqrt(np.diag(estimate.covariance))
         assert (apart < 3.0).all()
-    # windows in common do not lessen what is common to them
+    # more windows do not reduce a doubt that they share
     assert averaged.std("L") > 0.8 * one.std("L")
 
 
@@ -205,7 +206,7 @@ def test_a_delay_that_is_told_carries_the_doubt_of_the_course() -> None:
 
 
 def _coloured(window: Window, seed: int) -> Window:
-    """Return the noise-free window with white noise on voltage, and noise that lasts some 5 samples on the others."""
+    """Return the noise-free window with white noise on voltage, and noise correlated over 5 samples on the others."""
     rng = np.random.default_rng(seed)
     assert window.voltage_v is not None
     white = rng.standard_normal((3, window.n + 200))
@@ -229,7 +230,7 @@ def test_intervals_hold_where_noise_is_coloured() -> None:
         wide.append(apart / np.sqrt(np.diag(estimate.covariance)))
         narrow.append(apart / np.sqrt(np.diag(inverse_of(fit.information)[0])))
     assert np.mean(np.array(wide) < 1.96) > 0.88
-    assert np.mean(np.array(narrow) < 1.96) < 0.7  # what the information alone would promise
+    assert np.mean(np.array(narrow) < 1.96) < 0.7  # by the information alone
 
 
 def test_white_noise_leaves_the_information_as_it_is() -> None:

@@ -1,4 +1,4 @@
-"""What the data cannot tell is null with a reason; a friction that is nil is known to be nil."""
+"""Undetermined parameters are null with a reason; zero friction is a known value."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The Kalman filters: as a textbook's, one with the filter whose gains were kept, and linear in the signals."""
+"""The Kalman filters: equal to a textbook's, reproducible from stored gains, and linear in the signals."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ THETA = np.array([*bench.Plant().truth().values(), 0.0])
 
 
 def _motion(sampling: VoltageSampling) -> Motion:
-    """A rapid with three lost rows and an interval that is not known."""
+    """Return a rapid with three lost samples and an interval of unknown friction."""
     motion = prepare(replace(windows(0.002)[0], voltage_sampling=sampling))
     motion.mode[500] = BROKEN
     motion.observed[500:503] = False
@@ -26,7 +26,7 @@ def _motion(sampling: VoltageSampling) -> Motion:
 
 
 def _textbook(motion: Motion, theta: Float) -> Float:
-    """Return the whitened innovations (2 n,) by matrices, with the steps of the filter."""
+    """Return the whitened innovations (2 n,) by matrices, with the same transition coefficients."""
     means = motion.voltage_sampling == "interval_mean"
     voltage, current, speed = motion.noise.vector() ** 2
     steps = kalman.interval_steps(theta, motion.dt_s, 1.0 if means else 0.0)

@@ -1,4 +1,4 @@
-"""A drive's own loops: found from its rapids, on plants and drives that share no code with the model."""
+"""A drive's loops, identified from its rapids on plants and drives that share no code with the model."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ GAINS = ("position_gain_per_s", "speed_feedforward", "speed_kp", "speed_ki")
 
 
 def bench_axis(**regulators: Any) -> Axis:
-    """The bench's X with other regulators."""
+    """Return the bench's X axis with other regulators."""
     document = bench_document()
     document["axis"]["X"]["regulators"] |= regulators
     return configuration.parse(document).axis["X"]
 
 
 def shuttle(moves: int, way: float, speed: float, rest_s: float = 0.25, step_s: float = PERIOD) -> Float:
-    """A demand to and fro as an NC smooths it, m."""
+    """Return a back-and-forth demand as an NC smooths it, m."""
     ramp = speed / 4.0
     t = np.arange(0.0, way / speed + ramp, PERIOD)
     move = np.minimum(np.minimum(4.0 * t, speed), np.maximum(0.0, 4.0 * (way / speed + ramp - t)))
@@ -48,14 +48,14 @@ def shuttle(moves: int, way: float, speed: float, rest_s: float = 0.25, step_s: 
 
 
 def rapids(loops: real.Loops, mechanics: real.Mechanics | None = None) -> list[Window]:
-    """Rapids of an independent plant, as a drive reports them."""
+    """Return rapids of an independent plant, as a drive reports them."""
     mechanics = mechanics or real.Mechanics()
     run = real.run(mechanics, shuttle(4, 0.25, 0.5), loops)
     return find_windows(real.recording(run, mechanics, real.Sensors(), 0.5))
 
 
 class Observed(SlowDrive):
-    """The independent drive, whose voltage, current and speed are noted at every current-loop step."""
+    """The independent drive, with voltage, current and speed recorded at every step of its current loop."""
 
     noted: list[tuple[float, float, float]]
 
@@ -65,7 +65,6 @@ class Observed(SlowDrive):
 
 
 def observed(axis: Axis, demand_m: Float, row_s: float = PERIOD) -> list[Window]:
-    """The rapids of the independent drive."""
     drive = Observed(NOMINAL, axis, row_s, increments=2**24)
     drive.noted = []
     place = np.array(drive.run((demand_m * 1e3).tolist()))
@@ -88,14 +87,12 @@ def observed(axis: Axis, demand_m: Float, row_s: float = PERIOD) -> list[Window]
 
 
 def found(windows: list[Window], axis: Axis | None, mechanics: Parameters = NOMINAL) -> LoopEstimate:
-    """The loops of some windows."""
     loops = identify_loops(windows, [mechanics] * len(windows), axis, SETTINGS)
     assert loops is not None
     return loops
 
 
 def gains(loops: LoopEstimate) -> dict[str, float]:
-    """Values by key."""
     return dict(zip(loops.names, loops.values.tolist(), strict=True))
 
 
@@ -128,7 +125,7 @@ def test_what_is_not_configured_is_found_within_five_percent(loops: real.Loops, 
         assert value == pytest.approx(getattr(loops, name), rel=0.05), name
     assert told.verdict.accepted
     assert told.verdict.unexplained_um is not None
-    assert told.verdict.unexplained_um < 0.4  # the record is rounded to 1 um
+    assert told.verdict.unexplained_um < 0.4  # the recording is rounded to 1 um
     assert better_loops(told) == configured
 
 

@@ -1,4 +1,4 @@
-"""The small symmetric matrices of the normal equations, against a library's factorisations."""
+"""The small symmetric matrices of the normal equations, compared with numpy's factorisations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An estimate that chance took beyond what a drive can be is told within it; any other is left to the last bit."""
+"""An estimate that violates a physical bound by chance is projected onto it; any other is unchanged to the last bit."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TRUE = np.array([0.5, 0.005, 0.8, 0.075, 0.05, 5.0, 1.0, 0.06, 0.04, -2.0, 10.0]
 
 
 def estimate(values: Float, covariance: Float | None = None, names: tuple[str, ...] = NAMES) -> Estimate:
-    """Return an estimate, if not told otherwise with friction that is hardly known."""
+    """Return an estimate, by default with uncertain friction."""
     deviations = 0.01 * np.abs(values)
     deviations[[names.index(name) for name in names if name in ("Cd", "stribeck", "ft")]] = 2.0
     made = np.diag(deviations**2) if covariance is None else covariance
@@ -27,7 +27,7 @@ def estimate(values: Float, covariance: Float | None = None, names: tuple[str, .
 
 
 def changed(**values: float) -> Float:
-    """Return the true values but for some."""
+    """Return the true values with some replaced."""
     told = TRUE.copy()
     for name, value in values.items():
         told[NAMES.index(name)] = value
@@ -45,7 +45,7 @@ def test_friction_at_standstill_that_chance_made_negative_is_zero() -> None:
     assert unphysical(told) == []
     within = bounded(told)
     assert within.value("Cd") + within.value("stribeck") == 0.0
-    # both give way, the more the less they are known
+    # both move, the more the less certain they are
     assert within.value("Cd") == pytest.approx(5.675)
     assert within.covariance is told.covariance
 
@@ -59,7 +59,7 @@ def test_friction_at_standstill_that_is_surely_negative_is_refused() -> None:
 def test_correlated_values_follow_the_one_that_is_bounded() -> None:
     names = PARAMETERS
     covariance = np.zeros((6, 6))
-    covariance[4:, 4:] = [[1e-4, -9e-3], [-9e-3, 1.0]]  # ft and Cd nearly trade
+    covariance[4:, 4:] = [[1e-4, -9e-3], [-9e-3, 1.0]]  # ft and Cd nearly compensate each other
     within = bounded(estimate(np.array([*TRUE[:4], -0.001, 6.0]), covariance, names))
     assert within.value("ft") == 0.0
     assert within.value("Cd") == pytest.approx(6.0 - 0.09)
@@ -76,7 +76,7 @@ def test_load_beyond_dry_friction_is_told_of_moves_in_one_direction() -> None:
         speed = np.array([50.0 * direction])
         assert torque(within.parameters(), speed, np.zeros(1)) == pytest.approx(
             direction * (0.05 * 50.0 - 10.0)
-        )  # what moves it is the same
+        )  # the constraint is the same
 
 
 @given(st.integers(0, 2**32 - 1))

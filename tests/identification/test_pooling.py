@@ -1,4 +1,4 @@
-"""The mixed model of a pool: what windows share, what differs between them, what both directions tell."""
+"""The mixed model of a pool: common values, variation between windows, both directions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ assert FIRST is not None
 
 
 def covariance_at(speed_rad_s: float) -> Float:
-    """What a rapid tells: the friction torque at its speed to 0.01 N.m, ft and Cd apart to 2 % only."""
+    """Return a rapid's covariance: friction torque at its speed to 0.01 N.m, ft and Cd separately to 2 % only."""
     spread = np.diag(np.array([3e-4, 7e-6, 1.6e-4, 4e-5, 0.0, 0.0]) ** 2)
     apart, together = 0.09, 0.01
     spread[4:, 4:] = apart**2 * np.outer([-1 / speed_rad_s, 1.0], [-1 / speed_rad_s, 1.0])
@@ -32,7 +32,7 @@ def covariance_at(speed_rad_s: float) -> Float:
 def drawn(
     rng: np.random.Generator, truth: Sequence[Parameters], speeds: Sequence[float], load: float = 0.0
 ) -> list[Member]:
-    """Windows to and fro at some speeds, each with its own truth."""
+    """Return windows of both directions at some speeds, each with its own true values."""
     members = []
     for place, (now, speed) in enumerate(zip(truth, speeds, strict=True)):
         direction = 1 - 2 * (place % 2)
@@ -44,7 +44,7 @@ def drawn(
 
 
 def deviations(found: Estimate, truth: Parameters) -> Float:
-    """By how many of its standard deviations each of the six parameters is off."""
+    """Return the error of each of the six parameters in standard deviations."""
     off: Float = (found.values[:6] - list(truth.as_dict().values())) / np.sqrt(np.diag(found.covariance))[:6]
     return off
 
@@ -112,7 +112,7 @@ def test_terms_are_averaged_over_the_windows_that_have_them_and_a_ripples_phase_
     rng, names = np.random.default_rng(5), (*PARAMETERS, "ripple_screw_1", "ripple_screw_1_phase")
     members = []
     for place, plain in enumerate(drawn(rng, [BENCH] * 4, [RAPID] * 4)):
-        phase = np.pi + (0.1 if place % 2 else -0.1)  # on either side of where it jumps
+        phase = np.pi + (0.1 if place % 2 else -0.1)  # on either side of the phase jump
         values = np.array([*plain.values, 0.2, np.arctan2(np.sin(phase), np.cos(phase))])
         own = np.zeros((8, 8))
         own[:6, :6], own[6:, 6:] = plain.own, np.diag([0.01**2, 0.05**2])
@@ -164,7 +164,7 @@ def test_at_one_speed_the_sum_of_friction_is_known_better_than_its_parts() -> No
 
 
 def test_a_term_that_windows_tell_each_in_its_own_way_bends_nothing_else() -> None:
-    """Two speeds put a resonance apart by twenty deviations; Jt hangs together with it, and stays where it is."""
+    """Two speeds separate a resonance by twenty deviations; Jt, which correlates with it, must not change."""
     assert FIRST is not None
     names = (*PARAMETERS, "resonance")
     plain = drawn(np.random.default_rng(6), [BENCH] * 8, [RAPID] * 8)
@@ -176,7 +176,7 @@ def test_a_term_that_windows_tell_each_in_its_own_way_bends_nothing_else() -> No
         values = np.array([*one.values, 100.0 if place < 4 else 120.0])
         members.append(Member(names, values, own, np.zeros((7, 6)), place, one.direction))
     apart = between(members)
-    assert apart.scatter["resonance"] == pytest.approx(100.0, rel=0.3)  # 10 Hz to either side
+    assert apart.scatter["resonance"] == pytest.approx(100.0, rel=0.3)  # 10 Hz to each side
     found = pooled(members, FIRST, apart, joining=False)
     assert abs(found.value("Jt") - BENCH.Jt) < 3 * found.std("Jt")
     assert found.std("resonance") > 2.0

@@ -1,4 +1,4 @@
-"""A speed that is late is found out by the position, and mended before anything is made of it."""
+"""The lag of a late speed is estimated from the position, and removed before any other step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rows of 4 to 10 ms, as four axes on one bus have: what the regulators do within them biases nothing."""
+"""Samples of 4 to 10 ms, as with four axes on one bus: regulators within them cause no bias."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ VALUES = np.array(list(TRUTH.as_dict().values()))
 
 @lru_cache(maxsize=4)
 def _rows(row_s: float) -> tuple[Float, Float]:
-    """Return demand (n,), mm, and rows (4, n) of V, A, rad/s, mm of the twin's drive, whose set-points come so."""
+    """Return demand (n,), mm, and samples (4, n) of V, A, rad/s, mm of the simulated drive with such set-points."""
     demand = 1e3 * shuttle(moves=2)[:: round(row_s / 1e-3)]
     physics = Physics(TRUTH, AXIS.regulators, row_s, INCREMENTS)
     counts = np.append(demand, [demand[-1]] * 2) * INCREMENTS / AXIS.screw_pitch_mm
@@ -113,7 +113,7 @@ def test_what_a_current_does_within_its_rows_grows_with_them() -> None:
 
 
 def test_rows_of_2_ms_leave_the_inertia_open_and_those_of_1_ms_do_not() -> None:
-    """A drive whose fed-forward speed steps at every SYNC makes 15 % of the inertia in rows of 2 ms."""
+    """A speed feed-forward that steps at every SYNC causes an error of 15 % of the inertia at 2 ms."""
     stds = {}
     for row_ms in (1, 2):
         (window,) = rapids(dt_s=1e-3 * row_ms)

@@ -1,4 +1,4 @@
-"""A voltage sensor slower than the drive: each of its samples is one row of the likelihood, its delay a parameter."""
+"""A voltage sensor slower than the drive: each sample enters the likelihood, and its delay is a parameter."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.asked import asked_windows
 
 SETTINGS = Identification()
 TRUTH = np.array([bench.Plant().truth()[name] for name in PARAMETERS])
-# per cent of the truth that one rapid at 0.1 % noise must reach
+# largest error of one rapid at 0.1 % noise, %
 MEANS = (0.2, 0.6, 0.03, 0.08, 3.0, 4.0)
 
 
@@ -81,7 +81,7 @@ def test_windows_with_clocks_of_their_own_are_pooled() -> None:
     two = [slow_windows(delay_s=delay, noise=0.005, seed=seed)[0] for seed, delay in ((1, 0.001), (2, -0.001))]
     estimate = maximum_likelihood.estimate(two, SETTINGS)
     assert (_errors_percent(estimate.values)[:4] < (0.3, 1.2, 0.1, 0.2)).all()
-    # one residual of [5] for each voltage sample, one of [6] for each row, all of unit variance
+    # one residual of [5] for each voltage sample, one of [6] for each drive sample, all of unit variance
     assert estimate.residuals["electrical"].size == sum(w.slow_voltage.voltage_v.size for w in two if w.slow_voltage)
     assert estimate.residuals["mechanical"].size == sum(w.n for w in two)
     assert all(0.8 < np.std(e[e != 0.0]) < 1.2 for e in estimate.residuals.values())
@@ -89,7 +89,7 @@ def test_windows_with_clocks_of_their_own_are_pooled() -> None:
 
 @pytest.mark.parametrize("seed", [61, 274])
 def test_a_delay_that_least_squares_took_for_a_negative_l_is_found(seed: int) -> None:
-    # a sensor of 100 Hz, 4 ms early or late: the fit began at L = 0 and stayed there, 6 ms beside the delay
+    # a sensor of 100 Hz, 4 ms early or late: the fit once started at L = 0 and stayed there, 6 ms off the delay
     recording = recording_of(seed, 3, GOOD).recording
     estimate = maximum_likelihood.estimate(find_windows(recording), SETTINGS)
     assert estimate.result is Result.OK
@@ -99,7 +99,7 @@ def test_a_delay_that_least_squares_took_for_a_negative_l_is_found(seed: int) ->
 
 
 def test_a_meter_that_was_asked_off_its_instants_tells_as_much_as_one_that_was_not() -> None:
-    """Each value is taken at its own time; where all are taken at their instants the inductance suffers."""
+    """Each value counts at its own time; assigning all to the regular instants would bias the inductance."""
     on, off = (maximum_likelihood.estimate(asked_windows(timely=timely), SETTINGS) for timely in (True, False))
     for estimate in (on, off):
         assert not estimate.missing

@@ -1,4 +1,4 @@
-"""A resonance between motor and table is taken into the fit, and found, on machines of another simulation."""
+"""A resonance between motor and table is fitted, or found, on machines of another simulation."""
 
 from __future__ import annotations
 
@@ -37,20 +37,20 @@ PERIOD_S = 1e-3
 
 
 def axis_of(mechanics: Mechanics, base: str, told_hz: float = 0.0) -> Axis:
-    """Return the section of a base's axis, with the resonance that is told."""
+    """Return the section of a base's axis, with a configured resonance."""
     loops = SLOW_LOOPS if base == "slow" else BASES[base][1]
     return config_of(Machine("", base, mechanics, loops, Sensors(), loops, told_hz)).axis["X"]
 
 
 def slow_rapids(mechanics: Mechanics, seed: int = 1) -> list[Window]:
-    """Return a rapid to and one fro of the axis where friction rules."""
+    """Return one rapid in each direction of the axis with dominant friction."""
     _, _, rapid_m_s, acceleration_m_s2, _ = BASES["slow"]
     moved = run(mechanics, shuttle(0.4, rapid_m_s, acceleration_m_s2, 2), SLOW_LOOPS)
     return find_windows(recording(moved, mechanics, Sensors(), rapid_m_s, seed))
 
 
 def judged(windows: list[Window], axis: Axis) -> list[WindowOutcome]:
-    """Return the windows analysed through the axis."""
+    """Return the windows analysed through the axis pipeline."""
     return [analyse(window, SETTINGS, axis, PERIOD_S) for window in windows]
 
 
@@ -61,13 +61,13 @@ def test_no_table_adds_no_torque() -> None:
     stiff = torques.answer(Spring(100.0, 0.0, 0.03))
     ripple = Course("ripple_screw_1", LOAD, np.sin(motion.angle_rad))
     assert np.allclose(torques.with_answer(ripple, stiff).values, ripple.values, atol=1e-12)
-    # its friction reaches the motor through the spring, whatever there is of it
+    # its friction reaches the motor through the spring
     assert np.abs(torques.felt(torques.answer(Spring(5000.0, 0.5, 0.03)))).max() < 0.05
 
 
 @pytest.mark.usefixtures("long_computation")
 def test_a_told_resonance_takes_what_bends_the_six_away() -> None:
-    """A good encoder sees it: the table's share is told as well, and inertia and inductance no more bent."""
+    """With a good encoder the table's share is determined too, and inertia and inductance are unbiased."""
     mechanics = replace(ORDINARY_MECHANICS, load_nm=0.0)
     windows = rapids(mechanics, ORDINARY_SENSORS, ORDINARY_LOOPS, moves=2)
     truth = np.array(list(mechanics.truth().values())) * np.array([1 / 1.01, 1 / 1.01, 1.0, 1.01, 1.01, 1.01])
@@ -85,7 +85,7 @@ def test_a_told_resonance_takes_what_bends_the_six_away() -> None:
 
 
 def test_what_is_told_is_no_news_of_every_window() -> None:
-    """Eight windows with the same doubt about the table's share know it no better than one."""
+    """Eight windows with the same prior of the table's share determine it no better than one."""
     windows = slow_rapids(replace(SLOW, resonance_hz=150.0))
     outcomes = judged(windows, axis_of(SLOW, "slow", 150.0))
     for outcome in outcomes:
@@ -121,7 +121,7 @@ def test_a_resonance_that_nobody_told_is_found_by_the_replay() -> None:
     for outcome in again:
         assert outcome.verdict.accepted
         assert outcome.estimate is not None
-        # by the motor alone frequency and share trade: what the table does behind it is told
+        # seen from the motor, frequency and share compensate each other: the table's motion is determined
         hertz, share = outcome.estimate.value(RESONANCE), outcome.estimate.value(SHARE)
         assert hertz * (1 - share) ** 0.5 == pytest.approx(80.0 * 0.4**0.5, rel=0.15)
 
@@ -176,7 +176,7 @@ def test_a_load_that_just_holds_the_shaft_explains_how_a_move_begins() -> None:
 
 
 def test_friction_at_low_speed_falls_off_where_rows_tell_it() -> None:
-    """Below all rows that surely move, any amplitude would fit: this machine's fourth rapid was given 5e17 N.m."""
+    """Below all observed speeds any amplitude would fit: this machine's fourth rapid once got 5e17 N.m."""
     machine = random_machines(12, 1)[11]
     _, _, rapid_m_s, acceleration_m_s2, _ = BASES["slow"]
     moved = run(machine.mechanics, shuttle(0.4, rapid_m_s, acceleration_m_s2, 4), machine.loops)

@@ -1,4 +1,4 @@
-"""Terms join the six where the data surely show them, with intervals that hold, and nowhere else."""
+"""Terms are added where they are significant, with valid intervals, and nowhere else."""
 
 from __future__ import annotations
 
@@ -83,7 +83,9 @@ def test_friction_that_rises_or_falls_at_low_speed_joins(static: float) -> None:
 
 
 def test_an_ordinary_machine_with_everything_at_once_is_known() -> None:
-    """With 1 % on its current sensor the drive has R, L less and Jt, ft, Cd more by that; gravity acts in Cd."""
+    """With a gain error of 1 % of the current sensor, R and L are smaller, Jt, ft and Cd larger by 1 %; gravity adds to
+    Cd.
+    """
     for window in rapids(ORDINARY_MECHANICS, ORDINARY_SENSORS, ORDINARY_LOOPS, moves=2):
         estimate = _estimate(window)
         truth = TRUTH / np.array([1.01, 1.01, 1.0, 1 / 1.01, 1 / 1.01, 1 / 1.01])

@@ -1,4 +1,4 @@
-"""Trends: slopes with intervals that hold, steps among drift, the date of a limit."""
+"""Trends: slopes with valid intervals, steps within drift, the date of a limit."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_what_follows_the_temperature_is_no_wear() -> None:
     assert fair is not None
     assert naive.interval()[1] < 0
     assert fair.interval()[0] <= 0 <= fair.interval()[1]
-    assert slope(points, days, np.full(40, 0.05), days * 2) is None  # the two cannot be told apart
+    assert slope(points, days, np.full(40, 0.05), days * 2) is None  # the two cannot be separated
 
 
 def test_the_date_of_a_limit_and_its_interval() -> None:

@@ -1,4 +1,4 @@
-"""Rapids found in recordings: edges, stages, and what is not a rapid."""
+"""Rapids found in recordings: edges, stages, and moves that are not rapids."""
 
 from __future__ import annotations
 
@@ -92,5 +92,5 @@ def test_nothing_moves() -> None:
 def test_readings_that_are_no_numbers_do_not_disturb_the_search() -> None:
     whole = recording(0.002)
     speed = np.array(whole.speed_rad_s)
-    speed[[400, 401, 403, 404]] = np.inf  # whose differences are no numbers either
+    speed[[400, 401, 403, 404]] = np.inf  # their differences are not numbers either
     assert len(find_windows(replace(whole, speed_rad_s=speed))) == 1

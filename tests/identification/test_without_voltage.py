@@ -1,4 +1,4 @@
-"""Jt, ft and Cd from current and position alone, on a plant that the package did not make."""
+"""Jt, ft and Cd from current and position alone, on an independent plant."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_without_any_torque_constant_the_ratios_are_told() -> None:
 
 
 def test_intervals_hold_the_truth() -> None:
-    """Over 24 windows of two plants, as often as they should: the error in deviations has an RMS near 1."""
+    """Over 24 windows of two plants the error in deviations has an RMS near 1."""
     slow = run(SLOW, to_and_fro(4, 0.2, 0.2, 2.0), SLOW_LOOPS)
     errors = []
     for mechanics, made in ((SLOW, slow), (replace(SCREW, static=0.0, screw_ripple=0.0), None)):
@@ -88,7 +88,7 @@ def _windows(made: Run, mechanics: Mechanics, seed: int, rapid_m_s: float = 0.2)
 
 @pytest.mark.parametrize("dt_s", [0.004, 0.010])
 def test_slow_rows_tell_the_same(dt_s: float) -> None:
-    """Four axes on one bus leave a row every 4 ms, many machines one in 10; the NC smooths its ramps."""
+    """Four axes on one bus allow a sample every 4 ms, many machines one in 10; the NC smooths its ramps."""
     smooth = np.convolve(np.pad(to_and_fro(2, 0.4, 0.5, 4.0), 50, "edge"), np.full(90, 1 / 90), "same")[50:-50]
     for window in _windows(run(Mechanics(), smooth, dt_s=dt_s), Mechanics(), 1, 0.5):
         found = estimate(window)

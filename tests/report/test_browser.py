@@ -1,4 +1,4 @@
-"""A page in a real browser: pictures come alive, enlarge, hide curves; and it prints on paper."""
+"""A page in a real browser: charts become interactive, zoom, hide curves; and the page prints."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ document.querySelectorAll("figure")[2].querySelector('[id*="-legend-1"]').dispat
 
 
 def page() -> Page:
-    """One picture of each kind: a chart of two panels, a map, a place enlarged."""
+    """Return a page with one picture of each kind: a chart of two panels, a map, an enlarged detail."""
     path = curves()[0].path_mm
     pictures = [
         ("model", figures.model_against_drive(window(), PARAMETERS, 99.5)),
@@ -42,7 +42,7 @@ def page() -> Page:
 
 
 def shown(text: str, folder: Path) -> str:
-    """Return the document as the browser has it after its scripts ran."""
+    """Return the browser's document after its scripts ran."""
     source, found = folder / "page.html", folder / "dom.html"
     source.write_text(text, "utf-8")
     with found.open("w") as file:
@@ -63,9 +63,9 @@ def test_pictures_come_alive(tmp_path: Path) -> None:
 def test_a_page_is_printed_with_pictures_that_were_drawn_for_it(tmp_path: Path) -> None:
     whole = page()
     (section,) = whole.sections
-    lines = replace(section, figures=[section.figures[0], section.figures[2]])  # a scale of colours is an image
+    lines = replace(section, figures=[section.figures[0], section.figures[2]])  # a colour scale is an image
     write_pdf(replace(whole, sections=[lines]), tmp_path / "page.pdf")
     printed = (tmp_path / "page.pdf").read_bytes()
     assert printed.startswith(b"%PDF")
     assert 2 <= len(re.findall(rb"/Type /Page\b", printed)) <= 4
-    assert b"/Subtype /Image" not in printed  # curves and text, no picture of a screen
+    assert b"/Subtype /Image" not in printed  # vector curves and text, not a screenshot

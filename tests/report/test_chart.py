@@ -1,4 +1,4 @@
-"""Charts: what is drawn and what the page's script is told; units as they are printed; maps that can be compared."""
+"""Charts: the drawing and the exported data; typeset units; comparable maps."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.report.test_report import PARAMETERS, window
 
 
 def told(picture: str) -> dict[str, Any]:
-    """What the page's script is told of a picture."""
+    """Return the data that the page's script reads from a picture."""
     (text,) = re.findall(r"<metadata>(.*?)</metadata>", picture, re.DOTALL)
     found: dict[str, Any] = json.loads(html.unescape(text))
     return found
@@ -39,7 +39,7 @@ def test_a_long_curve_keeps_its_peaks() -> None:
 
 
 def test_the_script_is_told_what_is_drawn() -> None:
-    """A grid that several curves have is told once; what is lost is null; bounds stand beside their values."""
+    """Shared grids are exported once, lost values are null, and bounds accompany their values."""
     x = frozen([3.0, 1.0, 2.0])
     bars = Trace("points", x, frozen([30.0, 10.0, 20.0]), style="points", low=x, high=frozen([33.0, 11.0, 22.0]))
     line = Trace("line", frozen([1.0, 2.0, 3.0]), frozen([1.0, np.nan, 1 / 3]))
@@ -60,14 +60,14 @@ def test_seconds_since_1970_keep_all_their_digits() -> None:
 
 
 def test_an_overlay_shows_what_is_between_its_curves() -> None:
-    """Model and drive cannot be told apart on one scale: their difference has a panel of its own."""
+    """Model and drive coincide on one scale, so their difference has its own panel."""
     overlay, between = told(figures.model_against_drive(window(), PARAMETERS, 99.5))["panels"]
     drive, model = (np.array(trace["y"]) for trace in overlay["traces"])
     assert np.allclose(between["traces"][0]["y"], drive - model, atol=1e-3)
 
 
 def test_every_picture_says_what_it_shows() -> None:
-    """For those who cannot see it, with its numbers."""
+    """For blind readers, with the figures."""
     picture = figures.contour_errors(0.001, {"before": np.full(9, 100.0), "after": np.full(9, 0.2)})
     (words,) = re.findall(r'aria-label="([^"]*)"', picture)
     assert words == "Contour error along the path: before 100 um RMS, 100 um at most; after 0.2 um RMS, 0.2 um at most."

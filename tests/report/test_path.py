@@ -26,13 +26,12 @@ MODELS = nominal_models(CONFIG)
 
 @pytest.fixture(scope="module", name="correction")
 def _correction() -> Correction:
-    """The bench path, corrected."""
     return plan(bench_trajectory(10), MODELS, CONFIG)
 
 
 @pytest.mark.usefixtures("long_computation")
 def test_before_and_after(correction: Correction, tmp_path: Path) -> None:
-    """A map and a scale for each, every corner enlarged with both, the zones with both figures."""
+    """A map and a scale for each, every corner enlarged with both curves, the zones with both errors."""
     page = correction_page("part.ngc", "bench", correction)
     along, places, zones = page.sections
     assert [caption.partition(":")[0] for caption, _ in along.figures][:2] == [
@@ -50,7 +49,7 @@ def test_before_and_after(correction: Correction, tmp_path: Path) -> None:
 
 
 def test_what_is_magnified_is_the_contour_error(correction: Correction) -> None:
-    """A lag along the path is none: the drawn point lies as far from the path as the figure says."""
+    """A lag along the path does not count: the drawn point lies as far from the path as its contour error."""
     before = correction.before
     rows = slice(300, 600)
     actual = np.column_stack([before.predicted_mm[axis] for axis in "XY"])[rows]
@@ -60,7 +59,7 @@ def test_what_is_magnified_is_the_contour_error(correction: Correction) -> None:
 
 @pytest.mark.usefixtures("long_computation")
 def test_a_refused_correction_says_why() -> None:
-    """Its page shows the path as it would be cut, and the advice."""
+    """The page shows the uncorrected path and the advice."""
     refused = plan(bench_trajectory(20, (0.030, 0.015)), MODELS, CONFIG)
     page = correction_page("part.ngc", "bench", refused)
     assert ("correction", "refused") in page.headline
@@ -69,7 +68,7 @@ def test_a_refused_correction_says_why() -> None:
 
 
 def test_the_worst_places_are_apart_and_in_order(correction: Correction) -> None:
-    """One picture a place, however many zones it has."""
+    """One picture per position, however many zones it has."""
     found = worst_places(correction.before)
     rows = [row for _, row in found]
     assert rows == sorted(rows)
@@ -78,7 +77,7 @@ def test_the_worst_places_are_apart_and_in_order(correction: Correction) -> None
 
 
 def test_planes_of_three_axes_and_of_one() -> None:
-    """The plane with most of the path first; an axis alone has no map, and the page is made all the same."""
+    """The plane with most of the path comes first; a single axis has no map, but still a page."""
     flat = bench_trajectory(10)
     z = 30 * np.sin(flat.time_s)
     solid = replace(flat, position_mm={**flat.position_mm, "Z": frozen(z)})
@@ -90,7 +89,7 @@ def test_planes_of_three_axes_and_of_one() -> None:
 
 
 def test_one_axis_alone_is_enlarged_over_time() -> None:
-    """There and back: the place is a reversal, drawn as what the axis is ahead of the desired."""
+    """At a reversal, the error of the axis is drawn over time."""
     there = np.linspace(0.0, 60.0, 360)
     path = smooth(np.concatenate([there, there[::-1], np.zeros(300)])[:, None], (0.060, 0.030), 0.001)
     page = prediction_page("up.ngc", "bench", predict(trajectory(path, "Y"), MODELS, CONFIG))
@@ -102,8 +101,9 @@ def test_one_axis_alone_is_enlarged_over_time() -> None:
 
 @pytest.mark.usefixtures("long_computation")
 def test_a_long_path_is_drawn_by_points_and_its_zones_are_cut(tmp_path: Path) -> None:
-    """Each place in the colour of its own error, whatever the length; other passes over a place are not in its picture;
-    equal places are shown a few times."""
+    """Each position has the colour of its own error, and no other pass is in its picture; equal positions appear a few
+    times.
+    """
     once = np.column_stack([bench_trajectory(10).position_mm[axis] for axis in "XY"])
     both = np.concatenate([once, once[::-1]])
     path = np.concatenate([both + np.array([0.0, 0.5 * k]) for k in range(14)])
@@ -120,7 +120,7 @@ def test_a_long_path_is_drawn_by_points_and_its_zones_are_cut(tmp_path: Path) ->
 
 
 def test_points_hold_the_largest_error_of_each_place() -> None:
-    """A single bad row in ten minutes of path is seen, at its place."""
+    """A single bad sample in ten minutes of path is visible at its position."""
     n = 120_000
     angle = np.linspace(0, 60 * np.pi, n)
     circle = 50 * np.column_stack([np.cos(angle), np.sin(angle)])
@@ -143,7 +143,6 @@ def test_a_small_error_beside_a_large_one_is_seen() -> None:
 
 
 def test_a_path_without_error_has_a_page() -> None:
-    """Nothing stands out, nothing is enlarged."""
     still = trajectory(np.zeros((300, 2)))
     page = prediction_page("nothing.ngc", "bench", predict(still, MODELS, CONFIG))
     assert page.sections[1].text == page.sections[2].text == "No zone stands out."

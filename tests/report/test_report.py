@@ -1,4 +1,4 @@
-"""The report: one self-contained page, and figures that show the data."""
+"""The report: one self-contained page, and figures that match the data."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PARAMETERS = Parameters(R=0.5, L=0.005, K=0.8, Jt=0.075, ft=0.05, Cd=5.0)
 
 
 def window() -> Window:
-    """A window whose voltage drives the model, so that model and measurement agree."""
+    """Return a window simulated from its voltage, so that model and measurement agree."""
     from fdhil.model.feed_drive import simulate_plant
 
     voltage = np.concatenate([np.zeros(50), np.linspace(0, 60, 200), np.full(300, 60.0)])
@@ -84,8 +84,8 @@ def test_the_page_needs_nothing_from_elsewhere(tmp_path: Path) -> None:
     assert "<td>2</td>" in text
     loaded = re.findall(r"""(?:src|href)=["']([^"'#][^"']*)""", text)
     assert loaded == []
-    assert re.findall(r"<script[^>]", text) == []  # none with an address
-    assert "default-src 'none'" in text  # and the browser is told to load nothing
+    assert re.findall(r"<script[^>]", text) == []  # none with a URL
+    assert "default-src 'none'" in text  # and the browser may load nothing
     assert not list(tmp_path.rglob("*.part"))
 
 

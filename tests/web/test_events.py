@@ -29,7 +29,7 @@ TRIP = (
 NOTICES = (
     Notice("Armed", "info", "armed part.ngc"),
     Notice("GuardTripped", "MAJOR", TRIP, "X"),
-    Notice("MaintenanceDue", "minor", "ft has moved by 55 %, limit 50 %", "Y"),
+    Notice("MaintenanceDue", "minor", "ft has changed by 55 %, limit 50 %", "Y"),
     Notice("GuardTripped", "MAJOR", TRIP, "X"),
     Notice("StrayFiles", "minor", "2 files are no windows"),
 )

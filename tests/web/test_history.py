@@ -50,7 +50,7 @@ async def test_each_axis_is_told_in_few_words(client: httpx.AsyncClient) -> None
     assert moved["state"] in ("warn", "bad")
     assert moved["rapids_seen"] == RAPIDS
     assert moved["rapids_believed"] + moved["rapids_refused"] == RAPIDS
-    assert (never["state"], never["says"], never["newest_time"]) == ("none", ["Nothing was identified yet."], None)
+    assert (never["state"], never["says"], never["newest_time"]) == ("none", ["Nothing has been identified yet."], None)
 
 
 @pytest.mark.usefixtures("long_computation")

@@ -1,7 +1,5 @@
 """One file per estimator, each with ``estimate(windows, settings) -> Estimate``; ``fdhil.tables`` lists them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -11,13 +9,13 @@ from fdhil.records import Estimate, Window
 
 
 class Estimator(Protocol):
-    """What an estimator is: one window, or a pool of windows of one drive taken together."""
+    """Estimates one window, or a pool of windows of one drive together."""
 
     def __call__(self, windows: Sequence[Window], settings: Identification) -> Estimate: ...
 
 
 def chosen(settings: Identification) -> tuple[str, Estimator]:
-    """Return the name and the function of the estimator that the settings ask for, else the default."""
+    """Return name and function of the estimator in the settings, else of the default."""
     name = settings.method or tables.DEFAULT_ESTIMATOR
     estimator: Estimator = tables.load(tables.ESTIMATORS, name)
     return name, estimator

@@ -1,11 +1,8 @@
 """Estimates by the paper's method: one low-pass on every signal, operator [4], least squares on [5] and [6] of [DES].
 
-Each interval mean of voltage belongs to the middle of its interval; current and speed are brought to the same interval
-means, so that all three are treated alike. [6] is fitted as K i = Jt Dw + ft w + Cd sign(w) with K from [5]. Standard
-deviations come from one sandwich over both equations, because filtered residuals are coloured and share their noise.
+Current and speed are converted to interval means like the voltage's. [6] is fitted as K i = Jt Dw + ft w + Cd sign(w)
+with K from [5]. One sandwich over both equations yields the standard deviations: filtered residuals are coloured.
 """
-
-from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,13 +22,13 @@ from fdhil.records import PARAMETERS, Bool, Estimate, Float, Reason, Result, Win
 
 NAME = "least_squares"
 ORDER = [1, 0, 2, 3, 4, 5]  # from L, R, K to R, L, K, and back
-# of [L, R, K, Jt, ft, Cd]: what stencils and the voltage's course within a sample leave open, however low the noise
+# of [L, R, K, Jt, ft, Cd]: doubt due to stencils and the voltage's waveform within a sample, without noise
 OPEN_SHARE = np.array([1e-3, 5e-4, 5e-5, 3e-4, 0.0, 0.0])
 
 
 @dataclass(frozen=True, slots=True)
 class Signals:
-    """A window's signals, filtered alike and at one instant per row, (n,) each; ``usable`` marks the rows to fit."""
+    """A window's signals (n,), filtered alike and at one instant per sample; ``usable`` marks the samples to fit."""
 
     voltage: Float
     current: Float
@@ -52,7 +49,7 @@ def interval_means(values: Float) -> Float:
 
 
 def align(window: Window, settings: Identification) -> Signals:
-    """Return the three signals at one instant per row, through the same zero-phase low-pass."""
+    """Return the three signals at one instant per sample, through the same zero-phase low-pass."""
     assert window.voltage_v is not None
     dt = window.dt_s
     raw = [carried(s) for s in (window.voltage_v, window.current_a, window.speed_rad_s)]
@@ -69,13 +66,13 @@ def align(window: Window, settings: Identification) -> Signals:
 
 
 def mechanical_signals(window: Window, settings: Identification) -> Float:
-    """Return the usable rows (m, 4) of [i, Dw, w, sign w] of a window, whether or not it has a voltage."""
+    """Return the usable samples (m, 4) of [i, Dw, w, sign w] of a window, with or without a voltage."""
     silent = window if window.voltage_v is not None else replace(window, voltage_v=np.zeros(window.n))
     return regressors(align(silent, settings), window.dt_s)[1]
 
 
 def regressors(signals: Signals, dt_s: float, operator: Operator = ZERO_FORCING_1) -> tuple[Float, Float]:
-    """Return the usable rows (m, 4) of [u, Di, i, w] and (m, 4) of [i, Dw, w, sign w]."""
+    """Return the usable samples (m, 4) of [u, Di, i, w] and (m, 4) of [i, Dw, w, sign w]."""
     di, dw = derivative(signals.current, dt_s, operator), derivative(signals.speed, dt_s, operator)
     rows = signals.usable & np.isfinite(di) & np.isfinite(dw)
     electrical = np.column_stack([signals.voltage, di, signals.current, signals.speed])[rows]
@@ -96,15 +93,15 @@ def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
 
 
 def noise_through(windows: Sequence[Window], settings: Identification) -> tuple[Float, Float, Float]:
-    """Return the variances (3,) of voltage, current and speed, and what low-pass and operator make of one sample."""
+    """Return variances (3,) of voltage, current and speed, and the responses of low-pass and operator to one sample."""
     impulse = impulse_response(settings.lowpass_hz, windows[0].dt_s)
     noise = np.mean([noise_levels(w).vector() ** 2 for w in windows], axis=0)
     return noise, impulse, np.nan_to_num(derivative(impulse, windows[0].dt_s))
 
 
 def too_short(method: str, rows: int) -> Estimate:
-    """Return the answer for windows that hold hardly any row beyond the reach of standstill."""
-    text = f"only {rows} rows lie beyond the low-pass's reach from standstill"
+    """Return the estimate for windows with hardly any sample in motion beyond the low-pass's reach."""
+    text = f"only {rows} samples in motion lie beyond the low-pass's reach from standstill"
     reason = Reason("LowExcitation", text, "record a longer rapid or raise lowpass_hz")
     return empty_estimate(method, Result.UNDER_EXCITED, reason)
 
@@ -112,10 +109,10 @@ def too_short(method: str, rows: int) -> Estimate:
 def fit_two_steps(
     method: str, parts: Sequence[tuple[Float, Float]], noise: Float, impulse: Float, slope: Float, alias: Float
 ) -> Estimate:
-    """Fit [5], then [6] with its K, to rows (m, 4) of [u, Di, i, w] and of [i, Dw, w, sign w] per window.
+    """Fit [5], then [6] with its K, to samples (m, 4) of [u, Di, i, w] and of [i, Dw, w, sign w] per window.
 
     ``noise`` (3,) are the variances of voltage, current and speed; ``impulse`` and ``slope`` are the weights with which
-    a noisy sample enters a signal and its derivative; ``alias`` (6,) is what the voltage's sampling leaves in doubt.
+    a noisy sample enters a signal and its derivative; ``alias`` (6,) is the doubt due to the voltage's sampling.
     """
     electrical, mechanical = (np.vstack([p[k] for p in parts]) for k in (0, 1))
     if not (np.isfinite(electrical).all() and np.isfinite(mechanical).all()):
@@ -140,7 +137,7 @@ def solve_two_steps(electrical: Float, mechanical: Float) -> tuple[Float, float]
 
 
 def residuals_of(theta: Float, electrical: Float, mechanical: Float) -> tuple[Float, Float]:
-    """Return what ``theta`` = [L, R, K, Jt, ft, Cd] leaves of [5] (m,) in V, and of K times [6] (m,) in N.m."""
+    """Return the residuals of ``theta`` = [L, R, K, Jt, ft, Cd] in [5] (m,), V, and in K times [6] (m,), N.m."""
     torque = mechanical[:, 0] * theta[2]
     return electrical[:, 0] - electrical[:, 1:] @ theta[:3], torque - mechanical[:, 1:] @ theta[3:]
 
@@ -148,7 +145,7 @@ def residuals_of(theta: Float, electrical: Float, mechanical: Float) -> tuple[Fl
 def two_step_estimate(
     method: str, theta: Float, covariance: Float, residuals: tuple[Float, Float], condition: float, mechanical: Float
 ) -> Estimate:
-    """Return the judged estimate of ``theta`` = [L, R, K, Jt, ft, Cd] with its covariance (6, 6) in that order."""
+    """Return the estimate of ``theta`` = [L, R, K, Jt, ft, Cd] with its covariance (6, 6) in that order."""
     electrical, torque = residuals
     answer = Estimate(
         method=method,
@@ -162,14 +159,14 @@ def two_step_estimate(
 
 
 def _voltage_variance(residual_u: Float, theta: Float, impulse: Float, slope: Float, noise: Float) -> float:
-    """Return the variance of the voltage's noise as the residual of [5] shows it: the drive's own ripple is none."""
+    """Return the variance of the voltage's noise from the residual of [5]: the drive's own ripple is not noise."""
     silent = np.append(0.0, noise[1:])
     others = residual_gammas(theta, impulse, slope, silent)[0][0].max()
     return max(float(np.mean(residual_u**2) - others) / float(impulse @ impulse), 1e-3 * float(noise[0]))
 
 
 def raw_values(signals: Sequence[Signals], dt_s: Sequence[float]) -> Float | None:
-    """Return [R, L, K, Jt, ft, Cd] (6,) unjudged, as a start for other estimators; None when there are too few rows."""
+    """Return [R, L, K, Jt, ft, Cd] (6,) as a start for other estimators; None with too few samples."""
     parts = [regressors(s, dt) for s, dt in zip(signals, dt_s, strict=True)]
     if sum(p[0].shape[0] for p in parts) < 8:
         return None

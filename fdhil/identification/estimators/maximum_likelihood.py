@@ -1,13 +1,9 @@
 """Estimates all six parameters together from noisy signals: maximum likelihood by Kalman innovations.
 
-The voltage is noisy too, so the model driven by it is off by noise that the drive has filtered. The innovations of
-:mod:`fdhil.identification.innovations` undo that filter: they are white, and the sum of their squares is the exponent
-of the likelihood. The filter belongs to the parameters: held fixed, it would take noise of the voltage for the voltage
-and make L too large wherever the demand is smooth. Noise levels are renewed between the Gauss-Newton steps. The
-information matrix is what remains of the steps.
+The voltage is noisy too. The innovations undo the drive's filtering of that noise: they are white, and the sum of their
+squares is the exponent of the likelihood. The filter depends on the parameters: held fixed, it would mistake noise for
+voltage and make L too large wherever the demand is smooth.
 """
-
-from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -37,15 +33,15 @@ from fdhil.records import PARAMETERS, Estimate, Float, Result, Window
 
 __all__ = ["Fit", "descend", "estimate", "fit", "fit_windows", "jacobian", "pose", "typical"]
 NAME = "maximum_likelihood"
-INSTANT_DELAY = 0.5  # of a row
-RESEMBLING = 0.5  # of a delay or a lost voltage that was found may be something else: axes d and q that are not parted
-TURNS = 2  # in which what loops do within rows follows the parameters
+INSTANT_DELAY = 0.5  # of a sample
+RESEMBLING = 0.5  # share of a delay or lost voltage that may be something else: coupled d and q axes
+TURNS = 2  # iterations of parameters and simulated loops
 FLOORS = np.array([1e-4, 1e-4, 1e-9])  # of R, K and Jt
 LEAST_TIME_CONSTANT_S = 1e-4  # of the winding: noise may drive the starting L below 0
 
 
 def starting_point(first: Float | None) -> Float | None:
-    """Return theta (7,) to start from, without delay; None without a first estimate, or when no drive can be so."""
+    """Return theta (7,) to start from, without delay; None where ``first`` is missing or not a possible drive."""
     if first is None or not np.isfinite(first).all() or (first[[R, K, JT]] <= FLOORS).any():
         return None
     theta = np.append(first, 0.0)
@@ -54,10 +50,9 @@ def starting_point(first: Float | None) -> Float | None:
 
 
 def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | None:
-    """Fit windows of one drive together; None when they hold nothing to start from.
+    """Fit windows of one drive together; None without a start.
 
-    A delay between voltage and the other signals is fitted too when the data surely show one, or when the voltage has
-    a clock of its own.
+    A delay of the voltage is fitted too where it is significant, or where the voltage has a clock of its own.
     """
     windows = [mended(w, settings.speed_source) for w in windows]
     slow = [w for w in windows if w.slow_voltage is not None]
@@ -74,14 +69,15 @@ def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | No
     if any(w.voltage_delay_s is not None for w in usable):
         return add_terms(_fit_separate(motions, start, delays), command, finish)
     start[DELAY] = float(np.median(delays))
-    return _with_terms(_fit_together(motions, start), command)
+    # without a delay of whole samples, a shorter one is a candidate like the terms, which it resembles
+    return _with_terms(fit(motions, start, range(6) if start[DELAY] == 0.0 else range(7)), command)
 
 
 def with_loops(base: Fit, window: Window, settings: Identification, axis: Axis, sync_period_s: float | None) -> Fit:
-    """Return the fit of a window with long rows and what the ``axis``' loops do within them.
+    """Return the fit of a window with long samples, refined by simulating the ``axis``' loops within them.
 
-    ``base`` is the window's fit without. It is returned where loops tell nothing of these rows, and where the closed
-    loop explains the measured place no better by the other: then the loops are not these.
+    ``base`` is the fit without. It is returned where the loops do not apply, and where the closed loop explains the
+    measured position no better: then the loops are wrong.
     """
     begun = base.problem.motions[0]
     known = np.isfinite(window.demand_mm).all() and np.isfinite(window.position_mm).all()
@@ -98,26 +94,16 @@ def with_loops(base: Fit, window: Window, settings: Identification, axis: Axis, 
     return result if missed < missed_before else base
 
 
-def _fit_together(motions: Sequence[Motion], start: Float) -> Fit:
-    """Fit windows whose voltage comes with current and speed, by the drive's own clock.
-
-    Where no delay of whole rows shows, a shorter one is a candidate like the terms, which it resembles.
-    """
-    free = range(6) if start[DELAY] == 0.0 else range(7)
-    return fit(motions, start, free)
-
-
 def _with_terms(base: Fit, command: bool) -> Fit:
-    """Return the fit with the terms that join it, and with the delay that the data surely show."""
     return add_terms(with_delay_doubt(base), command, finish, delayed=True)
 
 
 def _fit_separate(motions: Sequence[Motion], start: Float, delays: Sequence[float]) -> Fit:
-    """Fit windows whose voltage comes from a sensor with a clock of its own: each window has its own delay.
+    """Fit windows whose voltage sensor has its own clock: each window has its own delay.
 
-    The delay left after alignment by counters is known to a fraction of a sample only, so it is fitted in every
-    window from its coarse value on (the counters may be a whole sample off), taken out, and what remains is fitted once
-    more with the parameters, whose intervals then contain it.
+    The delay left after alignment by counters is known to a fraction of a sample only. It is fitted in every window
+    from its coarse value (the counters may be a whole sample off) and removed; the rest is fitted once more with the
+    parameters, whose intervals then contain it.
     """
     alone = [_fit_alone(m, np.append(start[:6], delay)) for m, delay in zip(motions, delays, strict=True)]
     if len(motions) == 1:
@@ -128,7 +114,6 @@ def _fit_separate(motions: Sequence[Motion], start: Float, delays: Sequence[floa
 
 
 def _fit_alone(motion: Motion, start: Float) -> Fit:
-    """Fit one window with its delay; beside a slow voltage from the likeliest delay near the one found at first."""
     found = fit([motion], start, range(7))
     if motion.slow is None or not admissible(found.theta):
         return found
@@ -142,15 +127,13 @@ def _fit_alone(motion: Motion, start: Float) -> Fit:
 
 
 def instant_doubt(motion: Motion) -> float:
-    """Return one standard deviation (s) of a delay told by instants of a slow voltage, taken in step with regulators.
-
-    What the regulators do within a row puts an instant off by some of the voltage's rise over the row, always alike.
+    """Return the standard deviation (s) of a delay from instants of a low-rate voltage, due to regulators in step with
+    them.
     """
     return INSTANT_DELAY * motion.dt_s if motion.slow is not None and motion.voltage_sampling == "instant" else 0.0
 
 
 def _fit_slow(windows: Sequence[Window], settings: Identification) -> Fit | None:
-    """Fit windows whose voltage comes more slowly than the drive's rows; the delay is always a parameter."""
     begun = slow_start(windows, settings)
     if begun is None:
         return None
@@ -163,11 +146,11 @@ def _fit_slow(windows: Sequence[Window], settings: Identification) -> Fit | None
 
 
 def doubts(result: Fit, inverse: Float) -> Float:
-    """Return what noise cannot explain: one standard deviation (k, q) of the entries of theta.
+    """Return systematic doubts: one standard deviation (k, q) of the entries of theta.
 
-    An interval mean leaves the voltage's course within the sample open: its largest part, the back-EMF's ramp, is
-    known but for the regulators' answer to it (first column); what looks like a delay is the second. Either is the
-    same in all windows of a drive, so that more windows do not lessen it.
+    An interval mean leaves the voltage's waveform within the sample open: its largest part, the back-EMF's ramp, is
+    known except for the regulators' response (first column); what resembles a delay is the second. Both are common to
+    all windows of a drive, so more windows do not reduce them.
     """
     effects = result.problem.course_effects(result.theta)
     columns = np.zeros((result.theta.size, 1 + effects.shape[1]))
@@ -185,7 +168,6 @@ def doubts(result: Fit, inverse: Float) -> Float:
 
 
 def _resembling_terms(result: Fit) -> Float:
-    """Return (k, q) by how much entries of theta move if a voltage that joined is partly something else."""
     courses, columns = result.problem.motions[0].courses, []
     for k, j in enumerate(result.free):
         if j < FIRST_COURSE or courses[j - FIRST_COURSE].kind != VOLTAGE:
@@ -198,13 +180,11 @@ def _resembling_terms(result: Fit) -> Float:
 
 
 def _resembled_s(result: Fit) -> float:
-    """Return how much of a delay may be something else that resembles it; of one that shows in whole rows, nothing."""
     delay_s, first = abs(float(result.theta[DELAY])), result.problem.motions[0]
     return RESEMBLING * delay_s if first.slow is None and delay_s <= MOST_DELAY * first.dt_s else 0.0
 
 
 def _known_before(result: Fit, inverse: Float) -> Float:
-    """Return (k, q) what one standard deviation of each thing known before the data makes of the entries of theta."""
     asked = np.flatnonzero(result.prior)
     columns = np.zeros((result.theta.size, asked.size))
     columns[list(result.free)] = inverse[:, asked] * (result.prior * result.prior_std)[asked]
@@ -212,9 +192,9 @@ def _known_before(result: Fit, inverse: Float) -> Float:
 
 
 def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
-    """Fit one window, or several of one drive together; a delay is fitted with them when the data surely show one.
+    """Fit one window, or several of one drive together, with a delay where it is significant.
 
-    Where least squares finds nothing that could be a drive, that answer is returned: it says what is wrong.
+    Where least squares finds no possible drive, that estimate is returned: it shows what is wrong.
     """
     result = fit_windows(windows, settings)
     if result is None and any(w.slow_voltage is not None for w in windows):
@@ -225,7 +205,7 @@ def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
 
 
 def robust_inverse(result: Fit, inverse: Float) -> Float:
-    """Return ``inverse`` (k, k), or the covariance that holds where innovations are coloured or of uneven variance."""
+    """Return ``inverse`` (k, k), or the covariance valid for coloured innovations or uneven variance."""
     motions = result.problem.motions
     parts = result.by_window(result.residuals)
     known = [(m.mode != UNKNOWN) & m.observed for m in motions]
@@ -250,19 +230,19 @@ def finish(result: Fit) -> Estimate:
     """Return the fit as an estimate with its covariance."""
     inverse, condition = inverse_of(result.information)
     kept = [k for k, j in enumerate(result.free) if j != DELAY]
-    told = [j for j in result.free if j != DELAY]
+    entries = [j for j in result.free if j != DELAY]
     first = result.problem.motions[0]
-    alias = np.zeros(len(told))
+    alias = np.zeros(len(entries))
     alias[: len(PARAMETERS)] = aliasing(first.voltage_sampling, first.voltage_period_s)
     systematic = doubts(result, inverse)
     held = robust_inverse(result, inverse)
     late = DELAY in result.free
     at = result.free.index(DELAY) if late else 0
     chance, beyond = (part[np.ix_(kept, kept)] for part in (inverse, held - inverse))
-    own = systematic[told]
-    if result.prior.size:  # its share is among the doubts that windows have in common
+    own = systematic[entries]
+    if result.prior.size:  # the prior is among the doubts that windows have in common
         chance = chance - inverse[kept] @ np.diag(result.prior) @ inverse[:, kept]
-    values = result.theta[told]
+    values = result.theta[entries]
     answer = Estimate(
         method=NAME,
         names=PARAMETERS,
@@ -276,12 +256,12 @@ def finish(result: Fit) -> Estimate:
     )
     if first.courses or first.speed_late is not None:
         answer, beyond = told_terms(answer, result, values, beyond)
-    # what the data can tell is the information's to say; that residuals are coloured is no lack of excitation
+    # identifiability follows from the information; coloured residuals are not a lack of excitation
     top_rad_s, top_a = (
         max(float(np.abs(getattr(m, n)).max()) for m in result.problem.motions) for n in ("speed", "current")
     )
     judged = judge(answer, condition, top_rad_s, abs(float(result.theta[K])) * top_a)
-    if judged.names != answer.names:  # nothing is told
+    if judged.names != answer.names:  # all parameters are withheld
         return judged
     assert judged.systematic is not None
     left = np.column_stack([model_doubts(result), _resembling_terms(result)])[: len(PARAMETERS)]

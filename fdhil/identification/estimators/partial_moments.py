@@ -4,11 +4,9 @@
 
     int_0^T s x'(t + s) ds = T x(t + T) - int_0^T x(t + s) ds,
 
-so no derivative and no initial state appears, and the integral itself is the low-pass. The horizon is begun anew at
-every sample (that is the reinitialisation), and least squares is solved over all of them, as in [5] and [6].
+so no derivative and no initial state appears, and the integral itself is the low-pass. The horizon restarts at every
+sample (the reinitialisation), and least squares is solved over all of them, as in [5] and [6].
 """
-
-from __future__ import annotations
 
 from collections.abc import Sequence
 
@@ -39,7 +37,7 @@ def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
 
 
 def horizon_steps(settings: Identification, dt_s: float) -> int:
-    """Return the samples of a horizon: one period of the low-pass's corner, and never too few to integrate over."""
+    """Return the samples of a horizon: one period of the low-pass's corner, at least ``LEAST_STEPS``."""
     return max(LEAST_STEPS, round(1 / settings.lowpass_hz / dt_s))
 
 
@@ -70,7 +68,7 @@ def voltage_weights(steps: int, dt_s: float, sampling: VoltageSampling) -> Float
 
 
 def moments(window: Window, steps: int) -> tuple[Float, Float]:
-    """Return the rows (m, 4) of the moments of [u, i', i, w] and of [i, w', w, sign w]."""
+    """Return the moments (m, 4) of [u, i', i, w] and of [i, w', w, sign w]."""
     assert window.voltage_v is not None
     dt = window.dt_s
     moment, slope = kernels(steps, dt)
@@ -84,8 +82,7 @@ def moments(window: Window, steps: int) -> tuple[Float, Float]:
     rows = np.flatnonzero(usable > steps + 0.5)
 
     def through(values: Float, weights: Float) -> Float:
-        taken: Float = np.correlate(values, weights, "valid")[rows]
-        return taken
+        return np.correlate(values, weights, "valid")[rows]
 
     mean_current, mean_speed = through(current, moment), through(speed, moment)
     electrical = [through(carried(window.voltage_v), over), through(current, slope), mean_current, mean_speed]
