@@ -7,6 +7,7 @@ at once came in time, and if it is late all the same, others before it were lost
 from collections import deque
 
 LATE = 0.6  # of a period
+IN_TIME = 0.45  # of a period, to the next value; with LATE more than 1, by more than two clocks drift apart
 KEPT = 64  # values that came, of which the earliest for its number came in time
 
 
@@ -25,7 +26,7 @@ class ToldCount:
 
     def number(self, t_ns: int) -> int:
         """Return the number of a value that came at ``t_ns``."""
-        if self._last_ns is not None and t_ns - self._last_ns >= (1 - LATE) * self._period_ns:
+        if self._last_ns is not None and t_ns - self._last_ns >= IN_TIME * self._period_ns:
             self._settle(self._last_ns)
         self._number += 1
         self._last_ns = t_ns

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from fdhil.drivers.asking_grid import AskingGrid
@@ -60,6 +60,7 @@ def test_without_sync_the_computers_clock_does() -> None:
 
 
 @settings(max_examples=60, deadline=None)
+@example(drift=159.4e-6, late=[0.0] * 10 + [0.32002289982716375] + [0.0] * 19, lost=set(), held_up=True)
 @given(
     drift=st.floats(-200e-6, 200e-6),
     late=st.lists(st.floats(0, 0.5), min_size=30, max_size=80),
