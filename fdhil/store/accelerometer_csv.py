@@ -44,7 +44,6 @@ def with_accelerometer(recording: Recording, path: Path) -> Recording:
 
 
 def _read(path: Path) -> tuple[Float, Float]:
-    """Return times (n,) in s and accelerations (n, 3) in m/s2."""
     lines = read_csv_text(path).splitlines()
     rows = [line for line in lines if line.strip() and not line.startswith("#")]
     if rows and not rows[0].lstrip("-")[:1].isdigit():
@@ -65,7 +64,6 @@ def _read(path: Path) -> tuple[Float, Float]:
 
 
 def _placed(wanted: Float, told: Float, dt: float) -> tuple[float, float]:
-    """Return how like both are where they are likest, and where ``told`` then begins on the other's time, s."""
     both = [zero_phase(values - values.mean(), CORNER_HZ, dt) for values in (wanted, told)]
     size = quick_size(wanted.size + told.size)
     product = np.fft.irfft(np.fft.rfft(both[0], size) * np.conj(np.fft.rfft(both[1], size)), size)
@@ -79,7 +77,6 @@ def _placed(wanted: Float, told: Float, dt: float) -> tuple[float, float]:
 
 
 def _at(rows_s: Float, time_s: Float, values: Float) -> Float:
-    """Return the mean (n,) about each row, NaN beyond the file's ends and over what was lost."""
     step, row = float(np.median(np.diff(time_s))), rows_s[1] - rows_s[0]
     summed = np.concatenate([[0.0], np.cumsum(np.diff(time_s) * (values[1:] + values[:-1]) / 2)])
     at = (np.interp(rows_s + row / 2, time_s, summed) - np.interp(rows_s - row / 2, time_s, summed)) / row

@@ -52,7 +52,6 @@ def append(folder: Path, entry: Mapping[str, Any], clock: Clock = SYSTEM_CLOCK) 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[int]:
-    """Open the file for one writer at a time; one that root begins belongs to the owner of the folder."""
     flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
     descriptor = os.open(path, flags, 0o640)
     try:
@@ -66,7 +65,6 @@ def _opened(path: Path) -> Iterator[int]:
 
 
 def _lock(descriptor: int) -> None:
-    """Wait for the file's lock, but not for ever. OSError."""
     until_s = time.monotonic() + LOCKED_S
     while True:
         try:
@@ -78,7 +76,6 @@ def _lock(descriptor: int) -> None:
 
 
 def _last_seal(descriptor: int) -> tuple[str, bool]:
-    """Return what the next line is chained to, and whether the file ends with a whole line."""
     size = start = os.fstat(descriptor).st_size
     tail = last = b""
     while start and len(last) == len(tail.removesuffix(b"\n")):  # its beginning is not read yet
@@ -89,7 +86,6 @@ def _last_seal(descriptor: int) -> tuple[str, bool]:
 
 
 def _seal_of(line: bytes) -> str:
-    """Return a line's own seal; of one that has none, its SHA-256, so that the chain goes on and shows the damage."""
     try:
         seal = json.loads(line)["seal"]
     except (ValueError, KeyError, TypeError, RecursionError):

@@ -166,7 +166,6 @@ def mapped(raw: RecordingTable, told: ColumnMap, source: str) -> RecordingTable:
 
 
 def _whole_rows(columns: Mapping[str, Float], source: str) -> dict[str, Float]:
-    """Return the rows in which all but the sensors at the table have a value."""
     _check_lengths(columns, source)
     whole = np.isfinite(np.column_stack([columns[name] for name in columns if not name.startswith("table_")])).all(1)
     if np.count_nonzero(whole) < 2:
@@ -187,7 +186,6 @@ def whole_heading(raw: RecordingTable, name: str, source: str) -> str:
 
 
 def _with_whole_names(raw: RecordingTable, told: ColumnMap, source: str) -> ColumnMap:
-    """Return the map with the whole heading where it has a part of one; RecordingError where several have that part."""
     columns = {
         signal: tuple(c.model_copy(update={"name": whole_heading(raw, c.name, source)}) for c in _as_tuple(of))
         for signal, of in told.columns.items()
@@ -196,7 +194,6 @@ def _with_whole_names(raw: RecordingTable, told: ColumnMap, source: str) -> Colu
 
 
 def _sampled_together(raw: RecordingTable, told: ColumnMap, source: str) -> RecordingTable:
-    """Return those columns of a file that have one time and all that the map names."""
     names = dict.fromkeys(column.name for columns in told.columns.values() for column in _as_tuple(columns))
     tables = [raw, *raw.others]
     having = [table for table in tables if all(name in table.columns or name in table.doubts for name in names)]
@@ -220,7 +217,6 @@ def _sampled_together(raw: RecordingTable, told: ColumnMap, source: str) -> Reco
 
 
 def _signals(raw: RecordingTable, told: ColumnMap, pitch_m: float, source: str) -> tuple[dict[str, Float], list[str]]:
-    """Return the signals that the map gives, and what was done to them."""
     signals: dict[str, Float] = {}
     notes: dict[str, None] = {}  # in order, each once
     _check_places(raw, told, source)
@@ -249,10 +245,6 @@ def _signals(raw: RecordingTable, told: ColumnMap, pitch_m: float, source: str) 
 
 
 def _over_turns(values: Float, column: Column, pitch: float, source: str) -> tuple[Float, bool]:
-    """Return a reading within one turn as one over all turns, and whether it was one; ``pitch`` in the map's unit.
-
-    RecordingError for one that begins again at another length than the pitch.
-    """
     turn = pitch / abs(column.factor or 1.0)
     values, is_turn = unwrap_turns(values, turn)
     jump = None if is_turn else jump_of_reading(values)
@@ -266,7 +258,6 @@ def _over_turns(values: Float, column: Column, pitch: float, source: str) -> tup
 
 
 def _check_places(raw: RecordingTable, told: ColumnMap, source: str) -> None:
-    """Refuse two names of one column: a head that lists its signals one a line."""
     found: dict[int, str] = {}
     for column in (column for columns in told.columns.values() for column in _as_tuple(columns)):
         if column.name.startswith("#") or column.name not in raw.columns:
@@ -280,7 +271,6 @@ def _check_places(raw: RecordingTable, told: ColumnMap, source: str) -> None:
 
 
 def _check_unit(raw: RecordingTable, signal: str, column: Column, source: str) -> None:
-    """Refuse a unit that is not the one that stands above the column, where the map scales nothing itself."""
     known = {**FACTORS[signal], **(PER_REVOLUTION if signal == "speed_rad_per_s" else {})}
     units = [unit for unit in units_of_heading(raw, column.name) if unit in known]
     wrong = units and not any(math.isclose(known[unit], known[column.unit]) for unit in units)
@@ -299,13 +289,11 @@ def units_of_heading(raw: RecordingTable, heading: str) -> list[str]:
 
 
 def _unit(text: str) -> str:
-    """Return a text as a unit of the map, where it is one."""
     unit = text.strip("[]() ").translate(_MICRO)
     return SYNONYMS.get(unit, unit)
 
 
 def _time(raw: RecordingTable, rate_hz: float | None, rows: int, source: str) -> Float:
-    """Return the file's own time, else the rows' numbers by their rate."""
     is_doubtful = "time_s" in raw.doubts
     if ("time_s" in raw.columns and not is_doubtful) or (is_doubtful and rate_hz is None):
         return _column(raw, "time_s", source)
@@ -366,7 +354,6 @@ def _column(raw: RecordingTable, name: str, source: str) -> Float:
 
 
 def _what_it_has(*tables: RecordingTable) -> str:
-    """Return what a map may name; never nothing."""
     every = dict.fromkeys(name for table in tables for name in (*table.columns, *table.doubts))
     names = [shown(name) for name in every if not name.startswith("#")]
     places = [name for name in every if name.startswith("#")]

@@ -143,7 +143,6 @@ def _from_given(raw: RecordingTable, given: Mapping[str, str | Sequence[str]], s
 
 
 def _distinct(raw: RecordingTable) -> dict[str, Float]:
-    """Return the columns by heading, each once: one without a heading by its place."""
     found: dict[int, str] = {}
     for name, values in raw.columns.items():
         known = found.get(id(values))
@@ -155,7 +154,6 @@ def _distinct(raw: RecordingTable) -> dict[str, Float]:
 
 
 def _named(heading: str, raw: RecordingTable) -> str | None:
-    """Return the signal that a heading or its unit names."""
     text = heading.strip().lower()
     if any("%" in unit for unit in units_of_heading(raw, heading)):
         return None
@@ -171,7 +169,6 @@ def _unit(heading: str, raw: RecordingTable, signal: str) -> str | None:
 
 
 def _time(columns: Mapping[str, Float]) -> tuple[str, str] | None:
-    """Return the column that rises evenly, if there is one."""
     for heading, values in columns.items():
         steps = np.diff(values)
         if steps.size and np.isfinite(steps).all() and (steps > 0).all() and np.ptp(steps) < 0.1 * np.median(steps):
@@ -182,7 +179,6 @@ def _time(columns: Mapping[str, Float]) -> tuple[str, str] | None:
 def _by_physics(
     columns: Mapping[str, Float], found: dict[str, tuple[str, str]], by_name: Mapping[str, Sequence[str]]
 ) -> None:
-    """Enter the columns for voltage, current and speed that obey the equations best, where headings leave them open."""
     wanted = ("voltage_V", "current_A", "speed_rad_per_s")
     if all(signal in found for signal in wanted):
         return
@@ -201,7 +197,6 @@ def _by_physics(
 
 
 def _is_of_another_unit(heading: str, signal: str) -> bool:
-    """Return whether a heading ends in a unit in brackets that is none of the signal's."""
     found = re.search(r"[\[(]([^\[\]():,]*[^\[\]():,\d\s][^\[\]():,]*)[\])]$", heading.strip())
     return found is not None and found[1] not in FACTORS[signal]
 
@@ -217,7 +212,6 @@ def obeys(voltage: Float, current: Float, speed: Float) -> float:
 
 
 def _sampling(columns: Mapping[str, Float], found: Mapping[str, tuple[str, str]]) -> str:
-    """Return whether the voltage explains the current better as the mean over each sample or as its value there."""
     if not found.keys() >= {"current_A", "speed_rad_per_s"}:
         return "instant"
     u, i, w = (columns[found[s][0]][:KEPT_ROWS] for s in ("voltage_V", "current_A", "speed_rad_per_s"))
@@ -226,7 +220,6 @@ def _sampling(columns: Mapping[str, Float], found: Mapping[str, tuple[str, str]]
 
 
 def _share(values: Float, regressors: Sequence[Float]) -> tuple[float, Float] | None:
-    """Return the explained share of the variance and the coefficients, of regressors of unit size."""
     table = np.column_stack([*regressors, np.ones(values.size)])
     size = np.abs(table).max(axis=0)
     variance = float(np.var(values))
@@ -237,7 +230,6 @@ def _share(values: Float, regressors: Sequence[Float]) -> tuple[float, Float] | 
 
 
 def _with_unit(signal: str, heading: str, why: str, columns: Mapping[str, Float], raw: RecordingTable) -> Proposed:
-    """Return the column with its unit: the heading's, else the likeliest by size."""
     if (unit := _unit(heading, raw, signal)) is not None:
         return Proposed(signal, heading, unit, why)
     values = columns[heading]

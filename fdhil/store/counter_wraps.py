@@ -53,7 +53,6 @@ def jump_of_reading(values: Float) -> float | None:
 
 
 def _without_jumps(counts: Float, period: float, resolution: float) -> Float | None:
-    """Return the counts without jumps of a period; None where none, or something else, explains them."""
     jumps = np.abs(np.diff(counts))
     low = -period / 2 if counts.min() < 0 else 0.0
     if counts.min() < low or counts.max() >= low + period or jumps.max() <= period / 2:
@@ -73,7 +72,6 @@ def _placed(values: Float, known: Int, whole: Float) -> Float:
 
 
 def _scale(values: Float) -> float | None:
-    """Return the power of ten that makes whole numbers of all values; None without one."""
     if not (np.abs(values) < MOST_COUNTS).all():
         return None
     for decimals in range(MOST_DECIMALS + 1):
@@ -84,7 +82,6 @@ def _scale(values: Float) -> float | None:
 
 
 def _nearby(steps: Float, reach: int = 3) -> Float:
-    """Return the greatest of the steps (n,) about each one."""
     padded = np.pad(steps, reach)
     greatest: Float = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1).max(axis=1)
     return greatest

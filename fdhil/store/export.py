@@ -60,7 +60,6 @@ def _number(value: float | None) -> str | None:
 
 
 def _samples(slow: SlowVoltage) -> dict[str, str]:
-    """Return the headers that hold a slow sensor's samples; times are those of the rows, the first at 0 s."""
     late = {} if slow.late_s is None else {"voltage_late_s": " ".join(map(repr, slow.late_s.tolist()))}
     return late | {
         "voltage_begin_s": repr(slow.begin_s),
@@ -71,7 +70,6 @@ def _samples(slow: SlowVoltage) -> dict[str, str]:
 
 
 def _held(window: Window, slow: SlowVoltage) -> Float:
-    """Return the sample (n,) under way at each row, the nearest known one where there is none."""
     known = np.flatnonzero(np.isfinite(slow.voltage_v))
     if known.size == 0:
         raise RecordingError("every voltage sample of this window is lost; see why the sensor gave none")

@@ -127,17 +127,11 @@ class History:
     def _read(
         self, table: str, only: Mapping[str, Any], limit: int | None = None, *, oldest: bool = False
     ) -> list[Any]:
-        """Return what the newest rows (or the ``oldest``) hold, oldest first; damaged ones are noted and left out.
-
-        ``only`` is compared after a row was checked, so that damage of the very value compared is seen too; of the rows
-        before the newest ``CHECKED`` the database hands over those alone that say to be such ones.
-        """
         rows = self._rows(table, only, oldest=oldest)
         found = list(islice((it for row in rows if (it := self._believed(table, row, only)) is not None), limit))
         return found if oldest else found[::-1]
 
     def _rows(self, table: str, only: Mapping[str, Any], *, oldest: bool = False) -> Iterator[dict[str, Any]]:
-        """Yield rows as they are, one at a time: the newest ``CHECKED``, and of those before them that match."""
         newest = f"id > (SELECT max(id) - {CHECKED} FROM {table})"
         match = " AND ".join(f"{name} = :{name}" for name in only) or "1"
         query = f"SELECT * FROM {table} WHERE {newest} OR ({match}) ORDER BY id{'' if oldest else ' DESC'}"
@@ -146,7 +140,6 @@ class History:
             yield from map(dict, cursor.execute(query, only))
 
     def _believed(self, table: str, row: dict[str, Any], only: Mapping[str, Any] = MappingProxyType({})) -> Any | None:
-        """Return what a sound row holds, if it is one of ``only``; a damaged one is noted."""
         try:
             if self.version < schema.WITH_DIGESTS or row.get("digest") == schema.digest_of(table, row):
                 return DECODED[table](row) if all(row[name] == value for name, value in only.items()) else None
@@ -363,7 +356,6 @@ def _dumped(reasons: Sequence[Reason]) -> str:
 
 
 def _told(outcome: WindowOutcome) -> str | None:
-    """Return what an accepted window tells a pool, as its row has it."""
     if not outcome.verdict.accepted or outcome.estimate is None:
         return None
     told = member(outcome.window, outcome.estimate)

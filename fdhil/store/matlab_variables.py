@@ -61,7 +61,6 @@ def texts(headers: Any) -> dict[str, str]:
 
 
 def _leaves(name: str, alias: str, value: Any, depth: int) -> Iterator[tuple[str, str, Float | str]]:
-    """Yield name, short name, and the vector or why there is none."""
     if depth > MOST_DEPTH:
         return
     if isinstance(value, Mapping):
@@ -79,7 +78,6 @@ def _leaves(name: str, alias: str, value: Any, depth: int) -> Iterator[tuple[str
 
 
 def _vectors(name: str, alias: str, values: np.ndarray[Any, Any]) -> Iterator[tuple[str, str, Float | str]]:
-    """Yield a vector, or the longer ones of a matrix; a scope has those of a signal that is a vector in the third."""
     values = values.squeeze() if values.ndim > 2 else values
     if values.size == max(values.shape, default=1):
         if values.size > 1:

@@ -30,7 +30,6 @@ def newest_sets(history: History, axes: Iterable[str]) -> dict[str, Revision]:
 
 
 def _with_newest_loops(revision: Revision, history: History) -> Revision:
-    """Return a set with loops that were identified after it, or whose use was not recorded with it."""
     loops = history.loops(revision.set.axis, limit=1)
     if not loops or not loops[0][1].verdict.accepted:
         return revision

@@ -133,7 +133,6 @@ class Outbox:
         return self._settings.windows == "all" or (self._settings.windows == "refused" and not window["accepted"])
 
     def _prune(self, db: sqlite3.Connection, newest: int) -> None:
-        """Let go what was sent, and the oldest of too many; the last entry that was sent stays, to be known again."""
         sent = _sent_before(db, read_position(self._folder))
         (oldest,) = db.execute("SELECT min(id) FROM outbox").fetchone()
         until = min(max(sent, newest - self._settings.keep_unsent + 1), oldest + PRUNE_AT_MOST)
@@ -143,7 +142,6 @@ class Outbox:
 
 
 def _sent_before(db: sqlite3.Connection, position: Position) -> int:
-    """Return the entry before which all were sent, 0 where the position is of another file or of an older copy."""
     query = "SELECT 1 FROM outbox, outbox_of WHERE id = ? AND message = ? AND store = ?"
     known = db.execute(query, (position.entry, position.message, position.store)).fetchone()
     return position.entry if known else 0

@@ -68,14 +68,12 @@ def open_output(path: Path) -> Iterator[IO[bytes]]:
 
 
 def _is_stream(told: os.stat_result) -> bool:
-    """Whether this is the null device, or what the process writes its answers to."""
     if stat.S_ISCHR(told.st_mode) and told.st_rdev == Path(os.devnull).stat().st_rdev:
         return True
     return _descriptor(told) is not None
 
 
 def _descriptor(told: os.stat_result) -> int | None:
-    """Return standard output or standard error where ``told`` is of that very file, pipe or terminal."""
     for descriptor in (1, 2):
         with contextlib.suppress(OSError):
             if os.path.samestat(told, os.fstat(descriptor)):
@@ -84,7 +82,6 @@ def _descriptor(told: os.stat_result) -> int | None:
 
 
 def _open_stream(path: Path) -> IO[bytes]:
-    """Open the null device, or a standard stream where it stands: opened anew, a file behind it would be emptied."""
     descriptor = _descriptor(path.stat())
     if descriptor is None:
         return path.open("wb")

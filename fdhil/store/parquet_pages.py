@@ -28,13 +28,10 @@ def uncompressed_bytes(content: bytes, start: int, size: int) -> int:
 
 
 class _Reader:
-    """A place in bytes of the Thrift compact protocol; ValueError at what is none."""
-
     def __init__(self, content: bytes, at: int) -> None:
         self._content, self.at = content, at
 
     def struct(self, depth: int = 0) -> dict[int, int]:
-        """Pass over a struct and return its integers by their field."""
         if depth > _DEEPEST:
             raise ValueError("a page header is nested too deep")
         found: dict[int, int] = {}

@@ -139,7 +139,6 @@ _PROCESSES: dict[int, ReadingProcess] = {}  # by who asks: a process that was fo
 
 
 def _process(source: str) -> ReadingProcess:
-    """Return the process that reads for this one; it is begun with the first file and ends with this one."""
     process = _PROCESSES.get(os.getpid())
     if process is None or process.child.poll() is not None:
         _end()
@@ -180,7 +179,6 @@ def main() -> None:
 
 
 def _read_and_end(reader: Any, descriptor: int) -> None:
-    """Read one file in the fork, within the limits for its size."""
     code = 1
     try:
         asked = Connection(descriptor)

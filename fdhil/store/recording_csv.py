@@ -44,7 +44,6 @@ def parse_table(text: str, source: str) -> RecordingTable:
 
 
 def _headers(lines: list[str], width: int, source: str) -> dict[str, str]:
-    """Return the headers, without the empty cells that a spreadsheet writes behind each."""
     empty = "," * (width - 1)
     if all(line.endswith(empty) for line in lines):
         lines = [line.removesuffix(empty) for line in lines]
@@ -68,7 +67,6 @@ def encode(table: RecordingTable) -> bytes:
 
 
 def _numbers(lines: list[str], first_row: int, names: list[str], source: str) -> Float:
-    """Return the rows (n, k): all finite but what the table tells."""
     rows = [line for line in lines[first_row:] if line.strip()]
     if len(rows) < MIN_ROWS:
         raise RecordingError(f"{source} is truncated: {len(rows)} rows are no recording; record it again")
@@ -82,7 +80,6 @@ def _numbers(lines: list[str], first_row: int, names: list[str], source: str) ->
 
 
 def _bad_row(lines: list[str], first_row: int, names: list[str], source: str) -> RecordingError:
-    """Return the error that names the first row at fault."""
     width = len(names)
     last = max(k for k, line in enumerate(lines) if line.strip())
     for k, line in enumerate(lines[first_row:], start=first_row):

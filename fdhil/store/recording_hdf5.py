@@ -50,7 +50,6 @@ def read(content: bytes, source: str) -> RecordingTable:
 
 
 def _units(stored: Any) -> list[str]:
-    """Return the unit that a dataset's attributes say, whatever the case of their names."""
     return [_text(value) for key, value in stored.attrs.items() if key.lower() in UNIT_KEYS]
 
 
@@ -68,7 +67,6 @@ def read_matlab(content: bytes, source: str) -> RecordingTable:
 
 
 def _variable(file: Any, item: Any, h5py: Any, sizes: list[int], source: str, depth: int = 0) -> Any:
-    """Return a variable as MATLAB has it; ``sizes`` of what was read so far keep all of it within a recording's."""
     kind = _text(item.attrs.get("MATLAB_class", b""))
     if depth > MOST_DEPTH or len(sizes) > MOST_DATASETS:
         return None
@@ -89,17 +87,12 @@ def _variable(file: Any, item: Any, h5py: Any, sizes: list[int], source: str, de
 
 
 def _listed(fields: dict[str, Any]) -> Any:
-    """Return a structure; of an array of them, each field of which is a tuple, the list."""
     if not fields or not all(isinstance(part, tuple) for part in fields.values()):
         return fields
     return [dict(zip(fields, parts, strict=True)) for parts in zip(*fields.values(), strict=True)]
 
 
 def _vectors(file: Any, h5py: Any) -> dict[str, tuple[Any, Any]]:
-    """Return the dataset and the part of it of each vector of real numbers, by path, not of links out of the file.
-
-    A column of a matrix is ``path[:,0]`` or ``path[0,:]``, a field of a table ``path/field``.
-    """
     found: dict[str, Any] = {}
 
     def look(name: str, item: Any) -> None:

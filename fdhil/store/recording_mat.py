@@ -55,7 +55,6 @@ def read(content: bytes, source: str) -> RecordingTable:
 
 
 def _plain(value: Any, depth: int = 0) -> Any:
-    """Return scipy's value with structures as mappings, arrays of structures and cells as lists, and texts as such."""
     kind = getattr(getattr(value, "dtype", None), "kind", "")
     if kind == "V" and value.dtype.names and depth < MOST_DEPTH:
         parts = [{name: _plain(part[name], depth + 1) for name in value.dtype.names} for part in value.ravel()]

@@ -77,10 +77,6 @@ def read(content: bytes, source: str) -> RecordingTable:
 
 
 def _groups(file: Any, rows: list[int]) -> list[tuple[dict[str, Float], dict[str, str]]]:
-    """Return the channels of the groups that were sampled at the same times, ``time_s`` among them, and their doubts.
-
-    What a file marks as invalid is ``nan``.
-    """
     groups: list[tuple[dict[str, Float], dict[str, str]]] = []
     for k, group in enumerate(file.groups):
         if not rows[k]:
@@ -108,7 +104,6 @@ def _groups(file: Any, rows: list[int]) -> list[tuple[dict[str, Float], dict[str
 
 
 def _headers(comment: str) -> dict[str, str]:
-    """Return the headers in a file's comment; none where another program wrote it."""
     found = _COMMENT.search(comment)
     try:
         told = json.loads(html.unescape(found[1]) if found else comment)

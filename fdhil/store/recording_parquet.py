@@ -53,7 +53,6 @@ def _units(field: pa.Field) -> list[str]:
 
 
 def _kinds(fields: Iterable[pa.Field], above: str = "") -> Iterator[tuple[str, pa.DataType]]:
-    """Yield name and type of each column, of a field of a structure as ``structure.field``."""
     for field in fields:
         if pa.types.is_struct(field.type):
             yield from _kinds(field.type, f"{above}{field.name}.")
@@ -62,7 +61,6 @@ def _kinds(fields: Iterable[pa.Field], above: str = "") -> Iterator[tuple[str, p
 
 
 def _columns(read: pa.Table) -> tuple[dict[str, Float], frozenset[str], dict[str, str]]:
-    """Return the columns of numbers and times, which of them are times in s, and why a name stands for none."""
     while any(pa.types.is_struct(field.type) for field in read.schema):
         read = read.flatten()
     columns: dict[str, Float] = {}
@@ -85,7 +83,6 @@ def _is_number(kind: pa.DataType) -> bool:
 
 
 def _seconds(times: pa.ChunkedArray) -> Float:
-    """Return times, durations or times of day in s from the first on; a lost one is ``nan``."""
     kind = times.type
     if pa.types.is_date(kind):
         return np.asarray(times.cast(pa.timestamp("s")).cast(pa.int64()).cast(pa.float64()).to_numpy())

@@ -127,10 +127,6 @@ def recording_of(table: RecordingTable, source: str = "recording") -> Recording:
 
 
 def _travel(speed_rad_s: Float, dt_s: float, source: str | None) -> Float:
-    """Return the angle (n,) that a speed turns, which stands in for a position that was not recorded; lost rows NaN.
-
-    A speed that is a difference of positions is the mean over the row before.
-    """
     known = np.isfinite(speed_rad_s)
     speed = np.interp(np.arange(known.size), np.flatnonzero(known), speed_rad_s[known])
     means = speed[1:] if source == "difference" else (speed[1:] + speed[:-1]) / 2
@@ -139,7 +135,6 @@ def _travel(speed_rad_s: Float, dt_s: float, source: str | None) -> Float:
 
 
 def _as_lengths(table: RecordingTable, source: str) -> tuple[RecordingTable, tuple[float, float]]:
-    """Return a table of a rotary axis with lengths of arc in place of its angles, and which pitches it may have."""
     headers, columns = dict(table.headers), dict(table.columns)
     if PITCH_OF_ROTARY not in headers:
         return table, PITCH_M
@@ -203,7 +198,6 @@ def check_headers(headers: Mapping[str, str], columns: Mapping[str, object], sou
 
 
 def _rows(table: RecordingTable, names: list[str], source: str) -> Float:
-    """Return the columns side by side (n, k): all finite but what the table tells."""
     sizes = {name: table.columns[name].size for name in names}
     if len(set(sizes.values())) > 1:
         raise unlike_lengths(sizes, source)
@@ -228,11 +222,6 @@ def _told(name: str, names: list[str], columns: Float) -> Float | None:
 
 
 def _slow_voltage(headers: dict[str, str], start_s: float, dt_s: float, source: str) -> SlowVoltage | None:
-    """Return the samples of a voltage sensor that is slower than the rows, where the headers hold them.
-
-    Sample j begins ``voltage_begin_s`` + j ``voltage_period_s`` on the time axis of the rows, whose first is at
-    ``start_s`` and which are ``dt_s`` apart; a lost one is ``nan`` among ``voltage_samples_V``.
-    """
     if "voltage_samples_V" not in headers:
         return None
     period, begin = _positive(headers, "voltage_period_s", source), _optional(headers, "voltage_begin_s", source)
@@ -256,7 +245,6 @@ def _slow_voltage(headers: dict[str, str], start_s: float, dt_s: float, source: 
 
 
 def _late(headers: dict[str, str], samples: int, period: float, source: str) -> Float | None:
-    """Return by how much later than its place each sample of a slow sensor was true, where the headers hold it."""
     if "voltage_late_s" not in headers:
         return None
     try:
@@ -271,7 +259,6 @@ def _late(headers: dict[str, str], samples: int, period: float, source: str) -> 
 def _place(
     time_s: Float, dt: float, source: str
 ) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], tuple[tuple[int, int], ...]]:
-    """Return the grid row (n,) of each sample and the half-open gaps between them."""
     steps = np.diff(time_s)
     if (steps <= 0).any():
         k = int(np.argmax(steps <= 0))
@@ -308,7 +295,6 @@ def _sampling(headers: dict[str, str], source: str) -> VoltageSampling:
 
 
 def _check_sources(headers: dict[str, str], source: str) -> None:
-    """Refuse a word for where speed or voltage come from that is none."""
     for key, words in SOURCES.items():
         if key in headers and headers[key] not in words:
             raise RecordingError(f"{source} has {key} {shown(headers[key])}: it must be {' or '.join(words)}")
@@ -327,7 +313,6 @@ def _positive(headers: dict[str, str], key: str, source: str) -> float:
 
 
 def _within(headers: dict[str, str], key: str, bounds: tuple[float, float], source: str) -> float:
-    """Return a header's number; RecordingError beyond what machines have, with the unit that was likely meant."""
     value, (low, high) = _positive(headers, key, source), bounds
     if low <= value <= high:
         return value

@@ -23,7 +23,6 @@ def even_times(time_s: Float, rate_hz: float | None, source: str) -> tuple[Float
 
 
 def _without_jitter(time_s: Float, rate_hz: float | None, source: str) -> tuple[Float, str]:
-    """Return the grid of the rate, where many steps are neither as long as most nor a multiple, as time stamps are."""
     steps = np.diff(time_s)
     usual = float(np.median(steps)) if rate_hz is None else 1 / rate_hz
     if steps.size < FEW or not usual > 0 or (steps <= 0).any():
@@ -49,7 +48,6 @@ def _without_jitter(time_s: Float, rate_hz: float | None, source: str) -> tuple[
 
 
 def _unrounded(time_s: Float, rate_hz: float | None, source: str) -> tuple[Float, str]:
-    """Return the times, or the even grid that they were rounded from, and what was done."""
     steps = np.diff(time_s)
     rounding_s = _rounding(steps)
     if steps.size < FEW or rounding_s is None or (steps < 0).any():
@@ -87,7 +85,6 @@ def usual_step(time_s: Float) -> float:
 
 
 def _with_gaps(time_s: Float, steps: Float, rounding_s: float, rate_hz: float | None) -> tuple[Float, str]:
-    """Return the even grid with rows left out where whole samples are lost; the times where they are on none."""
     near = steps[steps < 1.5 * np.median(steps)]
     if not near.size or rounding_s > near.mean() / 2:
         return time_s, ""
@@ -101,7 +98,6 @@ def _note(period_s: float, rounding_s: float) -> str:
 
 
 def _rounding(steps: Float) -> float | None:
-    """Return the least difference between two steps that differ, where all steps are multiples of it."""
     distinct = np.unique(np.round(steps, 9))
     least = float(np.diff(distinct).min()) if distinct.size > 1 else 0.0
     if least < 2e-9 or np.abs(distinct / least - np.rint(distinct / least)).max() > MULTIPLE:
@@ -110,13 +106,11 @@ def _rounding(steps: Float) -> float | None:
 
 
 def _are_multiples(steps: Float, usual: float) -> bool:
-    """Whether each step is as long as two usual ones or more, which is what lost samples leave."""
     counts = np.rint(steps / usual)
     return bool(((counts >= 2) & (np.abs(steps - counts * usual) <= STEP_TOLERANCE * steps)).all())
 
 
 def _grid(time_s: Float, rows: Int, rounding_s: float, rate_hz: float | None) -> Float | None:
-    """Return the even times at ``rows`` that these are within one rounding of; None where there are none."""
     middle, about = rows - rows.mean(), time_s - time_s.mean()
     period_s = float(middle @ about / (middle @ middle)) if rate_hz is None else 1 / rate_hz
     if np.ptp(about - period_s * middle) > FIT * rounding_s:

@@ -99,7 +99,6 @@ def told(path: Path) -> Iterator[None]:
 
 
 def _unusable(path: Path, name: str, error: sqlite3.Error) -> StoreError:
-    """Say why the file cannot be used now; nothing is wrong with what is in it."""
     code = next((code for prefix, code in _CODES.items() if name.startswith(prefix)), "StoreFault")
     if name.startswith("SQLITE_IOERR") and is_full(path):  # SQLite calls it by its name when it grows a table alone
         code = "DiskFull"
@@ -208,7 +207,6 @@ def bring_up(db: sqlite3.Connection, path: Path) -> None:
 
 @contextmanager
 def _all_or_nothing(db: sqlite3.Connection) -> Iterator[None]:
-    """Make one transaction of what is done within; whatever ends it early leaves none open."""
     db.execute("BEGIN IMMEDIATE")
     try:
         yield
@@ -237,7 +235,6 @@ def _rows_of(db: sqlite3.Connection, table: str) -> Iterator[dict[str, Any]]:
 
 
 def _sound_rows(db: sqlite3.Connection) -> set[tuple[str, int]]:
-    """Return table and number of the rows that are what was written."""
     return {
         (table, row["id"])
         for table in _WITH_DIGESTS
@@ -247,7 +244,6 @@ def _sound_rows(db: sqlite3.Connection) -> set[tuple[str, int]]:
 
 
 def _sign(db: sqlite3.Connection, sound: set[tuple[str, int]] | None) -> None:
-    """Give rows of an older schema the digest of what can be read of them now; all, or those that were ``sound``."""
     for table in _WITH_DIGESTS:
         rows = [row for row in _rows_of(db, table) if sound is None or (table, row["id"]) in sound]
         signed = [(digest_of(table, row), row["id"]) for row in rows]
@@ -281,7 +277,6 @@ def insert(db: sqlite3.Connection, table: str, row: Mapping[str, Any], also: Als
 
 
 def _storable(value: Any) -> Any:
-    """Return a value as SQLite takes it: what is no Unicode in a text, as in a file's Latin-1 name, is escaped."""
     return value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
 
 

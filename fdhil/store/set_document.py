@@ -23,7 +23,6 @@ def terms_status(published: ParameterSet) -> Mapping[str, Mapping[str, Any]]:
 
 
 def _deviations(published: ParameterSet) -> list[float]:
-    """Return the standard deviations of the six parameters and the terms, NaN where none is known."""
     variances = np.diag(published.covariance)
     known = np.sqrt(np.where(variances >= 0, variances, np.nan)).tolist()
     return [*known, *[math.nan] * (len(PARAMETERS) + len(published.parameters.terms) - len(known))]

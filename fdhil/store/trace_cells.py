@@ -96,7 +96,6 @@ def parse_column(cells: Sequence[str], decimal: str) -> CellColumn:
 
 
 def _quick(cells: Sequence[str], decimal: str) -> Float:
-    """Return numbers without thousands' separators; ValueError where a cell is none."""
     other = "," if decimal == "." else "."
     if any(other in cell or "_" in cell for cell in cells):
         raise ValueError
@@ -115,7 +114,6 @@ def _number(text: str, decimal: str) -> float | None:
 
 
 def _clock(text: str) -> tuple[str, float] | None:
-    """Return the date (with its zone) and the seconds of a time of day; None of any other text."""
     found = _CLOCK.fullmatch(text) or _STOPWATCH.fullmatch(text)
     if found is None:
         return None
@@ -128,7 +126,6 @@ def _clock(text: str) -> tuple[str, float] | None:
 
 
 def _clock_column(texts: Sequence[str]) -> CellColumn:
-    """Return seconds; midnight is where the time falls by half a day or more, and there alone may the date change."""
     values, before, dated = np.full(len(texts), np.nan), math.nan, ""
     for k, text in enumerate(texts):
         read = _clock(text)

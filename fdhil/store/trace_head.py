@@ -45,7 +45,6 @@ def read_head(lines: Sequence[Sequence[Row]], layout: Layout) -> Head:
 
 
 def _fits(row: Row, layout: Layout) -> bool:
-    """Whether a line has as many names as a row has cells, or has numbers."""
     filled = max((j + 1 for j, cell in enumerate(row.cells) if cell.strip()), default=0)
     if len(row.cells) == layout.width or filled == layout.filled:
         return True

@@ -124,20 +124,17 @@ def find_body(rows: Sequence[Row], source: str, is_complete: bool) -> Body | Non
 
 
 def _interruption(body: Sequence[Row]) -> str:
-    """Return where something else stands between rows; an empty line after each of them is nothing."""
     steps = [below.line - above.line for above, below in pairwise(body)]
     k = next((k for k, step in enumerate(steps) if step != min(steps)), None)
     return "" if k is None else f"line {body[k].line + 1} between the rows is no row"
 
 
 def _spare(head: Sequence[Row], layout: Layout) -> list[int]:
-    """Return the empty columns after the last number that have no name: a number there was moved out of its column."""
     after = [j for j in layout.empty if j >= layout.filled]
     return [j for j in after if not any(len(row.cells) > j and plain(row.cells[j]) for row in head)]
 
 
 def _is_cut_off(rows: Sequence[Row], layout: Layout) -> bool:
-    """Whether the last row lacks cells, or has in its last one another number of digits than all rows before it."""
     if len(rows[-1].cells) < layout.width:
         return True
     last = [row.cells[-1].strip() for row in rows[-SAMPLE_ROWS:] if layout.is_row(row)]
@@ -150,10 +147,6 @@ def _last(rows: Sequence[Row], is_one: Callable[[Row], bool]) -> int:
 
 
 def _as_wide(row: Row, layout: Layout, is_before_full: bool, source: str) -> list[str] | None:
-    """Return as many cells as the other rows have; None of a record that is no row.
-
-    RecordingError where some are missing and full rows follow, or where there are more than the others have.
-    """
     missing = layout.width - len(row.cells)
     if layout.is_row(row) or (not missing and not any(cell.strip() for cell in row.cells)):
         return row.cells
@@ -187,7 +180,6 @@ def _uneven(row: Row, layout: Layout, source: str) -> RecordingError:
 
 
 def _layout(rows: Sequence[Row]) -> Layout | None:
-    """Return the layout that most records of two numbers or more have."""
     rows = rows[:: max(1, len(rows) // SAMPLE_ROWS)]
     sample = [[is_number(cell) for cell in row.cells] for row in rows]
     numeric = [flags for flags in sample if sum(flags) > 1]
@@ -203,10 +195,6 @@ def _layout(rows: Sequence[Row]) -> Layout | None:
 
 
 def _first_row(rows: Sequence[Row], layout: Layout) -> int | None:
-    """Return where the rows of numbers begin: several in succession.
-
-    Labels may stand beside the first of them; a head whose lines have numbers beside labels goes on with other lines.
-    """
     for k in range(min(len(rows) - SAME_WIDTH + 1, HEAD_LINES)):
         if layout.begins_rows(rows[k : k + SAME_WIDTH]):
             after = next((row for row in rows[k:] if not layout.is_row(row) or not layout.has_label(row)), None)
@@ -216,7 +204,6 @@ def _first_row(rows: Sequence[Row], layout: Layout) -> int | None:
 
 
 def _with_doubtful(rows: Sequence[Row], first: int, layout: Layout) -> int:
-    """Return where the rows begin that have a text among their numbers, which is doubted where it is used."""
     while first and layout.is_doubtful(rows[first - 1]):
         first -= 1
     return first

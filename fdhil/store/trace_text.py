@@ -93,7 +93,6 @@ def _text(content: bytes, told: TraceText, source: str) -> str:
 
 
 def _without_outer_quotes(lines: list[str]) -> list[str]:
-    """Return the lines of a file whose rows a spreadsheet took for one cell each, as they were before."""
     quoted = [_WHOLE_LINE.fullmatch(line) for line in lines]
     if 2 * sum(match is not None for match in quoted) <= len(lines):
         return lines
@@ -103,7 +102,6 @@ def _without_outer_quotes(lines: list[str]) -> list[str]:
 
 
 def _separator(lines: Sequence[str]) -> str:
-    """Return what takes most lines apart into numbers and nothing else."""
     some = [line for line in lines if any(map(str.isdigit, line))]
     sample = some[:: max(1, len(some) // SAMPLE_ROWS)]
 
@@ -119,7 +117,6 @@ def _separator(lines: Sequence[str]) -> str:
 
 
 def _split(lines: Iterable[str], separator: str, quoting: int = csv.QUOTE_MINIMAL) -> Iterator[tuple[int, list[str]]]:
-    """Yield the cells of each record, and the number of its last line."""
     is_blank = separator == " "
     if is_blank:
         lines = (re.sub(r"[ \t]+", " ", line.strip()) for line in lines)
@@ -150,7 +147,6 @@ def _no_rows(lines: Sequence[str], separator: str, source: str) -> RecordingErro
 
 
 def _decimal(body: Body, separator: str, source: str) -> str:
-    """Return the decimal mark, by the first number that only one of them can have written."""
     marked = ""
     padded = ""
     for row in body.rows:
@@ -177,7 +173,6 @@ def _decimal(body: Body, separator: str, source: str) -> str:
 
 
 def _head_lines(lines: Sequence[str], body: Body, separator: str) -> list[list[Row]]:
-    """Return the lines above the rows in the ways in which they may be taken apart."""
     head: list[list[Row]] = []
     for row in body.head:
         cells = row.cells
@@ -217,7 +212,6 @@ def _table(body: Body, head: Head, decimal: str) -> RecordingTable:
 
 
 def _uneven_times(name: str, places: Sequence[str], columns: Mapping[str, Float]) -> dict[str, str]:
-    """Return the doubt about columns of one name that are all times and differ: each channel has times of its own."""
     every = [columns[place][np.isfinite(columns[place])] for place in places]
     is_time = all(
         values.size > 2 and np.diff(values).min() > 0 and np.ptp(np.diff(values)) < 0.01 * np.diff(values).mean()

@@ -76,7 +76,6 @@ class RawScale:
 
 
 def _bits(values: Float) -> Bits:
-    """Return the bit patterns; all NaN are one, since a lost sample has no payload."""
     return np.where(np.isnan(values), np.nan, values).view(np.int64)
 
 
@@ -122,10 +121,6 @@ def _column(values: Float, candidates: Sequence[RawScale]) -> tuple[RawScale | N
 
 
 def _head(window: Window) -> dict[str, Any]:
-    """The fields of a window that are no arrays, as JSON keeps them exactly.
-
-    A slow sensor's samples are a column that ends earlier than the others; its grid is kept here.
-    """
     plain = {field.name: getattr(window, field.name) for field in fields(Window) if field.name not in COLUMNS}
     slow = plain.pop("slow_voltage")
     if plain["torque_constant_nm_per_a"] is None:  # as in windows of before there was one: their digest stays
@@ -144,7 +139,6 @@ def _head(window: Window) -> dict[str, Any]:
 
 
 def _digest(window: Window) -> str:
-    """SHA-256 of a window's meaning: no bit of it can change unseen."""
     digest = hashlib.sha256(json.dumps(_head(window), sort_keys=True).encode())
     for name in COLUMNS:
         values = getattr(window, name)
@@ -193,7 +187,6 @@ def _decode(content: bytes) -> tuple[Window, str]:
 
 
 def _check_declared(file: pq.ParquetFile, content: bytes) -> None:
-    """Refuse, before any of it is read, what would take more than a window does; ValueError says what."""
     told = file.metadata
     if told.num_rows > MAX_ROWS:
         raise ValueError(f"it declares {told.num_rows} rows, {MAX_ROWS} are allowed")

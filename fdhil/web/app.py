@@ -100,11 +100,6 @@ def _serve_shell(app: FastAPI, document: str, paths: Iterable[str]) -> None:
 
 
 def _answer_faults(app: FastAPI) -> None:
-    """Answer every fault with one kind of document, and never with a traceback.
-
-    All are coroutines, as in ``fdhil.web.context``: a disarm that is refused waits for no thread either.
-    """
-
     @app.exception_handler(Refused)
     async def refused(_request: Request, error: Refused) -> Json:
         return Json(error.document, error.status)

@@ -74,7 +74,6 @@ class Gate:
             await self._app(scope, _bounded(receive, most, within_s), _with_headers(scope, send))
 
     def _check_place(self, scope: Scope, headers: Headers) -> None:
-        """Refuse a name that is not ours (DNS rebinding) and a page that is not ours (forged requests)."""
         host = headers.get("host", "").lower()
         if _name(host) not in self._hosts or len(headers.getlist("host")) != 1:
             text = "this is not the name of this server"
@@ -132,7 +131,6 @@ def token_of(headers: Headers) -> str | None:
 
 
 def _name(host: str) -> str:
-    """Return a host without its port; empty where it is none."""
     try:
         parts = urlsplit(f"//{host}")
         name, _ = parts.hostname or "", parts.port
@@ -150,7 +148,6 @@ def _check_length(headers: Headers, most: int) -> None:
 
 
 def _bounded(receive: Receive, most: int, within_s: float) -> Receive:
-    """Return a ``receive`` that ends a body which is longer than it may be, also one that told no length, or slower."""
     taken = 0
     until_s: float | None = asyncio.get_running_loop().time() + within_s
 

@@ -99,7 +99,6 @@ class LiveFeed:
                     self._wanted.clear()
 
     async def _read(self) -> None:
-        """Read until nobody has looked on for a minute; OSError and the like when the daemon does not tell."""
         reader, writer = await asyncio.open_unix_connection(str(self._path), limit=LONGEST_LINE)
         try:
             writer.write(b'{"request": "live"}\n')
@@ -138,7 +137,6 @@ class LiveFeed:
         self.rings[axis].put(after.astype(np.int64) + first + base, values)
 
     def _base(self, axis: str, first: int) -> int:
-        """Return what lays an axis' ticks on this process' count: that of another axis where both count alike."""
         end = self.rings[axis].end
         for other, base in self._bases.items():
             apart = abs(first + base - self.rings[other].end) * self.period_s
@@ -152,7 +150,6 @@ class LiveFeed:
         self._line = (first - slope * first_ns, slope)
 
     def _voltage(self, line: Mapping[str, Any]) -> None:
-        """Lay a sensor's samples on the ticks in which its clock says they were taken: to look at, no closer."""
         base = self._bases.get(line["axis"])
         if self._line is None or base is None:
             return

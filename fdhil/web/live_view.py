@@ -66,7 +66,6 @@ class View:
         return b"".join([len(header).to_bytes(4, "little"), header, *numbers])
 
     def _part(self, axis: str, ring: Ring) -> tuple[Envelope, int]:
-        """Return what is new of an axis, and how many ticks were skipped before it."""
         oldest = max(ring.begin, ring.end - self._ticks)
         first = self._next.get(axis, oldest)
         skipped = max(0, oldest - first)

@@ -48,7 +48,6 @@ class Replayer:
         return answer[1:]
 
     async def _ask(self, axis: str, number: int) -> bytes:
-        """Return the line that answers, empty where the process ended or had to be ended."""
         answer = b""
         try:
             async with asyncio.timeout(LONGEST_S):

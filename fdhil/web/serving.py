@@ -140,7 +140,6 @@ async def _serve(
 
 
 async def _give_back() -> None:
-    """Give free memory back now and then: a page of a long history takes 100 MB while it is made."""
     while True:
         await asyncio.sleep(GIVE_BACK_S)
         await asyncio.to_thread(heap.give_back)

@@ -160,7 +160,7 @@ async def test_it_is_armed_ahead_of_its_check_and_ends_gently_when_that_stops(
         assert answer["ok"], answer
         assert answer["check"]["whole"] is False
         assert answer["check"]["checked_s"] >= NEAR_S
-        assert "the check of the rest goes on ahead of it" in answer["text"]
+        assert "the rest is checked ahead of the motion" in answer["text"]
         assert (mill.state, len(mill.rows), mill.final) == ("ARMED", 10_000, False)
         await shop.until(lambda: shop.checked.rows >= 30_000)  # no busy host may have the check fall behind by itself
         for row in (500, 3_000, 8_000, 15_000):
@@ -176,7 +176,7 @@ async def test_it_is_armed_ahead_of_its_check_and_ends_gently_when_that_stops(
 async def _is_not_abandoned_by_another(shop: Shop, program: Path) -> None:
     """Who is refused because something runs, and leaves, ends nothing of what runs."""
     answer = await shop.arm(program)
-    assert (answer["code"], answer["text"]) == ("NotOff", "what was armed before is still on, in state ACTIVE")
+    assert (answer["code"], answer["text"]) == ("NotOff", "the previous correction is still active, in state ACTIVE")
     assert not shop.desk.abandon()
     assert shop.desk.checking is not None
 
@@ -243,7 +243,7 @@ async def test_a_place_that_is_refused_later_is_told_long_before_the_motion_reac
         refused = shop.major()[0]
         assert refused.code == "DemandTooHigh"
         place = re.search(rf"line {HARD_LINE}, at (\d+\.\d+) s: axis X has a current or voltage limit", refused.text)
-        left = re.search(r"corrected for another (\d+\.\d) s, then ramped to zero before that place", refused.text)
+        left = re.search(r"corrected for another (\d+\.\d) s, then ramped to zero before that line", refused.text)
         assert place, refused.text
         assert left, refused.text
         assert "lower the feed" in refused.text
@@ -294,7 +294,7 @@ async def test_what_ended_a_moment_ago_is_waited_for(
         answer = await shop.arm(program)
         assert (answer["code"], answer["advice"]) == (
             "NotOff",
-            "run fdhil disarm or wait until it has ended, then arm again",
+            "run fdhil disarm or wait for its end, then arm again",
         )
 
 
@@ -335,8 +335,8 @@ def test_what_is_refused_before_it_begins_is_disarmed(config: MachineConfig, mil
     (found,) = feeder.go_on()
     assert (found.code, found.severity, mill.state) == ("DemandTooHigh", "MAJOR", "OFF")
     assert found.text == (
-        "line 7, at 63.00 s: axis X has; lower the feed; long.ngc was armed ahead of its check: it had not begun and is"
-        " disarmed"
+        "line 7, at 63.00 s: axis X has; lower the feed; long.ngc was armed ahead of its check: the program had not"
+        " begun and was disarmed"
     )
     link.close()
 

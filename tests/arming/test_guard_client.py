@@ -66,7 +66,7 @@ def test_answers_of_others_are_passed_over(far: Far) -> None:
 
 
 def test_a_guard_that_gives_no_answer_is_told(far: Far) -> None:
-    with pytest.raises(DeviceTimeout, match="gave no answer"), far(b"") as client:
+    with pytest.raises(DeviceTimeout, match="did not answer"), far(b"") as client:
         client.disarm()
 
 

@@ -61,7 +61,7 @@ def test_a_link_that_was_ended_makes_no_new_connection(guard: Guard, folder: Pat
     link.close()
     assert link.refresh() == []
     assert not link.connected
-    with pytest.raises(DeviceError, match="is not asked any more, since the daemon ends"):
+    with pytest.raises(DeviceError, match="is disconnected: the daemon is shutting down"):
         link.disarm()
 
 

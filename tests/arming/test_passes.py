@@ -135,7 +135,7 @@ async def test_each_pass_is_told_beside_what_was_predicted(
     assert first["gain"]["measured"] > first["gain"]["predicted"] > 1.0
     assert "ended early: StaleData" in third["text"]
     assert any("more than predicted; identify again" in notice.text for notice in shop.told)
-    assert any("worse than without; leave it off" in notice.text for notice in shop.told)
+    assert any("worse than uncorrected; leave it off" in notice.text for notice in shop.told)
 
 
 def test_a_gain_is_bounded_by_the_parameters_spread_and_by_the_skill(config: MachineConfig, program: Path) -> None:
@@ -203,8 +203,8 @@ def test_a_table_behind_a_known_spring_is_measured_where_it_is(
 @pytest.mark.parametrize(
     ("late", "severity", "told"),
     [
-        ("this PC was late (37 offsets, worst 9.0 ms)", "minor", "take load off this PC, then arm again"),
-        ("", "MAJOR", "worse than without; leave it off and identify again"),
+        ("this PC was late (37 offsets, worst 9.0 ms)", "minor", "reduce the load of this PC, then arm again"),
+        ("", "MAJOR", "worse than uncorrected; leave it off and identify again"),
     ],
 )
 def test_pass_that_a_late_pc_ended_is_not_the_models_fault(late: str, severity: str, told: str) -> None:

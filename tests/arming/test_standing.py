@@ -71,7 +71,7 @@ def config(tmp_path: Path) -> MachineConfig:
 @pytest.mark.parametrize(
     ("status", "nothing", "text"),
     [
-        (standing.ABSENT, True, "no guard was heard, nothing was sent"),
+        (standing.ABSENT, True, "there was no guard, nothing was sent"),
         (OFF, True, "offset 0"),
         ({"state": "OFF"}, False, "an unknown offset may still be applied"),
         ({"state": "OFF", "may_stand_um": {}}, False, "an unknown offset may still be applied"),

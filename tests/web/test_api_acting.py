@@ -103,7 +103,7 @@ async def test_what_the_daemon_refuses_is_told_with_all_its_reasons(config: Mach
         disarmed = await client.post("/api/machine/disarm", headers=OWN)
     told = answer.json()
     assert (answer.status_code, told["ok"], told["code"]) == (409, False, "ModelNotValidated")
-    assert told["advice"] == "let the machine make a few rapids of this axis"
+    assert told["advice"] == "run a few rapids of this axis"
     assert told["refused"]
     assert disarmed.json()["code"] == "GuardAbsent"
 

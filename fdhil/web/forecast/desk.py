@@ -228,7 +228,6 @@ class Desk:
 
 
 async def _conclude(job: Job, work: Work, code: int) -> None:
-    """Take up what the process has left; one that died has left nothing."""
     try:
         if code != 0:
             raise ValueError(code)
@@ -247,7 +246,6 @@ async def _conclude(job: Job, work: Work, code: int) -> None:
 
 
 async def _written(part: Path, content: AsyncIterable[bytes]) -> str:
-    """Write what comes into a file, and return its digest; Refused for nothing."""
     digest, size = hashlib.sha256(), 0
     with part.open("xb") as file:
         async for piece in content:

@@ -61,7 +61,6 @@ _NAMES = ("path_mm", "error_um", "contour_um", "line")
 
 
 def _steps(path_mm: Float, first: int, last: int) -> Float:
-    """Return the way from each row to the next (last - first, d); the last row of all has none to go."""
     part = path_mm[first : last + 1]
     steps = np.diff(part, axis=0)
     return steps if len(steps) == last - first else np.vstack([steps, np.zeros((1, part.shape[1]))])

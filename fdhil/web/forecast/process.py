@@ -157,7 +157,6 @@ def _feed_mm_min(reference: Trajectory, row: int) -> float:
 
 
 def _scale(planned: Correction) -> dict[str, float | None]:
-    """Return one scale of colours for both; ``least_um`` where it is logarithmic."""
     largest_um, least_um = common_scale([planned.before.contour_um, planned.after.contour_um])
     return {"largest_um": max(largest_um, LEAST_UM), "least_um": least_um}
 
@@ -167,7 +166,6 @@ def _reach(reference: Trajectory) -> dict[str, list[float]]:
 
 
 def _single(reference: Trajectory) -> list[tuple[str, str]]:
-    """Return the plane of a path in which at most one axis moves."""
     moving = max(reference.table_axes, key=lambda axis: float(np.ptp(reference.position_mm[axis])))
     other = next((axis for axis in reference.table_axes if axis != moving), moving)
     return [(moving, other)]

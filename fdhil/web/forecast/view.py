@@ -66,7 +66,6 @@ def view(forecast: Forecast, plane: tuple[int, int], box: Box | None, factor: fl
 
 
 def _fitting(forecast: Forecast, inside: Bool, size_mm: float) -> float:
-    """Return how many times as far the table may be drawn from the path, so that the largest error is seen."""
     largest_mm = float(np.max(forecast.contour_um[BEFORE], where=inside, initial=0.0)) * 1e-3
     return float(max(f for f in FACTORS if f == 1 or f * largest_mm <= SEEN * size_mm))
 
@@ -79,7 +78,6 @@ def _flat(forecast: Forecast, plane: tuple[int, int]) -> Float:
 
 
 def _inside(flat: Float, box: Box | None) -> Bool:
-    """Return the rows (n,) inside a box and a little around it."""
     if box is None:
         return np.ones(len(flat), dtype=np.bool_)
     across, along = BESIDE * (box.right - box.left), BESIDE * (box.top - box.bottom)
@@ -93,13 +91,11 @@ def _inside(flat: Float, box: Box | None) -> Bool:
 
 
 def _runs(inside: Bool) -> list[tuple[int, int]]:
-    """Return first row and end of each run of rows that are inside."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8)))
     return [(int(first), int(last)) for first, last in edges.reshape(-1, 2)]
 
 
 def _seen(forecast: Forecast, flat: Float, rows: Int, size_mm: float) -> Float:
-    """Return the rows (m, 4) as they are seen, place and both colours, in units of the least that anyone sees."""
     scale = forecast.document["scale"]
     least_um, largest_um = scale["least_um"], max(scale["largest_um"], 1e-6)
     errors = np.asarray(forecast.contour_um[:, rows], dtype=np.float64)
@@ -136,7 +132,6 @@ def knots(seen: Float, most: int) -> Int:
 
 
 def _worst(seen: Float, way: Float, first: int, last: int) -> tuple[float, int, int, int]:
-    """Return how far a piece is off at most, below 0 for a heap, its first row, where that is, and its last row."""
     length = way[last] - way[first]
     share = (way[first : last + 1] - way[first]) / length if length > 0 else np.linspace(0, 1, last - first + 1)
     chord = seen[first] + share[:, None] * (seen[last] - seen[first])
@@ -146,7 +141,6 @@ def _worst(seen: Float, way: Float, first: int, last: int) -> tuple[float, int, 
 
 
 def _run(forecast: Forecast, flat: Float, points: Int, last: int) -> dict[str, Any]:
-    """Return points of the path, with the largest errors and the largest feed until the next of them."""
     first = int(points[0])
     starts = points - first
     before, after = (
@@ -167,7 +161,6 @@ def _run(forecast: Forecast, flat: Float, points: Int, last: int) -> dict[str, A
 def _table(
     forecast: Forecast, plane: tuple[int, int], rows: slice, case: int, factor: float
 ) -> Mapping[str, list[float]]:
-    """Return where the table will be, its distance from the path enlarged."""
     margin = round(WINDOW_S / forecast.dt_s)
     around = slice(max(0, rows.start - margin), rows.stop + margin)
     actual = forecast.actual_mm(case, rows)

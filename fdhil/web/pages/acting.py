@@ -94,7 +94,6 @@ async def plan(
 
 
 async def _plan(here: Context, name: str | None, method: Method) -> Plan:
-    """Return what the daemon that runs would arm: its limits, whatever the file says by now."""
     config = here.config
     if name is None and method != "flatness":
         raise Refused(422, "BadRequest", f"the method {method} corrects a program, and none is named", "choose one")
@@ -111,7 +110,6 @@ async def _plan(here: Context, name: str | None, method: Method) -> Plan:
 
 
 def _reaches(limits: Mapping[str, Mapping[str, float | None]], feeds: bool) -> dict[str, AxisReach]:
-    """Return the limits of the axes that are sent to: position offsets, or with ``feeds`` speed and torque."""
     return {
         name: AxisReach(**{key: None if (key in FED) is not feeds else value for key, value in told.items()})
         for name, told in limits.items()
@@ -147,7 +145,6 @@ async def arm(arming: Arming, request: Request, here: Here, asking: Asking) -> D
 
 
 async def _while_there(request: Request, here: Context, asked: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Ask the daemon as long as the browser waits and its user may arm; else the daemon abandons the check."""
     asking = asyncio.ensure_future(here.daemon.ask(asked, ARM_S, progress=lambda _: None))
     try:
         while not (await asyncio.wait([asking], timeout=LOOK_S))[0]:
@@ -163,7 +160,6 @@ async def _while_there(request: Request, here: Context, asked: Mapping[str, Any]
 
 
 def _operators_token(config: MachineConfig) -> str:
-    """Return what arming needs besides the role: given by systemd, or read as the daemon's own user. DeviceError."""
     given = given_credential(TOKEN_NAME)
     return read_token(given.parent if given else config.run_directory)
 

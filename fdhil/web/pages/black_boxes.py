@@ -107,7 +107,6 @@ def _axis(samples: AxisSamples, last_tick: int, period_s: float) -> AxisEnvelope
 
 
 def _least(values: Float, starts: Any, sign: float) -> list[float | None]:
-    """Return the least (``sign`` 1) or the greatest (-1) of each column."""
     least: Float = np.fmin.reduceat(sign * values, starts)
     return _short(sign * least)
 

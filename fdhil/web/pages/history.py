@@ -42,7 +42,6 @@ def course(axis: str, here: Here, made: Made) -> dict[str, Any]:
 
 
 def _kept(here: Context, made: Documents, about: str | None, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """Return a document; one that was made of the same rows is not made again. StoreError."""
     with here.history() as history:
         rows = history.newest_rows()
     known = made.get(about)

@@ -71,7 +71,6 @@ def _limit(name: str, limit: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _slopes(health: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return how each parameter moves with temperature and time, as text with its interval; null where unknown."""
     found = []
     for name in DISPLAY:
         lines = {key: health.get(of, {}).get(name) for key, of in (("per_kelvin", "slopes"), ("per_day", "trends"))}
@@ -86,7 +85,6 @@ def _change(change: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _course(history: AxisHistory, name: str) -> dict[str, Any]:
-    """Return a parameter's charts, and the newest estimates as the table that says the same."""
     unit, factor = DISPLAY[name]
     warming = over_temperature(history, name)
     return {
@@ -101,7 +99,6 @@ def _course(history: AxisHistory, name: str) -> dict[str, Any]:
 
 
 def _chart(chart: Chart) -> dict[str, Any]:
-    """Return a chart as the browser draws it: colours are numbers there, so that they fit a dark page too."""
     document = told(chart)
     for trace in (trace for panel in document["panels"] for trace in panel["traces"]):
         trace["colour"] = COLOURS.index(trace["colour"]) + 1 if trace["colour"] in COLOURS else LINE_COLOUR

@@ -152,7 +152,6 @@ async def stream(
 
 
 async def _converse(socket: WebSocket, view: View, viewer: Viewer, feed: LiveFeed, here: Here) -> str:
-    """Send samples and receive what was drawn; return why that is over. WebSocketDisconnect if the browser left."""
     tasks = [
         asyncio.create_task(_hear(socket, view, viewer)),
         asyncio.create_task(_tell(socket, view, viewer, feed, here)),
@@ -167,7 +166,6 @@ async def _converse(socket: WebSocket, view: View, viewer: Viewer, feed: LiveFee
 
 
 async def _hear(socket: WebSocket, view: View, viewer: Viewer) -> str:
-    """Take in what the browser has drawn, until it says anything else."""
     while True:
         try:
             told: Any = json.loads(await socket.receive_text())
@@ -180,10 +178,6 @@ async def _hear(socket: WebSocket, view: View, viewer: Viewer) -> str:
 
 
 async def _tell(socket: WebSocket, view: View, viewer: Viewer, feed: LiveFeed, here: Here) -> str:
-    """Send what is new, some ten times a second, as fast as the browser draws; a word of life when nothing is.
-
-    The login is checked each time: a user who was removed receives no further sample.
-    """
     told_s, token = 0.0, token_of(socket.headers)
     while True:
         await asyncio.sleep(TELL_S)

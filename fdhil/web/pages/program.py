@@ -108,7 +108,6 @@ class Text(BaseModel):
 
 @asynccontextmanager
 async def _serving(app: FastAPI) -> AsyncIterator[None]:
-    """Drop what is kept when the pages are no longer served."""
     yield
     desk = getattr(app.state, "programs", None)
     if desk is not None:
@@ -280,7 +279,6 @@ def text(
 
 
 def _printable(line: str) -> str:
-    """Return a line without what a screen would not show, cut where it is very long."""
     kept = "".join(letter if letter.isprintable() else " " for letter in line.rstrip("\r\n")[:LONGEST_LINE])
     return kept + ("..." if len(line) > LONGEST_LINE + 2 else "")
 

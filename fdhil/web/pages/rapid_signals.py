@@ -78,8 +78,6 @@ class RapidSignals(BaseModel):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Course:
-    """A signal (n,) with its name and unit, and the course (n,) that a model makes of it."""
-
     name: str
     unit: str
     measured: Float
@@ -124,7 +122,6 @@ def _said(reason: Reason) -> Said:
 
 
 def _courses(overlay: Overlay) -> list[_Course]:
-    """Return the signals that the rapid has, in the order in which they are read: cause, answer, error."""
     window = overlay.window
     speed, current, model = _modelled(overlay)
     courses = [
@@ -145,7 +142,6 @@ def _courses(overlay: Overlay) -> list[_Course]:
 
 
 def _modelled(overlay: Overlay) -> tuple[Float | None, Float | None, str | None]:
-    """Return speed and current (n,) as the measured voltage makes them, else as the closed loop does."""
     window, driven, followed = overlay.window, overlay.driven, overlay.followed
     if driven is not None:
         time_s = np.arange(window.n) * window.dt_s
@@ -160,7 +156,6 @@ def _modelled(overlay: Overlay) -> tuple[Float | None, Float | None, str | None]
 
 
 def _voltage(window: Window) -> list[_Course]:
-    """Return the voltage on the window's rows; a slow sensor's value stands for its whole period."""
     if window.voltage_v is not None:
         return [_Course("voltage_v", "V", window.voltage_v)]
     slow = window.slow_voltage
@@ -211,7 +206,6 @@ def _step(size: int) -> int:
 
 
 def _told(values: Float) -> Points:
-    """Return numbers as JSON has them, null where there is none."""
     return [float(f"{v:.{DIGITS}g}") if math.isfinite(v) else None for v in values.tolist()]
 
 

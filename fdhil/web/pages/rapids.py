@@ -33,7 +33,6 @@ from fdhil.web.replayer import Replayer
 
 @asynccontextmanager
 async def _replaying(app: FastAPI) -> AsyncIterator[None]:
-    """End the process that replays with the one that serves."""
     try:
         yield
     finally:
