@@ -1,4 +1,4 @@
-"""Recordings as HDF5 files: one dataset each with its unit as attribute, the headers as attributes of the file."""
+"""Reads and writes recordings as HDF5: one dataset each with its unit as attribute, the headers as file attributes."""
 
 import io
 from typing import Any
@@ -17,7 +17,7 @@ MOST_DATASETS = 1000
 
 
 def encode(table: RecordingTable) -> bytes:
-    """Return a table as the bytes of an HDF5 file. FdhilError without the extra ``hdf5``."""
+    """Return a table as the bytes of an HDF5 file. Raises FdhilError without the extra ``hdf5``."""
     content = io.BytesIO()
     with library().File(content, "w") as file:
         file.attrs.update(table.headers)
@@ -28,12 +28,12 @@ def encode(table: RecordingTable) -> bytes:
 
 
 def decode(content: bytes, source: str) -> RecordingTable:
-    """Return the table of a file's bytes; datasets in groups by their path. RecordingError when it is no HDF5 file."""
+    """Return the table of a file's bytes; datasets in groups by their path. RecordingError if it is not HDF5."""
     return read_apart(__name__, KIND, content, source)
 
 
 def read(content: bytes, source: str) -> RecordingTable:
-    """Return the table in this process, which a damaged file may end."""
+    """Return the table, read in this process, which a damaged file may crash."""
     h5py = library()
     try:
         with h5py.File(io.BytesIO(content), "r") as file:
@@ -54,7 +54,7 @@ def _units(stored: Any) -> list[str]:
 
 
 def read_matlab(content: bytes, source: str) -> RecordingTable:
-    """Return the table of a file of MATLAB 7.3, in this process, which a damaged file may end."""
+    """Return the table of a MATLAB 7.3 file, read in this process, which a damaged file may crash."""
     h5py = library()
     try:
         with h5py.File(io.BytesIO(content), "r") as file:
@@ -67,6 +67,7 @@ def read_matlab(content: bytes, source: str) -> RecordingTable:
 
 
 def _variable(file: Any, item: Any, h5py: Any, sizes: list[int], source: str, depth: int = 0) -> Any:
+    """Return a variable as in MATLAB; ``sizes`` of those read so far limit the total to a recording's."""
     kind = _text(item.attrs.get("MATLAB_class", b""))
     if depth > MOST_DEPTH or len(sizes) > MOST_DATASETS:
         return None
@@ -93,6 +94,10 @@ def _listed(fields: dict[str, Any]) -> Any:
 
 
 def _vectors(file: Any, h5py: Any) -> dict[str, tuple[Any, Any]]:
+    """Return dataset and selection of each vector of real numbers by path, excluding external links.
+
+    A column of a matrix is ``path[:,0]`` or ``path[0,:]``, a field of a table ``path/field``.
+    """
     found: dict[str, Any] = {}
 
     def look(name: str, item: Any) -> None:
@@ -120,7 +125,7 @@ def _text(value: Any) -> str:
 
 
 def library() -> Any:
-    """Return what reads and writes such files. FdhilError without the extra."""
+    """Return the HDF5 library. Raises FdhilError without the extra."""
     try:
         import h5py
     except ImportError:

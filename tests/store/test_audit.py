@@ -123,7 +123,7 @@ def test_who_keeps_the_audit_locked_delays_it_and_then_it_is_told(
     monkeypatch.setattr(audit, "LOCKED_S", 0.05)
     with (written / audit.FILE_NAME).open() as reader:  # whoever may read it may lock it, too
         fcntl.flock(reader, fcntl.LOCK_EX)
-        with pytest.raises(StoreError, match="another process has kept it locked"):
+        with pytest.raises(StoreError, match="another process holds its lock"):
             audit.append(written, {"asked": "arm"})
     audit.append(written, {"asked": "arm"})
     assert len(list(audit.entries(written))) == len(ENTRIES) + 1

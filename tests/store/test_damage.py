@@ -237,10 +237,10 @@ ZEROS = np.zeros(400_000)
     ("content", "words"),
     [
         (parquet({name: np.zeros(600_000) for name in ("tick", "demand_mm")}), "declares 600000 rows"),
-        (parquet(dict.fromkeys(("tick", "demand_mm", "x1"), ZEROS)), "columns that no window has"),
+        (parquet(dict.fromkeys(("tick", "demand_mm", "x1"), ZEROS)), "columns unknown in windows"),
         (parquet({"tick": ZEROS}, use_dictionary=True), "has a dictionary"),
-        (parquet({"tick": pa.array(["a" * 1000] * 600)}, use_dictionary=False), "holds no plain numbers"),
-        (parquet({"tick": pa.array([[0.0] * 1000] * 600)}, use_dictionary=False), "columns that no window has"),
+        (parquet({"tick": pa.array(["a" * 1000] * 600)}, use_dictionary=False), "does not contain plain numbers"),
+        (parquet({"tick": pa.array([[0.0] * 1000] * 600)}, use_dictionary=False), "columns unknown in windows"),
         (large_page(40_000), "declares"),
     ],
     ids=["rows", "columns", "dictionary", "texts", "lists", "page"],

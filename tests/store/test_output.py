@@ -41,7 +41,7 @@ def test_the_old_file_is_kept_where_writing_fails(tmp_path: Path) -> None:
     """Half-way: the disk is full. A reader never sees half a file, and nothing is left behind."""
     old = tmp_path / "old.csv"
     old.write_bytes(b"old")
-    with pytest.raises(OutputError, match=r"No space left.*kept"):
+    with pytest.raises(OutputError, match=r"No space left.*unchanged"):
         write_half(old)
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"]
 

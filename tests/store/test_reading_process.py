@@ -41,7 +41,7 @@ def test_a_file_that_ends_its_reader_is_refused_and_the_next_one_read(name: str,
     bad, good = tmp_path / "bad.mat", tmp_path / f"good.{name}"
     bad.write_bytes((FOUND / "recording_mat" / "vector-of-unknown-type").read_bytes())
     export_table(table_of(window()), good, {"h5": "hdf5"}.get(name, name))
-    with pytest.raises(RecordingError, match=r"bad\.mat is no MATLAB file.*did not survive it; export it again"):
+    with pytest.raises(RecordingError, match=r"bad\.mat is not a readable MATLAB file.*crashed; export it again"):
         read_recording(bad)
     assert read_recording(good).axis == "X"
 
