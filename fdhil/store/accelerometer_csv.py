@@ -36,7 +36,7 @@ def with_accelerometer(recording: Recording, path: Path) -> Recording:
     if abs(correlation) < LEAST_CORRELATION:
         raise RecordingError(
             f"{path} does not match the moves of the recording (correlation {abs(correlation):.2f}, "
-            f"{LEAST_CORRELATION} is required): use the file of the same run, from before the first move to after the last"
+            f"{LEAST_CORRELATION} is required): use the file of the same run, with all its moves"
         )
     values = axes[:, best] if correlation > 0 else -axes[:, best]
     rows = frozen(np.arange(recording.speed_rad_s.size) * recording.dt_s)

@@ -256,7 +256,7 @@ async def test_browsers_that_never_draw_make_room_for_one_that_does(
             await socket.recv()
         async with stream_of(place) as third:
             assert json.loads(await third.recv())["axes"] == ["X"]
-            with pytest.raises(ConnectionClosed, match="another browser has this place"):
+            with pytest.raises(ConnectionClosed, match="another browser took this place"):
                 await heard_out(first)
 
 

@@ -1,4 +1,4 @@
-"""What a browser draws of a forecast: the whole or a part of its path, by as few points as tell the same."""
+"""Reduces a forecast to what a browser draws: all or a part of its path, by the fewest points that look the same."""
 
 import heapq
 from collections.abc import Mapping, Sequence
@@ -13,19 +13,19 @@ from fdhil.records import Bool, Float, Int
 from fdhil.web.forecast.kept import AFTER, BEFORE, Forecast
 
 MOST_POINTS = 5000
-WHOLE_ROWS = 3000  # up to which every row is told, with where the table will be
-MOST_ROWS = 400_000  # that are looked at in one view
-STRETCH = 4096  # rows that are looked at as one
-FINE = 1 / 1500  # of the view: nobody sees less
-SHADE = 0.03  # of the scale of colours
+WHOLE_ROWS = 3000  # up to which every row is sent, with the predicted table path
+MOST_ROWS = 400_000  # examined in one view
+STRETCH = 4096  # rows simplified at once
+FINE = 1 / 1500  # of the view: the smallest visible distance
+SHADE = 0.03  # of the colour scale
 FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-SEEN = 0.15  # of the view that the largest error may take
-BESIDE = 0.1  # of the view, around it
+SEEN = 0.15  # of the view, for the largest error
+BESIDE = 0.1  # of the view, as a margin around it
 MOST_COURSE = 1500
 
 
 class Box(NamedTuple):
-    """A part of a plane, mm."""
+    """A rectangle in a plane, mm."""
 
     left: float
     right: float
@@ -34,17 +34,17 @@ class Box(NamedTuple):
 
 
 def plane_of(forecast: Forecast, asked: Sequence[str]) -> tuple[int, int]:
-    """Return the columns of a plane; ValueError where it is none of this machine's."""
+    """Return the columns of a plane's axes. Raises ValueError for an unknown axis."""
     across, along = (forecast.axes.index(axis) for axis in asked)
     return across, along
 
 
 def view(forecast: Forecast, plane: tuple[int, int], box: Box | None, factor: float) -> dict[str, Any]:
-    """Return the path inside ``box`` (None: all of it) as runs of points, each with what follows it until the next.
+    """Return the path inside ``box`` (None: all of it) as runs of points, each with the figures up to the next.
 
-    A run's ``before_um`` and ``after_um`` are the largest contour errors of each piece. Where few rows are inside they
-    are all told, ``whole``, and with them where the table will be, its distance from the path ``factor`` times as far:
-    0 for as far as the view has room for.
+    A run's ``before_um`` and ``after_um`` are the largest contour errors of each piece. With few rows inside, all are
+    returned (``whole``) together with the predicted table path, its distance from the path enlarged by ``factor`` (0:
+    as far as the view has room).
     """
     flat = _flat(forecast, plane)
     inside = _inside(flat, box)
@@ -84,7 +84,7 @@ def _inside(flat: Float, box: Box | None) -> Bool:
     low = np.array([box.left - across, box.bottom - along])
     high = np.array([box.right + across, box.top + along])
     inside = np.asarray(np.all((flat >= low) & (flat <= high), axis=1))
-    # a step that crosses the edge of the view is drawn to its other end
+    # a step across the edge of the view is drawn completely
     inside[:-1] |= inside[1:].copy()
     inside[1:] |= inside[:-1].copy()
     return inside
@@ -96,6 +96,7 @@ def _runs(inside: Bool) -> list[tuple[int, int]]:
 
 
 def _seen(forecast: Forecast, flat: Float, rows: Int, size_mm: float) -> Float:
+    """Return the rows (m, 4), position and both colours, in units of the smallest visible difference."""
     scale = forecast.document["scale"]
     least_um, largest_um = scale["least_um"], max(scale["largest_um"], 1e-6)
     errors = np.asarray(forecast.contour_um[:, rows], dtype=np.float64)
@@ -109,10 +110,10 @@ def _seen(forecast: Forecast, flat: Float, rows: Int, size_mm: float) -> Float:
 
 
 def knots(seen: Float, most: int) -> Int:
-    """Return the rows (k,) at which a path (m, d) is cut into straight pieces that are off by less than 1 nowhere.
+    """Return the rows (k,) that divide a path (m, d) into straight pieces with deviations below 1.
 
-    The path is taken over its way. The piece that is farthest off is cut first, so that ``most`` points are the best
-    that so few can tell [Douglas, Peucker 1973, with the way as the parameter].
+    The path is parametrised by its length. The piece with the largest deviation is divided first, so that ``most``
+    points are the best possible [Douglas, Peucker 1973, with the length as the parameter].
     """
     end = len(seen) - 1
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(seen[:, :2], axis=0).T))])
@@ -132,6 +133,7 @@ def knots(seen: Float, most: int) -> Int:
 
 
 def _worst(seen: Float, way: Float, first: int, last: int) -> tuple[float, int, int, int]:
+    """Return the negative of a piece's largest deviation (for a heap), its first row, that row, and its last row."""
     length = way[last] - way[first]
     share = (way[first : last + 1] - way[first]) / length if length > 0 else np.linspace(0, 1, last - first + 1)
     chord = seen[first] + share[:, None] * (seen[last] - seen[first])
@@ -173,7 +175,7 @@ def _table(
 
 
 def course(forecast: Forecast, first: int, last: int) -> dict[str, Any]:
-    """Return the contour errors and the feed over time, the largest of each of at most ``MOST_COURSE`` stretches."""
+    """Return contour errors and feed over time, the largest of each of at most ``MOST_COURSE`` intervals."""
     starts = np.arange(0, last - first, max(1, -(-(last - first) // MOST_COURSE)))
     before, after = (
         np.maximum.reduceat(np.asarray(forecast.contour_um[case, first:last]), starts) for case in (BEFORE, AFTER)
@@ -187,7 +189,7 @@ def course(forecast: Forecast, first: int, last: int) -> dict[str, Any]:
 
 
 def line_place(forecast: Forecast, line: int) -> dict[str, Any] | None:
-    """Return where a line of the program has its largest error, and how far it goes; None where it orders nothing."""
+    """Return where a program line has its largest error, and its extent; None if it orders no motion."""
     rows = np.flatnonzero(np.asarray(forecast.line) == line)
     if rows.size == 0:
         return None
@@ -208,5 +210,5 @@ def line_place(forecast: Forecast, line: int) -> dict[str, Any] | None:
 
 
 def rounded(values: npt.ArrayLike, decimals: int) -> list[float]:
-    """Return values as JSON has them, no longer than they are worth."""
+    """Return values as JSON data, without excess digits."""
     return [float(value) for value in (np.round(np.asarray(values, dtype=np.float64), decimals) + 0.0).tolist()]

@@ -1,4 +1,4 @@
-"""Acting: what arming would move is told first, and only what was told is armed. To disarm asks nothing."""
+"""Arming from the browser: a plan shows what arming may move, and only that plan is armed. Disarming needs no plan."""
 
 import asyncio
 import hashlib
@@ -19,10 +19,10 @@ from fdhil.web.gate import token_of
 from fdhil.web.programs import NAME, Program, listed, look_at
 
 router = APIRouter(prefix="/api/machine")
-DISARM_S = 15.0  # the daemon waits for the guard's answer and for the ramp
+DISARM_S = 15.0  # the daemon waits for the guard's answer and the ramp
 ARM_S = 600.0
 FED = ("max_torque_nm", "max_speed_rad_s")
-LOOK_S = 0.5  # whether the browser that asked is still there
+LOOK_S = 0.5  # interval of the check that the browser is still connected
 PLAN_ID = r"^[0-9a-f]{64}$"
 
 ProgramName = Annotated[str, Field(pattern=NAME)]
@@ -30,7 +30,7 @@ Method = Literal["inverse", "mirror", "flatness"]
 
 
 class Choice(BaseModel):
-    """What may be armed from here: the programs of the folder that the configuration names, and the methods."""
+    """What can be armed from here: the programs of the configured folder, and the methods."""
 
     ok: Literal[True] = True
     programs: list[Program]
@@ -39,7 +39,7 @@ class Choice(BaseModel):
 
 
 class AxisReach(BaseModel):
-    """How far the guard lets a correction go on an axis; null where it sends nothing of that kind."""
+    """The guard's limits for a correction on an axis; null for offsets that it does not send."""
 
     max_offset_um: float | None
     max_speed_mm_s: float | None
@@ -49,7 +49,7 @@ class AxisReach(BaseModel):
 
 
 class Plan(BaseModel):
-    """What would be armed and what that may move; ``confirm`` goes back with the request, so that nothing else is."""
+    """What would be armed and what that may move; ``confirm`` is returned with the request to arm exactly this."""
 
     ok: Literal[True] = True
     program: Program | None
@@ -61,7 +61,7 @@ class Plan(BaseModel):
 
 
 class Arming(BaseModel):
-    """The request to arm what a plan told."""
+    """The request to arm a plan."""
 
     program: ProgramName | None = None
     method: Method = "inverse"
@@ -70,7 +70,7 @@ class Arming(BaseModel):
 
 
 class Done(BaseModel):
-    """What was done, in the daemon's words."""
+    """What was done, as reported by the daemon."""
 
     ok: Literal[True] = True
     text: str
@@ -79,7 +79,7 @@ class Done(BaseModel):
 
 @router.get("/programs")
 def programs(here: Here) -> Choice:
-    """Tell what may be armed from here."""
+    """Return what can be armed from here."""
     folder = here.config.web.programs_directory
     feeds = any(axis.feedforward is not None for axis in here.config.axis.values())
     return Choice(programs=listed(folder) if folder else [], methods=list(tables.CORRECTIONS), feedforward=feeds)
@@ -89,22 +89,23 @@ def programs(here: Here) -> Choice:
 async def plan(
     here: Here, program: Annotated[ProgramName | None, Query()] = None, method: Annotated[Method, Query()] = "inverse"
 ) -> Plan:
-    """Tell what arming would move. Nothing is done yet."""
+    """Return what arming would move. Nothing is done yet."""
     return await _plan(here, program, method)
 
 
 async def _plan(here: Context, name: str | None, method: Method) -> Plan:
+    """Use the limits of the running daemon, whatever the configuration file contains by now."""
     config = here.config
     if name is None and method != "flatness":
-        raise Refused(422, "BadRequest", f"the method {method} corrects a program, and none is named", "choose one")
+        raise Refused(422, "BadRequest", f"the method {method} needs a program, and none was named", "choose a program")
     program = None if name is None else await asyncio.to_thread(look_at, config.web.programs_directory, name)
     status = await here.daemon.status()
     axes = _reaches(status["limits"], feeds=program is None)
     if not axes:
-        text = "the configuration lets nothing be sent to any axis"
-        raise Refused(409, "WritingOff", text, "see how a correction is commissioned in docs/how-to/commission.md")
-    told = [program and program.sha256, method, {axis: reach.model_dump() for axis, reach in axes.items()}]
-    confirm = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+        text = "the configuration allows no offsets on any axis"
+        raise Refused(409, "WritingOff", text, "commission a correction as in docs/how-to/commission.md")
+    content = [program and program.sha256, method, {axis: reach.model_dump() for axis, reach in axes.items()}]
+    confirm = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
     state, difference = str(status["state"]), config_difference(status, config.digest)
     return Plan(program=program, method=method, axes=axes, state=state, difference=difference, confirm=confirm)
 
@@ -119,14 +120,14 @@ def _reaches(limits: Mapping[str, Mapping[str, float | None]], feeds: bool) -> d
 
 @router.post("/arm")
 async def arm(arming: Arming, request: Request, here: Here, asking: Asking) -> Done:
-    """Arm what was confirmed; a browser that goes away while a program is checked has nothing armed.
+    """Arm the confirmed plan; if the browser disconnects during the check, nothing is armed.
 
-    What the daemon then says it has armed is compared with what was shown, and disarmed where it differs.
+    The daemon's answer is compared with the plan, and disarmed if the program differs.
     """
     shown = await _plan(here, arming.program, arming.method)
     if shown.confirm != arming.confirm:
-        text = "the program or the limits are not those that were shown; nothing is armed"
-        raise Refused(409, "PlanChanged", text, "look at what is shown now, and confirm again")
+        text = "the program or the limits have changed since they were shown; nothing is armed"
+        raise Refused(409, "PlanChanged", text, "check the present plan, and confirm again")
     asked = {
         "request": "arm",
         "program": shown.program and shown.program.path,
@@ -139,20 +140,21 @@ async def arm(arming: Arming, request: Request, here: Here, asking: Asking) -> D
     answer = granted(await _while_there(request, here, asked))
     if shown.program is not None and answer.get("program_digest") != shown.program.sha256:
         await here.daemon.ask({"request": "disarm", "by": asking.name}, DISARM_S)
-        text = "the program was changed while it was armed; it is disarmed again"
-        raise Refused(409, "PlanChanged", text, "look at what is shown now, and confirm again")
+        text = "the program was changed while it was armed; it was disarmed again"
+        raise Refused(409, "PlanChanged", text, "check the present plan, and confirm again")
     return Done(text=str(answer["text"]), state=str(answer.get("state", "ARMED")))
 
 
 async def _while_there(request: Request, here: Context, asked: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Wait for the daemon while the browser waits and its user may arm; else the daemon abandons the check."""
     asking = asyncio.ensure_future(here.daemon.ask(asked, ARM_S, progress=lambda _: None))
     try:
         while not (await asyncio.wait([asking], timeout=LOOK_S))[0]:
             if await request.is_disconnected():
-                raise Refused(409, "Abandoned", "nobody waited for the answer, nothing is armed", "arm again")
+                raise Refused(409, "Abandoned", "the browser disconnected, nothing is armed", "arm again")
             asker = here.access.asker(token_of(request.headers))
             if asker is None or asker.role != "operate":
-                text = "the login has ended, or the user lost the role operate: nothing is armed"
+                text = "the login has expired, or the user lost the role operate; nothing is armed"
                 raise Refused(401, "AuthRequired", text, "log in again")
         return await asking
     finally:
@@ -160,12 +162,13 @@ async def _while_there(request: Request, here: Context, asked: Mapping[str, Any]
 
 
 def _operators_token(config: MachineConfig) -> str:
+    """Return the operator's token: from systemd, or read as the daemon's own user. DeviceError."""
     given = given_credential(TOKEN_NAME)
     return read_token(given.parent if given else config.run_directory)
 
 
 @router.post("/disarm")
 async def disarm(here: Here, asking: Asking) -> Done:
-    """Ramp the correction to zero and wait until zero is read back; what is being checked is not armed."""
+    """Ramp the correction to zero and wait until zero is read back; what is being prepared is not armed."""
     answer = granted(await here.daemon.ask({"request": "disarm", "by": asking.name}, DISARM_S))
     return Done(text=str(answer["text"]), state=str(answer.get("state", "OFF")))

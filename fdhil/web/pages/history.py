@@ -1,4 +1,4 @@
-"""How the drives are and how their parameters moved: against time and temperature, with intervals and limits."""
+"""The drives' state and parameter trends: over time and temperature, with intervals and limits."""
 
 from collections.abc import Callable
 from typing import Annotated, Any
@@ -26,18 +26,18 @@ async def _documents(request: Request) -> Documents:
 
 
 Made = Annotated[Documents, Depends(_documents)]
-"""By axis (None: all of them) the rows of the history and the document that was made of them."""
+"""Cached documents by axis (None: all of them), with the newest row numbers that they were made from."""
 
 
 @router.get("")
 def axes(here: Here, made: Made) -> dict[str, Any]:
-    """Return how each axis is, in a few words."""
+    """Return the state of each axis in a few words."""
     return _kept(here, made, None, lambda: _overview(here))
 
 
 @router.get("/{axis}")
 def course(axis: str, here: Here, made: Made) -> dict[str, Any]:
-    """Return all that the history tells of one axis: its courses, limits, changes, published sets and notices."""
+    """Return the history of one axis: its trends, limits, changes, published sets and notices."""
     return _kept(here, made, axis, lambda: _of_axis(here, axis))
 
 
@@ -47,7 +47,7 @@ def _kept(here: Context, made: Documents, about: str | None, make: Callable[[], 
     known = made.get(about)
     if known is None or known[0] != rows:
         known = rows, make()
-        made[about] = known  # of axes that there are: others are refused in ``make``
+        made[about] = known  # only of existing axes: others are refused in ``make``
     return known[1]
 
 
@@ -60,9 +60,7 @@ def _of_axis(here: Context, axis: str) -> dict[str, Any]:
     histories, refused = read_axes(here.config, axis, NEWEST_REVISIONS)
     names = [history.axis for history in histories]
     if axis not in names:
-        raise Refused(
-            404, "NoSuchAxis", f"nothing is known of an axis {axis[:32]!r}", f"it is one of {', '.join(names)}"
-        )
+        raise Refused(404, "NoSuchAxis", f"there is no axis {axis[:32]!r}", f"use one of {', '.join(names)}")
     history, of_axis = histories[names.index(axis)], refused.get(axis, Refusals())
     notices = newest_first(read_notices(here.config, axis), MOST_NOTICES)
     return {"axes": names, **axis_document(here.config, history, of_axis), "notices": notices}

@@ -1,4 +1,4 @@
-"""The machine: what its daemon says, how the axes are, and what to do next."""
+"""The machine: the daemon's status, the state of the axes, and what to do next."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
@@ -18,11 +18,11 @@ from fdhil.web.pages.machine_lights import AxisLight, Light, Step, axis_light, c
 
 router = APIRouter(prefix="/api/machine")
 COURSE = 40
-START = Step(text="The daemon does not answer.", advice="start it with fdhil run CONFIG, and look at its log")
+START = Step(text="The daemon does not answer.", advice="start it with fdhil run CONFIG, and check its log")
 
 
 class Machine(BaseModel):
-    """The machine now. Without an answer of the daemon ``status`` is null and ``fault`` says why: that is no error."""
+    """The machine now. If the daemon does not answer, ``status`` is null and ``fault`` says why; that is no error."""
 
     ok: Literal[True] = True
     machine: str
@@ -62,7 +62,7 @@ class Published(BaseModel):
 
 
 class AllPublished(BaseModel):
-    """What the store knows of every axis; ``fault`` where it cannot be read, or is not there yet."""
+    """The stored parameters of every axis; ``fault`` if the store cannot be read or does not exist yet."""
 
     ok: Literal[True] = True
     axes: Mapping[str, Published]
@@ -71,12 +71,12 @@ class AllPublished(BaseModel):
 
 @router.get("")
 async def machine(here: Here, asking: Asking) -> Machine:
-    """Return the daemon's status document, at most half a second old, and what is to be said of it."""
+    """Return the daemon's status document, at most half a second old, and its assessment."""
     try:
         status = await here.daemon.status()
     except DeviceError as error:
         fault = Fault.model_validate(document_of(error))
-        silent = dict.fromkeys(here.config.axis, AxisLight(light="none", text="not known: the daemon does not answer"))
+        silent = dict.fromkeys(here.config.axis, AxisLight(light="none", text="unknown: the daemon does not answer"))
         return Machine(machine=here.config.machine.name, axes=silent, next=[START], status=None, fault=fault)
     acting = here.config.web.acting and asking.role == "operate"
     return Machine(
@@ -85,7 +85,7 @@ async def machine(here: Here, asking: Asking) -> Machine:
 
 
 def lights(status: Mapping[str, Any]) -> dict[str, AxisLight]:
-    """Return how each axis of a status document is."""
+    """Return the state of each axis in a status document."""
     troubles: dict[str, list[str]] = {axis: [] for axis in status["axes"]}
     for trouble in status["troubles"]:
         troubles.get(trouble["axis"], []).append(f"{trouble['code']}: {trouble['text']}")
@@ -111,7 +111,7 @@ def _published(history: History, axis: str, config: MachineConfig) -> Published 
 
 
 def published_document(revisions: Sequence[Revision], first: Revision | None, config: MachineConfig) -> Published:
-    """Return the newest of an axis' revisions (oldest first), compared with the first one ever."""
+    """Return the newest of an axis' revisions (oldest first), compared with its first one."""
     newest = revisions[-1]
     shown: ParameterSet = newest.set
     firsts = first.set.parameters.as_dict() if first else {}
@@ -120,9 +120,9 @@ def published_document(revisions: Sequence[Revision], first: Revision | None, co
     for name, told in parameters_status(shown).items():
         half = None if told["high"] is None else told["high"] - told["value"]
         change, light = change_light(told["value"], half, firsts.get(name), limits[name])
-        beside = {"first": firsts.get(name), "change": change, "limit": limits[name], "light": light}
-        beside["course"] = [known[name] for each in revisions if name in (known := each.set.parameters.as_dict())]
-        found[name] = Parameter(**{key: told[key] for key in ("value", "low", "high", "unit")}, **beside)
+        more = {"first": firsts.get(name), "change": change, "limit": limits[name], "light": light}
+        more["course"] = [known[name] for each in revisions if name in (known := each.set.parameters.as_dict())]
+        found[name] = Parameter(**{key: told[key] for key in ("value", "low", "high", "unit")}, **more)
     return Published(
         revision=shown.revision,
         published_wall_s=newest.stamp.wall_s,

@@ -1,6 +1,6 @@
-"""Programs before they are cut: their path error without and with the correction, and what their passes taught.
+"""Programs before machining: their path error without and with correction, and what their passes taught.
 
-A program that is dropped is forecast in a process of its own. Nothing here reaches the machine.
+A dropped program is forecast in a child process. Nothing here reaches the machine.
 """
 
 import asyncio
@@ -31,7 +31,7 @@ LONGEST_LINE = 400
 
 
 class Fault(BaseModel):
-    """Why there is no forecast; ``line`` is that of the program at fault, where one is."""
+    """Why there is no forecast; ``line`` is the program line at fault, if there is one."""
 
     code: str
     text: str
@@ -40,7 +40,7 @@ class Fault(BaseModel):
 
 
 class Advice(BaseModel):
-    """The feeds that keep a tolerance, and how far they are: ``lines`` as ``fdhil advise --json`` has them."""
+    """The feeds that keep a tolerance, and their progress: ``lines`` as in ``fdhil advise --json``."""
 
     tolerance_um: float
     state: STATES
@@ -50,7 +50,7 @@ class Advice(BaseModel):
 
 
 class Told(BaseModel):
-    """A program and how far its forecast is; ``forecast`` as ``fdhil correct --json`` has it, and what a map needs."""
+    """A program and the progress of its forecast; ``forecast`` as in ``fdhil correct --json``, plus map data."""
 
     digest: str
     name: str
@@ -63,7 +63,7 @@ class Told(BaseModel):
 
 
 class Kept(BaseModel):
-    """A program that is kept."""
+    """A kept program."""
 
     digest: str
     name: str
@@ -71,14 +71,14 @@ class Kept(BaseModel):
 
 
 class Programs(BaseModel):
-    """The programs that are kept here, the newest first, and how large one may be."""
+    """The kept programs, the newest first, and the largest allowed size."""
 
     programs: list[Kept]
     largest_bytes: int
 
 
 class Learning(BaseModel):
-    """The curves of the programs that have learned, and the passes that the running daemon measured, oldest first."""
+    """The learning curves of programs, and the passes that the running daemon measured, oldest first."""
 
     daemon: bool
     learning: bool
@@ -87,7 +87,7 @@ class Learning(BaseModel):
 
 
 class Jobs(BaseModel):
-    """The newest passes of corrected programs that the history keeps, newest first."""
+    """The newest stored passes of corrected programs, newest first."""
 
     jobs: list[dict[str, Any]]
 
@@ -134,20 +134,20 @@ BODY = {"requestBody": {"content": {"application/octet-stream": {"schema": {"typ
 
 @router.get("")
 async def programs(desk: Programming) -> Programs:
-    """List the programs that are kept."""
+    """List the kept programs."""
     kept = [Kept(digest=job.digest, name=job.name, state=job.forecasting.state) for job in desk.jobs]
     return Programs(programs=kept, largest_bytes=LARGEST_PROGRAM)
 
 
 @router.post("", status_code=202, openapi_extra=BODY)
 async def drop(request: Request, desk: Programming, name: Annotated[str, Query(min_length=1, max_length=255)]) -> Told:
-    """Take an NC program, or a demand where ``name`` ends in .csv, as the body's bytes, and have it forecast."""
+    """Store an NC program, or a demand if ``name`` ends in .csv, from the body's bytes, and have it forecast."""
     return _told(await desk.take(name, request.stream()))
 
 
 @router.post("/named", status_code=202)
 async def take_named(here: Here, desk: Programming, name: Annotated[str, Query(pattern=NAME)]) -> Told:
-    """Have a program forecast that is in the folder of the programs that may be armed from here."""
+    """Have a program of the folder of programs forecast."""
     content = await asyncio.to_thread(content_of, here.config.web.programs_directory, name, LARGEST_PROGRAM)
     return _told(await desk.take(name, _once(content)))
 
@@ -158,7 +158,7 @@ async def _once(content: bytes) -> AsyncIterator[bytes]:
 
 @router.get("/jobs")
 def finished_jobs(here: Here) -> Jobs:
-    """Return the passes of corrected programs with their predicted and measured errors; none without a history."""
+    """Return the passes of corrected programs with predicted and measured errors; none without a history."""
     try:
         with here.history() as history:
             found = list(jobs(history.notices(limit=RECENT_NOTICES)))
@@ -169,7 +169,7 @@ def finished_jobs(here: Here) -> Jobs:
 
 @router.get("/learning")
 async def learning(here: Here, desk: Programming) -> Learning:
-    """Tell what the passes of programs have taught."""
+    """Return what was learned in the passes of programs."""
     try:
         status = await here.daemon.status()
     except (ConnectError, DeviceTimeout):
@@ -188,13 +188,13 @@ async def learning(here: Here, desk: Programming) -> Learning:
 
 @router.get("/{digest}")
 async def program(digest: Digest, desk: Programming) -> Told:
-    """Tell how far a forecast is, and what it says of the whole program."""
+    """Return the progress of a forecast, and its results for the whole program."""
     return _told(desk.job(digest))
 
 
 @router.post("/{digest}/cancel")
 async def cancel(digest: Digest, desk: Programming) -> Told:
-    """End a forecast that is under way."""
+    """Cancel a running forecast."""
     return _told(await desk.cancel(digest))
 
 
@@ -202,7 +202,7 @@ async def cancel(digest: Digest, desk: Programming) -> Told:
 async def feeds(
     digest: Digest, desk: Programming, tolerance_um: Annotated[float, Query(gt=0.0, le=1e6, allow_inf_nan=False)]
 ) -> Told:
-    """Have the feeds found that keep the path within a tolerance, as ``fdhil advise`` does."""
+    """Compute the feeds that keep the path within a tolerance, as ``fdhil advise`` does."""
     return _told(desk.advise(digest, tolerance_um))
 
 
@@ -218,16 +218,16 @@ def part(
     top: Mm | None = None,
     factor: Annotated[float, Query(ge=0.0, le=10_000.0, allow_inf_nan=False)] = 0.0,
 ) -> Json:
-    """Tell the path in the plane of two axes: all of it, or what lies in a box (mm), there with the table's way.
+    """Return the path in the plane of two axes: all of it, or inside a box (mm) with the predicted table path.
 
-    ``factor``: how many times as far the table is drawn from the path; 0 for what the view has room for.
+    ``factor`` enlarges the table's distance from the path; 0: as far as the view has room.
     """
     forecast = desk.forecast(digest)
     try:
         plane = plane_of(forecast, (across, along))
     except ValueError:
-        told = ", ".join(forecast.axes)
-        raise Refused(422, "BadRequest", "this is no plane of the program", f"its axes are {told}") from None
+        listed = ", ".join(forecast.axes)
+        raise Refused(422, "BadRequest", "the program has no such plane", f"its axes are {listed}") from None
     box = None
     if left is not None and right is not None and bottom is not None and top is not None:
         box = Box(left, right, bottom, top)
@@ -243,7 +243,7 @@ def over_time(
     start_s: Annotated[float, Query(ge=0.0, allow_inf_nan=False)] = 0.0,
     end_s: Annotated[float | None, Query(ge=0.0, allow_inf_nan=False)] = None,
 ) -> Json:
-    """Tell contour errors and feed over time."""
+    """Return contour errors and feed over time."""
     forecast = desk.forecast(digest)
     rows = len(forecast.line)
     first = min(int(min(start_s / forecast.dt_s, rows)), rows - 1)
@@ -253,7 +253,7 @@ def over_time(
 
 @router.get("/{digest}/line/{line}")
 def place_of_line(digest: Digest, line: Annotated[int, Path(ge=1, le=10**9)], desk: Programming) -> Json:
-    """Tell where a line of the program has its largest error."""
+    """Return where a program line has its largest error."""
     found = line_place(desk.forecast(digest), line)
     if found is None:
         raise Refused(404, "NotFound", f"line {line} of the program orders no motion", "choose a line that moves")
@@ -267,15 +267,15 @@ def text(
     first: Annotated[int, Query(ge=1, le=10**9)] = 1,
     count: Annotated[int, Query(ge=1, le=MOST_LINES)] = 40,
 ) -> Text:
-    """Tell lines of the program's text."""
+    """Return lines of the program's text."""
     job = desk.job(digest)
     try:
         with job.program.open(encoding="utf-8", errors="replace", newline="\n") as file:
             found = list(islice(file, first - 1, first + count))
     except OSError:
-        raise Refused(404, "NotFound", "the text is not kept (any more)", "drop the file again") from None
-    told = [Line(line=first + k, text=_printable(each)) for k, each in enumerate(found[:count])]
-    return Text(lines=told, more=len(found) > count)
+        raise Refused(404, "NotFound", "the text is not stored (any more)", "drop the file again") from None
+    lines = [Line(line=first + k, text=_printable(each)) for k, each in enumerate(found[:count])]
+    return Text(lines=lines, more=len(found) > count)
 
 
 def _printable(line: str) -> str:

@@ -1,4 +1,4 @@
-"""The signals of one rapid with the model laid over them, what is left, and the spectra of both. Pure."""
+"""The signals of one rapid with the model's, their residuals, and the spectra of both. Pure."""
 
 import math
 from dataclasses import dataclass
@@ -15,16 +15,16 @@ from fdhil.report.typography import typeset
 from fdhil.web.pages.rapid_list import Said
 
 MOST_POINTS = 6000
-"""Points of one curve: a screen shows fewer, and a browser on a phone draws so many at once."""
+"""Points of one curve: more than a screen shows, and few enough for a browser on a phone."""
 DIGITS = 6
 
 Points = list[float | None]
 
 
 class Signal(BaseModel):
-    """A signal in the unit that its name ends with: measured, modelled, and measured less modelled; null is not known.
+    """A signal in the unit that its name ends with: measured, modelled, and the residual; null if unknown.
 
-    ``model`` tells what made the modelled one: "voltage" (the drive under the measured voltage alone), "loop" (the
+    ``model`` is the source of the modelled one: "voltage" (the drive under the measured voltage alone), "loop" (the
     closed loop along the demand), or null. ``residual_rms`` is over the move. The spectra are amplitudes.
     """
 
@@ -41,7 +41,7 @@ class Signal(BaseModel):
 
 
 class Replayed(BaseModel):
-    """What a replay of the recording says with the configuration of today."""
+    """The verdict of a replay of the recording with the present configuration."""
 
     accepted: bool
     fit_percent: float | None
@@ -59,9 +59,9 @@ class Stage(BaseModel):
 
 
 class RapidSignals(BaseModel):
-    """A rapid's signals: point k is ``time_s[k]`` after the first row; of long ones each ``every``-th row is told.
+    """A rapid's signals: point k is ``time_s[k]`` after the first row; of long ones only each ``every``-th row.
 
-    ``turns_hz`` is how often the motor turns in a second at the most: what comes with each turn shows there.
+    ``turns_hz`` is the motor's highest frequency of rotation, where effects of each turn appear.
     """
 
     every: int
@@ -78,6 +78,8 @@ class RapidSignals(BaseModel):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Course:
+    """A signal (n,) with its name and unit, and the curve (n,) of a model."""
+
     name: str
     unit: str
     measured: Float
@@ -122,6 +124,7 @@ def _said(reason: Reason) -> Said:
 
 
 def _courses(overlay: Overlay) -> list[_Course]:
+    """Return the rapid's signals in reading order: cause, response, error."""
     window = overlay.window
     speed, current, model = _modelled(overlay)
     courses = [
@@ -142,6 +145,7 @@ def _courses(overlay: Overlay) -> list[_Course]:
 
 
 def _modelled(overlay: Overlay) -> tuple[Float | None, Float | None, str | None]:
+    """Return speed and current (n,) from the measured voltage, else from the closed loop."""
     window, driven, followed = overlay.window, overlay.driven, overlay.followed
     if driven is not None:
         time_s = np.arange(window.n) * window.dt_s
@@ -156,6 +160,7 @@ def _modelled(overlay: Overlay) -> tuple[Float | None, Float | None, str | None]
 
 
 def _voltage(window: Window) -> list[_Course]:
+    """Return the voltage at the window's rows; a slow sensor's value covers its whole period."""
     if window.voltage_v is not None:
         return [_Course("voltage_v", "V", window.voltage_v)]
     slow = window.slow_voltage
@@ -188,7 +193,7 @@ def _signal(course: _Course, moving: slice, every: int) -> Signal:
 def spectrum(values: Float) -> Float:
     """Return the amplitudes (m,) of a signal (n,) less its mean: a sine of amplitude 1 makes a peak of 1.
 
-    Hann's window, whose peaks are Harris' (1978); lost rows are bridged by a line. Of neighbours the largest is told.
+    Uses Hann's window (Harris 1978); lost samples are interpolated. Of adjacent frequencies the largest is kept.
     """
     if not np.isfinite(values).any():
         return np.full(0, math.nan)

@@ -1,4 +1,4 @@
-"""The rapids: which were recorded, what was said of each, its signals with the model laid over, its recording."""
+"""The recorded rapids: their list, the verdict on each, its signals with the model, its recording."""
 
 import logging
 from collections.abc import AsyncIterator
@@ -40,7 +40,7 @@ async def _replaying(app: FastAPI) -> AsyncIterator[None]:
 
 
 def replayer_of(app: FastAPI) -> Replayer:
-    """Return the one that replays for this application."""
+    """Return the replayer of this application."""
     if not hasattr(app.state, "replayer"):
         app.state.replayer = Replayer(app.state.context.config)
     replayer = app.state.replayer
@@ -69,7 +69,7 @@ def rapids(
     before: Annotated[int | None, Query(ge=1, le=LARGEST_ID)] = None,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
 ) -> Rapids:
-    """Return the newest rapids, or those ``before`` a number, of an axis, a verdict, a reason's class."""
+    """Return the newest rapids, or those ``before`` a number, by axis, verdict and reason."""
     with here.history() as history:
         return page_of(history, _kept(here), axis, verdict, code, before, limit)
 
@@ -83,7 +83,7 @@ def counts(here: Here, axis: Annotated[str | None, Query(pattern="^[A-Z]2?$")] =
 
 @router.get("/recordings/{name:path}", response_class=Response)
 def recording(here: Here, asking: Asking, name: str) -> Response:
-    """Return a recording as its file is, for ``fdhil replay`` and ``fdhil export``."""
+    """Return a recording as its file, for ``fdhil replay`` and ``fdhil export``."""
     try:
         return FileAnswer(open_named(_folder(here), name), name, PARQUET)
     except StoreError as error:
@@ -94,14 +94,14 @@ def recording(here: Here, asking: Asking, name: str) -> Response:
 
 @router.get("/{axis}/{number}")
 def rapid(here: Here, axis: Axis, number: Number) -> RapidTold:
-    """Return what the history has of one rapid."""
+    """Return the stored data of one rapid."""
     with here.history() as history:
         return told_of(history, the_window(history, axis, number), _kept(here))
 
 
 @router.get("/{axis}/{number}/signals", response_model=RapidSignals)
 async def signals(replayer: Replaying, axis: Axis, number: Number) -> Response:
-    """Return a rapid's signals with the model laid over them, as a replay finds it now."""
+    """Return a rapid's signals with the model, as replayed now."""
     return Response(await replayer.signals(axis, number), media_type="application/json")
 
 

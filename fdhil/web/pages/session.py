@@ -1,4 +1,4 @@
-"""Logs in and out, and tells the browser who it is. Open to everyone who reaches the address; it tells no secret."""
+"""Logs in and out, and reports the session to the browser. Open to every client; reveals no secret."""
 
 from typing import Annotated
 
@@ -21,7 +21,7 @@ class Login(BaseModel):
 
 
 class Who(BaseModel):
-    """Who asks, and whether a login is needed: ``role`` is null where nothing may be read yet."""
+    """The client, and whether a login is needed: ``role`` is null if nothing may be read yet."""
 
     name: str
     role: Role | None
@@ -30,7 +30,7 @@ class Who(BaseModel):
 
 
 class LoggedIn(Who):
-    """A login: the token that every further request carries, and for how long at most."""
+    """A login: the token for every further request, and its longest lifetime."""
 
     token: str
     life_s: float
@@ -38,7 +38,7 @@ class LoggedIn(Who):
 
 @router.get("")
 async def who(request: Request, here: AtEntry) -> Who:
-    """Tell who asks."""
+    """Return the client's name and role."""
     asker = here.access.asker(token_of(request.headers))
     acting = here.web.acting
     role, name = (asker.role, asker.name) if asker else (None, "")
@@ -56,6 +56,6 @@ async def log_in(login: Login, request: Request, here: AtEntry) -> LoggedIn:
 
 @router.delete("")
 async def log_out(request: Request, here: AtEntry) -> Who:
-    """Log out: the token is worth nothing from now on."""
+    """Log out: the token becomes invalid."""
     here.access.log_out(token_of(request.headers))
     return await who(request, here)
