@@ -8,11 +8,12 @@ import contextlib
 import json
 import os
 import resource
+import select
 import signal
 import sys
 import threading
 from asyncio.subprocess import PIPE, Process
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +69,12 @@ class BoundedProcess:
         assert self._process.stdout is not None
         return await self._process.stdout.readline()
 
+    async def exchange(self, request: Mapping[str, Any]) -> bytes:
+        """Send a request and return the complete line that answers it; b"" if the process ended before."""
+        await self.send(request)
+        line = await self.read_line()
+        return line if line.endswith(b"\n") else b""
+
     def kill(self) -> None:
         """End it at once, also one that is only about to start."""
         self._killed = True
@@ -97,6 +104,13 @@ def receive_request() -> dict[str, Any]:
     request: dict[str, Any] = json.loads(sys.stdin.buffer.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
     return request
+
+
+def receive_requests(idle_s: float) -> Iterator[dict[str, Any]]:
+    """Yield one request after another until the parent is gone, or has sent none for ``idle_s``."""
+    with open(0, "rb", buffering=0, closefd=False) as lines:  # select does not see buffered lines
+        while select.select([lines], [], [], idle_s)[0] and (line := lines.readline()):
+            yield json.loads(line)
 
 
 def _end_with_parent() -> None:

@@ -97,12 +97,10 @@ class BackgroundCheck:
         return self._going is not None and self._going.abandon()
 
     async def attend(self) -> None:
-        """Raise the error that ended the task of a background check, if any."""
         if self._going is not None and self._going.ended:
             await self._going.task
 
     async def close(self) -> None:
-        """End a running check and wait for its end."""
         self.abandon()
         if self._going is not None:
             await asyncio.wait([self._going.task])

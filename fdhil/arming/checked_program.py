@@ -100,18 +100,15 @@ class CheckedProgram:
         self.errors = errors
 
     def conclude(self, header: Mapping[str, Any]) -> None:
-        """Set the results of the whole check."""
         self.errors = {which: header[which] for which in ("before", "after")}
         self.header = header
 
     @property
     def rows(self) -> int:
-        """The number of rows that have passed."""
         return self.blocks[-1].end if self.blocks else 0
 
     @property
     def whole(self) -> bool:
-        """Whether the whole program passed."""
         return self.header is not None and not self.refused
 
     @property
@@ -142,7 +139,6 @@ class RowStream:
     """The rows of a checked program in the guard's increments; ``end`` is one past the last row handed out."""
 
     def __init__(self, checked: CheckedProgram, program_digest: str, sync_period_s: float) -> None:
-        """Begin at the first row; nothing is read yet."""
         self.checked, self.program_digest = checked, program_digest
         self.axes = checked.axes
         self.end = 0
@@ -163,7 +159,6 @@ class RowStream:
 
     @property
     def done(self) -> bool:
-        """Whether the whole program has been handed out."""
         return self.checked.whole and self._next == len(self.checked.blocks)
 
     def take(self, seconds: float = 0.0) -> Piece:

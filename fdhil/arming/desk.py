@@ -49,8 +49,6 @@ Prepared = TypeVar("Prepared", Armament, Feeding)
 
 
 class Storing(Protocol):
-    """The part of the outcome store that arming needs."""
-
     fault: str | None
     """Why nothing can be stored now; None while storing works."""
 
@@ -91,7 +89,6 @@ class ArmingDesk:
         self._standstill.take(samples)
 
     def hear_nc(self, state: NcState) -> None:
-        """Take the NC's state: a pass that was held or overridden is not the planned one."""
         self._passes.hear_nc(state)
 
     @property

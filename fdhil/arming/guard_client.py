@@ -48,7 +48,6 @@ class GuardClient:
             raise ConnectError.of_socket(str(path), error, absent) from None
 
     def status(self) -> dict[str, Any]:
-        """Return the guard's status document."""
         return self.ask({"request": "status"})
 
     def load(

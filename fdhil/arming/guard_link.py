@@ -45,7 +45,6 @@ class GuardLink:
 
     @property
     def connected(self) -> bool:
-        """Whether there is a connection."""
         return self._client is not None
 
     @property
@@ -61,7 +60,6 @@ class GuardLink:
 
     @property
     def state(self) -> str:
-        """The guard's last state."""
         return str(self._status["state"])
 
     @property
@@ -81,7 +79,6 @@ class GuardLink:
         return self._status
 
     def refresh(self) -> list[Notice]:
-        """Read the status (blocking); return the changes since the last call."""
         self.look()
         return self.take_changes()
 

@@ -20,7 +20,6 @@ class GuardPresence:
         self._asked_s = self._answered_s = -math.inf
 
     def is_there(self) -> bool:
-        """Return whether a guard listens, or did a moment ago."""
         now_s = time.monotonic()
         if now_s - self._asked_s >= ASK_AGAIN_S:
             self._asked_s = now_s

@@ -45,14 +45,12 @@ class Knowledge:
         self._axes = {axis: _Axis() for axis in axes}
 
     def begin(self, newest: Mapping[str, Revision], skills: Sequence[Skill]) -> None:
-        """Start from the stored parameters and skills."""
         for name, revision in newest.items():
             axis = self._axes[name]
             axis.published, axis.published_s = revision.set, self._now_s() - revision.stamp.age_s(self._clock)
         self.note(skills)
 
     def note(self, outcomes: Sequence[Outcome | LoopEstimate]) -> None:
-        """Take outcomes of the pipelines."""
         for outcome in outcomes:
             if isinstance(outcome, ParameterSet):
                 axis = self._axes[outcome.axis]
@@ -65,19 +63,16 @@ class Knowledge:
                 self._axes[outcome.axis].load_changed = True
 
     def note_temperature(self, reading: Temperature) -> None:
-        """Take a temperature."""
         self._axes[reading.axis].temperature_c = reading.celsius
 
     @property
     def temperatures(self) -> dict[str, float]:
-        """The newest temperature of each axis that has one."""
         return {name: axis.temperature_c for name, axis in self._axes.items() if axis.temperature_c is not None}
 
     def _now_s(self) -> float:
         return self._clock.since_boot_ns() * 1e-9
 
     def now(self) -> dict[str, AxisKnowledge]:
-        """Return the present model of every axis."""
         now_s = self._now_s()
         return {
             name: AxisKnowledge(

@@ -85,16 +85,13 @@ class Passes:
         return None if found is None or found[0] != models else found[1]
 
     def forget(self) -> None:
-        """Drop the pass: the program was not armed."""
         self._running = None
 
     def take(self, samples: AxisSamples) -> None:
-        """Take samples while a pass may run."""
         if self._running is not None or self._ended:
             self._taken.append(samples)
 
     def hear_nc(self, state: NcState) -> None:
-        """Take the NC's state while a pass may run."""
         if self._running is not None:
             self._running.hear_nc(state)
 

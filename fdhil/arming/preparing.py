@@ -85,7 +85,6 @@ class Armament:
         return standing_facts(self.stream.axes, config, known, checked.gain_um if checked.whole else self.begun_um)
 
     def progress(self) -> dict[str, Any]:
-        """Return the part of the summary that changes while it is armed."""
         return {"check": self.stream.status()}
 
     def summary(self) -> dict[str, Any]:
@@ -214,15 +213,12 @@ class Feeding:
     facts: dict[str, bool]
 
     def standing_facts(self, config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> dict[str, bool]:
-        """Return the facts that may be withdrawn while it runs."""
         return feeding_facts(tuple(self.laws), config, known)
 
     def progress(self) -> dict[str, Any]:
-        """Return nothing: no part of the summary changes."""
         return {}
 
     def summary(self) -> dict[str, Any]:
-        """Return the operator's summary."""
         return {"program": None, "method": "flatness", "axes": list(self.laws), "facts": dict(self.facts)}
 
 

@@ -218,12 +218,10 @@ def encoded(demand_mm: Mapping[str, Float], offset_um: Mapping[str, Float], conf
 
 
 def header_digest(header: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a header's content."""
     return hashlib.sha256(json.dumps(header, sort_keys=True).encode()).hexdigest()
 
 
 def part_file(folder: Path, key: str) -> Path:
-    """Return the path of the rows while they are being written."""
     return folder / f".{key}.part"
 
 

@@ -46,7 +46,6 @@ class StandingMark:
                 self._kept = True
 
     def remove(self) -> None:
-        """Remove the record: a guard is certain that nothing is applied."""
         if self._kept:
             with suppress(OSError):
                 self._path.unlink(missing_ok=True)

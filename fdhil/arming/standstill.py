@@ -30,7 +30,6 @@ class Standstill:
         self._blocks: Mapping[str, deque[AxisSamples]] = {axis: deque() for axis in config.axis}
 
     def take(self, samples: AxisSamples) -> None:
-        """Take a block of one axis."""
         blocks = self._blocks[samples.axis]
         if samples.tick.size == 0:
             return

@@ -38,7 +38,6 @@ KEPT_ROWS = 4000  # tested against the equations
 LEVELS = 20  # distinct values of a signal; a column with fewer is a state
 EXPLAINED = 0.5  # least product of both equations' shares for columns to be taken as u, i and w
 RPM_FROM = 700.0  # a larger speed without a unit is assumed to be in rpm
-ANGLE_UNITS = ("rad", "deg", "rev")
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,6 @@ class Proposal:
 
     @property
     def toml(self) -> str:
-        """The map as TOML."""
         lines = ["# proposed by fdhil: check every line", "[headers]"]
         lines += [f"{key} = {json.dumps(value)}" for key, value in self.headers.items()]
         if self.aside:
@@ -77,7 +75,6 @@ class Proposal:
         return "\n".join(lines) + "\n"
 
     def lines(self) -> Iterator[str]:
-        """Yield a line of text per column."""
         for each in (*self.columns, *self.aside):
             yield f"  {each.signal:16} {each.heading!r} in {each.unit}: {each.why}"
 

@@ -210,7 +210,6 @@ class History:
         return self._insert("revisions", row, stamp)
 
     def add_loops(self, found: LoopEstimate, stamp: Stamp) -> int:
-        """Store the identified regulators of a drive."""
         verdict = found.verdict
         row = {
             "axis": found.axis,
@@ -229,7 +228,6 @@ class History:
         return [] if self.version < schema.WITH_TERMS else self._read("loops", _of(axis), limit)
 
     def add_skill(self, skill: Skill, stamp: Stamp) -> int:
-        """Store how well a move was predicted."""
         names = ("axis", "tick", "rms_um", "max_um", "delay_ms", "measured_rms_um")
         return self._insert("skills", {name: getattr(skill, name) for name in names}, stamp)
 
@@ -313,7 +311,6 @@ class History:
             return self._db.execute(query, values).fetchall()
 
     def skills(self, axis: str | None = None, limit: int | None = None) -> list[Skill]:
-        """Return the skills of recorded moves, oldest first."""
         return self._read("skills", _of(axis), limit)
 
     def notices(self, limit: int | None = None) -> list[StoredNotice]:
@@ -329,7 +326,6 @@ class History:
         return [replace(notice, acknowledged=given.get(notice.number)) for notice in found]
 
     def acknowledgements(self, limit: int | None = None) -> list[Acknowledgement]:
-        """Return the acknowledgements, oldest first."""
         return [] if self.version < schema.WITH_ACKNOWLEDGEMENTS else self._read("acknowledgements", {}, limit)
 
     def counts(self, axis: str) -> tuple[int, int]:

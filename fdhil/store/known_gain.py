@@ -30,6 +30,5 @@ def known_gain(
 
 
 def recent_skills(config: MachineConfig) -> dict[str, list[Skill]]:
-    """Return the skills of each axis' last moves. Raises StoreError."""
     with History.read(config.store.directory) as history:
         return {axis: history.skills(axis, limit=RECENT_MOVES) for axis in config.axis}

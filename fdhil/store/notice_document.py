@@ -7,7 +7,6 @@ from fdhil.store.rows import Acknowledgement, Stamp, StoredNotice
 
 
 def notice_document(stored: StoredNotice) -> dict[str, Any]:
-    """Return a stored notice for JSON."""
     notice = stored.notice
     return {
         "number": stored.number,

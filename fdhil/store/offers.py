@@ -82,7 +82,6 @@ def newest_accepted(answers: Sequence[Answer], name: str) -> int:
 
 
 def file_name(name: str, version: int) -> str:
-    """Return the file name of an offer."""
     return f"{name}-{version}.offer"
 
 

@@ -77,7 +77,6 @@ def read_position(folder: Path) -> Position:
 
 
 def write_position(folder: Path, position: Position) -> None:
-    """Store how far the outbox was sent. Raises StoreError."""
     write_file(folder / POSITION_FILE, json.dumps(asdict(position)).encode())
 
 
@@ -90,7 +89,6 @@ class Outbox:
         self._windows = Counter[str]()
 
     def enter(self, db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
-        """Add an entry for a row in the row's transaction. Raises sqlite3.Error."""
         if table not in KINDS:
             return
         axis = row.get("axis") or ""
@@ -201,7 +199,6 @@ class OutboxReader:
         return Position(self.store, 0, "", position.about)
 
     def waiting(self, after: int) -> int:
-        """Return how many entries follow one."""
         return int(self._ask("SELECT count(*) FROM outbox WHERE id > ?", (after,))[0][0])
 
     def entries(self, after: int, limit: int) -> list[Entry]:

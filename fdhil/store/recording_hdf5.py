@@ -125,7 +125,6 @@ def _text(value: Any) -> str:
 
 
 def library() -> Any:
-    """Return the HDF5 library. Raises FdhilError without the extra."""
     try:
         import h5py
     except ImportError:

@@ -21,7 +21,6 @@ _OBJECTS = {"object", "opaque", "function", "sparse"}
 
 
 def encode(table: RecordingTable) -> bytes:
-    """Return a table as the bytes of a MATLAB file."""
     units = {name: UNITS[name] for name in table.columns if name in UNITS}
     content = io.BytesIO()
     content_of = {"headers": dict(table.headers), "units": units, **table.columns}

@@ -116,7 +116,6 @@ def _headers(comment: str) -> dict[str, str]:
 
 
 def library() -> Any:
-    """Return the MDF library. Raises FdhilError without the extra."""
     try:
         import asammdf
     except ImportError:

@@ -18,7 +18,6 @@ _META = b"fdhil"
 
 
 def encode(table: RecordingTable) -> bytes:
-    """Return a table as the bytes of a Parquet file."""
     fields = [pa.field(name, pa.float64(), metadata={"unit": UNITS.get(name, "")}) for name in table.columns]
     schema = pa.schema(fields, metadata={_META: json.dumps(dict(table.headers)).encode()})
     sink = pa.BufferOutputStream()

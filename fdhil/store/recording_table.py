@@ -165,7 +165,6 @@ def check_size(rows: int, columns: int, source: str) -> None:
 
 
 def unlike_lengths(sizes: Mapping[str, int], source: str) -> RecordingError:
-    """Return the error for columns of different lengths."""
     return RecordingError(f"{source} has columns of different lengths, {sizes}: export them with one time step")
 
 

@@ -35,7 +35,6 @@ class Stamp:
 
     @staticmethod
     def now(clock: Clock = SYSTEM_CLOCK) -> Stamp:
-        """Return the stamp of this moment."""
         return Stamp(clock.wall_s(), clock.boot_id(), clock.since_boot_ns())
 
     def age_s(self, clock: Clock = SYSTEM_CLOCK) -> float:
@@ -131,7 +130,6 @@ class StoredNotice:
 
     @property
     def is_open(self) -> bool:
-        """Whether it waits to be acknowledged."""
         return self.acknowledged is None and self.notice.severity != "info"
 
 

@@ -121,7 +121,6 @@ def stamp_of(path: Path) -> tuple[int, ...]:
 
 
 def version_of(db: sqlite3.Connection) -> int:
-    """Return the schema version of the file."""
     return int(db.execute("PRAGMA user_version").fetchone()[0])
 
 
@@ -283,7 +282,6 @@ def _storable(value: Any) -> Any:
 
 
 def put_aside(db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
-    """Move a damaged row, as it can be read now, to the quarantine table."""
     with _all_or_nothing(db):
         content = (table, row["id"], ascii(dict(row)))
         db.execute("INSERT INTO quarantine (of, row, content) VALUES (?, ?, ?)", content)

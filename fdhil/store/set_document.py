@@ -41,7 +41,6 @@ def _figures(name: str, value: float, std: float) -> Mapping[str, Any]:
 
 
 def set_document(published: ParameterSet) -> dict[str, Any]:
-    """Return a published set for JSON."""
     return {
         "axis": published.axis,
         "revision": published.revision,

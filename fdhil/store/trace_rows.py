@@ -36,7 +36,6 @@ class Layout:
 
     @property
     def filled(self) -> int:
-        """The number of cells of a row up to its last number."""
         return self.numbers[-1] + 1
 
     def is_row(self, row: Row) -> bool:

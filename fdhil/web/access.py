@@ -67,7 +67,6 @@ class Guesses:
         return self._wrong.get(key, (0, -math.inf))[1]
 
     def wrong(self, *keys: str) -> None:
-        """Count a wrong password."""
         now_s = self._now_s()
         for key in keys:
             count = self.count(key) + 1
@@ -77,7 +76,6 @@ class Guesses:
                 self._wrong.popitem(last=False)
 
     def right(self, *keys: str) -> None:
-        """Reset the counts."""
         for key in keys:
             self._wrong.pop(key, None)
 

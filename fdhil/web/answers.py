@@ -40,7 +40,6 @@ class Refused(Exception):
 
 
 def status_of(error: FdhilError) -> int:
-    """Return the HTTP status of an fdhil error."""
     code = getattr(error, "code", "")
     if code in BY_CODE:
         return BY_CODE[code]

@@ -18,6 +18,5 @@ class FileAnswer(StreamingResponse):
         super().__init__(iter(partial(file.read, PIECE), b""), headers=headers, media_type=media_type)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send the file and close it."""
         with self._file:
             await super().__call__(scope, receive, send)

@@ -36,7 +36,6 @@ class Answers:
         self._one = threading.Lock()
 
     def __call__(self, question: str, **given: str | None) -> Mapping[str, Any]:
-        """Return the answer to a query as JSON data. Raises FdhilError."""
         key = (question, *given.values())
         with self._one:
             at_s, answer = self._kept.pop(key, (-KEPT_S, {}))

@@ -14,7 +14,6 @@ class Json(JSONResponse):
     """
 
     def render(self, content: Any) -> bytes:
-        """Return the body."""
         try:
             return to_json(content, inf_nan_mode="null")
         except PydanticSerializationError:

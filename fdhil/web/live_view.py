@@ -29,7 +29,6 @@ class View:
         self._number = self._seen = 0
 
     def may_send(self) -> bool:
-        """Return whether the browser has drawn enough of what it was sent."""
         return self._number - self._seen < MOST_UNSEEN
 
     def drawn(self, number: int) -> bool:
@@ -38,7 +37,6 @@ class View:
         return self._seen > before
 
     def has_news(self, rings: Mapping[str, Ring]) -> bool:
-        """Return whether a column of any axis is complete."""
         return any(rings[axis].end - self._next.get(axis, rings[axis].begin) >= self.per_column for axis in self._axes)
 
     def message(self, rings: Mapping[str, Ring], fields: Mapping[str, Any]) -> bytes:

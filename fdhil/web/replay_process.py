@@ -7,12 +7,11 @@ when idle for a while: its libraries take 200 MB.
 
 import json
 import resource
-import select
 import sys
 from collections.abc import Mapping
 from typing import Any
 
-from fdhil.bounded_process import limit_process
+from fdhil.bounded_process import limit_process, receive_requests
 from fdhil.config import MachineConfig
 from fdhil.daemon.outcome_store import WINDOWS_FOLDER
 from fdhil.errors import FdhilError
@@ -39,7 +38,6 @@ class Replays:
         self._checked: set[tuple[int, int]] = set()
 
     def signals(self, axis: str, number: int) -> RapidSignals:
-        """Return a rapid with its model. Raises FdhilError, Refused."""
         store = self._config.store.directory
         with History.read(store, checked=self._checked) as history:
             file = the_window(history, axis, number).file
@@ -52,7 +50,6 @@ class Replays:
         return signals_of(lay_over(window, self._config, loops))
 
     def answer(self, request: Mapping[str, Any]) -> str:
-        """Return the line that answers a request."""
         try:
             return "+" + self.signals(str(request["axis"]), int(request["number"])).model_dump_json()
         except Refused as error:
@@ -64,12 +61,12 @@ class Replays:
 def main() -> None:
     """Answer requests until the parent is gone, or for a while without any."""
     limit_process(NICENESS, {resource.RLIMIT_AS: MEMORY_BYTES})
-    with open(0, "rb", buffering=0, closefd=False) as lines:  # select does not see buffered lines
-        settings = json.loads(lines.readline())
-        replays = Replays(MachineConfig.model_validate(settings["config"]), str(settings["digest"]))
-        while select.select([lines], [], [], IDLE_S)[0] and (line := lines.readline()):
-            sys.stdout.write(replays.answer(json.loads(line)) + "\n")
-            sys.stdout.flush()
+    requests = receive_requests(IDLE_S)
+    settings = next(requests)
+    replays = Replays(MachineConfig.model_validate(settings["config"]), str(settings["digest"]))
+    for request in requests:
+        sys.stdout.write(replays.answer(request) + "\n")
+        sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -55,20 +55,17 @@ class Replayer:
             async with asyncio.timeout(LONGEST_S):
                 if self._process is None:
                     self._process = BoundedProcess(PROCESS)
-                    await self._process.start(
-                        {"config": self._config.model_dump(mode="json"), "digest": self._config.digest}
-                    )
-                await self._process.send({"axis": axis, "number": number})
-                answer = await self._process.read_line()
+                    settings = {"config": self._config.model_dump(mode="json"), "digest": self._config.digest}
+                    await self._process.start(settings)
+                answer = await self._process.exchange({"axis": axis, "number": number})
         except (TimeoutError, OSError, ValueError):
-            answer = b""
+            pass
         finally:
-            if not answer.endswith(b"\n"):  # the next request must not get the answer to this one
+            if not answer:  # the next request must not get the answer to this one
                 await self.close()
         return answer
 
     async def close(self) -> None:
-        """End the process."""
         process, self._process = self._process, None
         if process is not None:
             await process.end()

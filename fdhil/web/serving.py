@@ -82,7 +82,6 @@ def serve(web: Web, make: Callable[[], FastAPI], ready: Callable[[str], None]) -
 
 
 def url_of(web: Web, listener: socket.socket) -> str:
-    """Return the address to open in a browser."""
     port = listener.getsockname()[1]
     host = "localhost" if web.host in ("0.0.0.0", "::") else f"[{web.host}]" if ":" in web.host else web.host
     return f"{'https' if web.tls_certificate_file else 'http'}://{host}:{port}"

@@ -69,7 +69,7 @@ def test_the_list_is_filtered_by_its_address(stage: Stage, chromium: Browser) ->
 def test_a_black_box_is_shown_and_given_as_a_file(stage: Stage, chromium: Browser) -> None:
     with tab_of("watcher", stage, chromium) as tab:
         tab.open("/events")
-        tab.page.get_by_role("button", name="Show what the drives did").first.click()
+        tab.page.get_by_role("button", name="Show the drives' signals").first.click()
         tab.page.locator("#black-box").wait_for()
         assert tab.violations() == []
         with tab.page.expect_download() as saved:

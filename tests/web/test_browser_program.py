@@ -58,7 +58,7 @@ def test_a_corner_is_looked_at_by_wheel_pinch_and_keys(judged: Tab) -> None:
     judged.says("dl.readout", "line")
     page.wait_for_url("**?line=4")
     assert page.locator(".listing [aria-current]").inner_text().split() == ["4", "G1", "Y40"]
-    judged.says("main", "Dashed: where the table will be")
+    judged.says("main", "Dashed: predicted table path")
     for key in ("+", "Shift+ArrowLeft", "-", "0"):
         before = seen(judged)
         page.locator("canvas.map").first.press(key)

@@ -77,7 +77,7 @@ def test_two_are_marked_and_compared(reader: Tab) -> None:
     page.wait_for_url(f"**/rapids/{one}?with={other}")
     table = page.get_by_role("table", name=reader.word("rapid.numbers"))
     table.wait_for()
-    assert f"{other} at most" in table.inner_text()
+    assert f"{other} maximum" in table.inner_text()
     reader.says("main", reader.word("rapid.compared.mirrored"))  # they went to and fro
     assert reader.violations() == []
     page.get_by_role("link", name=reader.word("rapid.compare.end")).click()

@@ -47,11 +47,9 @@ class Work:
 
     @property
     def over(self) -> bool:
-        """Whether it has ended."""
         return self.state in ("done", "failed", "cancelled")
 
     def fail(self, code: str, text: str, advice: str, line: int | None = None) -> None:
-        """End it with a fault."""
         self.state, self.fault = "failed", {"code": code, "text": text, "advice": advice, "line": line}
 
 
@@ -70,12 +68,10 @@ class Job:
 
     @property
     def works(self) -> list[Work]:
-        """The running and completed computations."""
         return [self.forecasting, *([self.advising] if self.advising else [])]
 
     @property
     def over(self) -> bool:
-        """Whether all its computations have ended."""
         return all(work.over for work in self.works)
 
 
@@ -90,7 +86,6 @@ class Desk:
 
     @property
     def jobs(self) -> list[Job]:
-        """The kept programs, the newest first."""
         return list(reversed(self._jobs.values()))
 
     def job(self, digest: str) -> Job:
@@ -180,7 +175,6 @@ class Desk:
         return job
 
     async def close(self) -> None:
-        """Cancel everything and remove the files."""
         tasks = [work.task for job in self._jobs.values() for work in job.works if work.task is not None]
         for task in tasks:
             task.cancel()

@@ -32,12 +32,10 @@ class Forecast:
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """The axes, in the order of the columns."""
         return tuple(self.document["axes"])
 
     @property
     def dt_s(self) -> float:
-        """The time from one row to the next."""
         return float(self.document["sync_period_s"])
 
     def actual_mm(self, case: int, rows: slice) -> Float:
