@@ -69,12 +69,6 @@ class BoundedProcess:
         assert self._process.stdout is not None
         return await self._process.stdout.readline()
 
-    async def exchange(self, request: Mapping[str, Any]) -> bytes:
-        """Send a request and return the complete line that answers it; b"" if the process ended before."""
-        await self.send(request)
-        line = await self.read_line()
-        return line if line.endswith(b"\n") else b""
-
     def kill(self) -> None:
         """End it at once, also one that is only about to start."""
         self._killed = True

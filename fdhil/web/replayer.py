@@ -57,13 +57,15 @@ class Replayer:
                     self._process = BoundedProcess(PROCESS)
                     settings = {"config": self._config.model_dump(mode="json"), "digest": self._config.digest}
                     await self._process.start(settings)
-                answer = await self._process.exchange({"axis": axis, "number": number})
+                await self._process.send({"axis": axis, "number": number})
+                answer = await self._process.read_line()
         except (TimeoutError, OSError, ValueError):
             pass
         finally:
-            if not answer:  # the next request must not get the answer to this one
+            whole = answer.endswith(b"\n")
+            if not whole:  # the next request must not get the answer to this one
                 await self.close()
-        return answer
+        return answer if whole else b""
 
     async def close(self) -> None:
         process, self._process = self._process, None
