@@ -59,15 +59,15 @@ class BackgroundCheck:
             await self.close()
             request = self._request(program, program_digest, models, key, config)
             going = self._going = _RunningCheck(request, await asyncio.to_thread(self._opened, key))
-        with contextlib.ExitStack() as left:  # the caller was cancelled, or ``enough`` failed
-            left.callback(self.abandon)
+        with contextlib.ExitStack() as on_failure:  # the caller was cancelled, or ``enough`` failed
+            on_failure.callback(self.abandon)
             found = await going.passed(enough)
-            left.pop_all()
+            on_failure.pop_all()
         return found
 
     def _key(self, program_digest: str, models: Mapping[str, Parameters], config: MachineConfig) -> str:
-        of = [SCHEMA, program_digest, config.digest, {axis: values_of(m) for axis, m in models.items()}]
-        return hashlib.sha256(json.dumps(of).encode()).hexdigest()[:32]
+        parts = [SCHEMA, program_digest, config.digest, {axis: values_of(m) for axis, m in models.items()}]
+        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
 
     def _opened(self, key: str) -> CheckedProgram:
         """Open the file before the child process writes it, so that no rename or removal can come in between."""
@@ -142,19 +142,19 @@ class _RunningCheck:
             self.ended = True
             self._news.set()
 
-    def _take(self, told: Mapping[str, Any]) -> None:
+    def _take(self, message: Mapping[str, Any]) -> None:
         checked = self.checked
         self._news.set()
-        if "progress" in told:
-            self.progress = {"program": self._program, **told["progress"]}
-        elif "block" in told:
-            end, sha256 = told["block"]
-            checked.take(Block(end, sha256, told["last"]), told["errors"])
-        elif "header" in told:
-            checked.refused = tuple(Reason(**each) for each in told["header"]["refused"])
+        if "progress" in message:
+            self.progress = {"program": self._program, **message["progress"]}
+        elif "block" in message:
+            end, sha256 = message["block"]
+            checked.take(Block(end, sha256, message["last"]), message["errors"])
+        elif "header" in message:
+            checked.refused = tuple(Reason(**each) for each in message["header"]["refused"])
             if not checked.refused:
-                checked.conclude(told["header"])
-        elif refused := told.get("refused") or told.get("error"):
+                checked.conclude(message["header"])
+        elif refused := message.get("refused") or message.get("error"):
             checked.refused += (Reason(**refused),)
 
     def _conclude(self, code: int) -> None:

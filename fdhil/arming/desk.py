@@ -44,7 +44,7 @@ ALIVE_S = 0.1  # the guard considers the daemon lost after 0.5 s
 REFRESH_S = 0.5
 LANDING_S = 1.0  # without SYNC; with SYNC a ramp-down that has begun completes on its own
 
-Tell = Callable[[Sequence[Notice]], None]
+Record = Callable[[Sequence[Notice]], None]
 Prepared = TypeVar("Prepared", Armament, Feeding)
 
 
@@ -252,13 +252,13 @@ class ArmingDesk:
 
     def _without_guard(self, error: DeviceError) -> Answer:
         """Return the refusal without a guard, with the offset that the last one may have left."""
-        stands = self.guard.standing
-        if stands.nothing:
+        residual = self.guard.standing
+        if residual.nothing:
             text, _, advice = str(error).rpartition("; ")
             return refusal("GuardAbsent", text, advice)
-        return refusal("OffsetStands", f"{error}; {stands}", START_AND_ADOPT)
+        return refusal("OffsetStands", f"{error}; {residual}", START_AND_ADOPT)
 
-    async def attend(self, tell: Tell) -> None:
+    async def attend(self, record: Record) -> None:
         """Report to the guard that the daemon is alive and which facts hold; record what the guard does.
 
         The guard's answer is not awaited: it takes its time while a program is handed over.
@@ -272,18 +272,18 @@ class ArmingDesk:
             await asyncio.sleep(ALIVE_S)
             turn += 1
             if looking is not None and looking.done():
-                tell(looking.result())
+                record(looking.result())
                 looking = None
                 if self.guard.state in REST:
                     self._release()
 
-    async def stream(self, tell: Tell) -> None:
+    async def stream(self, record: Record) -> None:
         """Hand a long program's rows to the guard as they pass the check, and record refusals."""
         while True:
             await asyncio.sleep(STREAM_S)
             if self._feeder is not None:
-                tell(await asyncio.to_thread(self._feeder.go_on))
-            tell(await asyncio.to_thread(self._passes.digest))
+                record(await asyncio.to_thread(self._feeder.go_on))
+            record(await asyncio.to_thread(self._passes.digest))
             await self._check.attend()
 
     def _facts(self) -> Mapping[str, bool] | None:

@@ -117,11 +117,11 @@ class GuardLink:
                 raise
 
     def _keep(self) -> None:
-        stands = standing(self._status)
-        if stands.nothing:
+        residual = standing(self._status)
+        if residual.nothing:
             self._mark.remove()
-        elif stands.known:
-            self._mark.keep(stands)
+        elif residual.known:
+            self._mark.keep(residual)
 
     def _drop(self) -> None:
         if self._client is not None:
@@ -208,19 +208,19 @@ class GuardLink:
 
 
 def _gone(before: Mapping[str, Any], now: Mapping[str, Any], error: DeviceError) -> Notice:
-    stands = standing(now)
+    residual = standing(now)
     was = "" if before["state"] in GONE else f"it was in state {before['state']}; "
-    text = f"{error}; {was}{stands}"
-    if stands.nothing:
+    text = f"{error}; {was}{residual}"
+    if residual.nothing:
         return Notice("GuardLost", "minor", text)
     return Notice("GuardLost", "MAJOR", f"{text}; {START_AND_ADOPT}")
 
 
-def _severity(state: str, stands: Standing) -> Literal["info", "minor", "MAJOR"]:
+def _severity(state: str, residual: Standing) -> Literal["info", "minor", "MAJOR"]:
     """A guard that is off and has not read its drives yet is no alarm; a known or frozen offset is one."""
-    if state not in AT_REST or stands.nothing:
+    if state not in AT_REST or residual.nothing:
         return "info"
-    return "MAJOR" if state == "FROZEN" or stands.known else "minor"
+    return "MAJOR" if state == "FROZEN" or residual.known else "minor"
 
 
 def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
@@ -236,13 +236,13 @@ def _voided(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
 def _moved(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
     cause = now.get("cause") or {}
     why = f": {cause.get('code', '')}: {cause['text']}" if cause.get("text") else ""
-    stands = standing(now)
-    severity = _severity(now["state"], stands)
-    left = f"; {stands}" if now["state"] in AT_REST else ""
+    residual = standing(now)
+    severity = _severity(now["state"], residual)
+    left = f"; {residual}" if now["state"] in AT_REST else ""
     if before["state"] in GONE:
         return [Notice("GuardFound", severity, f"the guard is running, in state {now['state']}{why}{left}")]
     if before["state"] == now["state"]:
-        known = not left or standing(before).nothing == stands.nothing
+        known = not left or standing(before).nothing == residual.nothing
         return [] if known else [Notice("GuardState", severity, f"{now['state']}{left}")]
     notice = Notice("GuardState", severity, f"{before['state']} -> {now['state']}{why}{left}", cause.get("axis", ""))
     tripped = before["state"] in CHARGED and now["state"] not in CHARGED and cause.get("code") not in ORDERED

@@ -138,9 +138,9 @@ def _writers(
     By the record these are those of all RPDOs that map one, valid or not. The default RPDOs are added: one that did not
     exist, or was invalid, at commissioning was set up by another master since.
     """
-    node, kept = machine.node_id(name), () if record is None else record.rpdos
-    harmless = {identifier_of(cob_id) for cob_id in kept if not cob_id & INVALID_COB_ID}
-    suspect = {identifier_of(cob_id) for cob_id in kept if cob_id & INVALID_COB_ID}
+    node, recorded = machine.node_id(name), () if record is None else record.rpdos
+    harmless = {identifier_of(cob_id) for cob_id in recorded if not cob_id & INVALID_COB_ID}
+    suspect = {identifier_of(cob_id) for cob_id in recorded if cob_id & INVALID_COB_ID}
     suspect |= {base + node for base in COB_RPDO} | {spec.cob_base + node for spec in profile.rpdos}
     same_bus = {n: axis for n, axis in machine.axis.items() if axis.drive.bus == machine.axis[name].drive.bus}
     known = {

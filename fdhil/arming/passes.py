@@ -133,12 +133,16 @@ class Passes:
             "predicted_without": {"rms_um": summary["before"]["rms_um"]},
             "gain": _gains(summary, measured),
         }
-        lesson, notices = _learned(ended)
-        text = _text(report) + ("" if lesson is None else _lesson_text(lesson))
+        learned_offsets, notices = _learned(ended)
+        text = _text(report) + ("" if learned_offsets is None else _lesson_text(learned_offsets))
         if ended.running.disturbed is not None:
             report["disturbed"] = ended.running.disturbed
             text += f"; {ended.running.disturbed}: the pass is not used for learning"
-        learned = {} if lesson is None else {"learned": {"passes": len(lesson.curve_um), "curve_um": lesson.curve_um}}
+        learned = (
+            {}
+            if learned_offsets is None
+            else {"learned": {"passes": len(learned_offsets.curve_um), "curve_um": learned_offsets.curve_um}}
+        )
         self.reports.append({**report, "text": text, **learned})
         self._keep_or_break(ended, report, text)
         return [_notice(report, text), *notices]
@@ -335,9 +339,9 @@ def _text(report: Mapping[str, Any]) -> str:
     return f"{text}; it ended early: {report['late'] or report['ended_by']}"
 
 
-def _lesson_text(lesson: Lesson) -> str:
-    newest = " ".join(f"{left_um:.2f}" for left_um in lesson.curve_um[-SHOWN_CURVE:])
-    return f"; learned from {len(lesson.curve_um)} passes; residuals of the last ones {newest} um"
+def _lesson_text(learned: Lesson) -> str:
+    newest = " ".join(f"{left_um:.2f}" for left_um in learned.curve_um[-SHOWN_CURVE:])
+    return f"; learned from {len(learned.curve_um)} passes; residuals of the last ones {newest} um"
 
 
 def _notice(report: Mapping[str, Any], text: str) -> Notice:

@@ -233,9 +233,9 @@ def keep(folder: Path, key: str, request: Callable[[BinaryIO], dict[str, Any]]) 
     part = part_file(folder, key)
     try:
         make_folder(folder)
-        for left in folder.glob(".*.part"):  # left by a check that was ended
-            if left != part:
-                left.unlink()
+        for leftover in folder.glob(".*.part"):  # left by a check that was ended
+            if leftover != part:
+                leftover.unlink()
         with part.open("wb") as body:
             header = request(body)
             body.flush()

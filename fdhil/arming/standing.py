@@ -95,12 +95,16 @@ def lost(before: Mapping[str, Any], arming: bool) -> Mapping[str, Any]:
     if before["state"] in GONE and not arming:
         return before
     last = {**before, "state": "lost" if arming or before["state"] not in AT_REST else before["state"]}
-    stands = standing(last)
-    kept = {"may_stand_um": stands.offset_um, "feedforward": before.get("feedforward"), "last_state": before["state"]}
-    if stands.nothing:
+    residual = standing(last)
+    known = {
+        "may_stand_um": residual.offset_um,
+        "feedforward": before.get("feedforward"),
+        "last_state": before["state"],
+    }
+    if residual.nothing:
         text = "the guard is gone; by its last status nothing was applied"
-        return {"state": "absent", "text": text, **kept}
-    return {"state": "lost", "text": f"the guard is gone; {stands}; {START_AND_ADOPT}", **kept}
+        return {"state": "absent", "text": text, **known}
+    return {"state": "lost", "text": f"the guard is gone; {residual}; {START_AND_ADOPT}", **known}
 
 
 def landed(
@@ -124,11 +128,11 @@ def landed(
 
 def verdict(status: Mapping[str, Any]) -> dict[str, Any]:
     """Return the answer to a request for zero: ok only if the guard is off and certain that nothing is applied."""
-    stands, state = standing(status), status["state"]
-    report = {"state": state, "may_stand_um": dict(stands.offset_um)}
-    if state == "OFF" and stands.nothing:
-        return {"ok": True, "text": f"guard: OFF, {stands}", **report}
+    residual, state = standing(status), status["state"]
+    report = {"state": state, "may_stand_um": dict(residual.offset_um)}
+    if state == "OFF" and residual.nothing:
+        return {"ok": True, "text": f"guard: OFF, {residual}", **report}
     cause = (status.get("cause") or {}).get("text")
-    text = f"the guard is {state}" + (f" ({cause})" if cause else "") + f": {stands}"
+    text = f"the guard is {state}" + (f" ({cause})" if cause else "") + f": {residual}"
     advice = ADOPT if state in AT_REST else f"check fdhil status; if it does not end, {ADOPT}"
     return {"ok": False, "code": "OffsetStands", "text": text, "advice": advice, **report}

@@ -34,13 +34,13 @@ class StandingMark:
         left = {"state": "lost", "may_stand_um": offsets if isinstance(offsets, dict) else {}}
         return {**left, "text": f"no guard has run since; {standing(left)}; {START_AND_ADOPT}"}
 
-    def keep(self, stands: Standing) -> None:
+    def keep(self, residual: Standing) -> None:
         """Record what may be applied: before it is sent, or as soon as it is reported.
 
         A store that cannot be written reports that itself, and nothing can be armed then.
         """
         if not self._kept:
-            offset_um = {**stands.offset_um, **dict.fromkeys(stands.fed)}
+            offset_um = {**residual.offset_um, **dict.fromkeys(residual.fed)}
             with suppress(StoreError):
                 write_file(self._path, json.dumps(offset_um).encode())
                 self._kept = True

@@ -31,9 +31,9 @@ def kept_lessons(folder: Path, config_digest: str) -> list[tuple[float, str, Les
             written_s = path.stat().st_mtime
         except FileNotFoundError:  # the daemon removed it in the meantime
             continue
-        lesson = read_lesson(path)
-        if lesson is not None:
-            found.append((written_s, path.name.partition("-")[0], lesson))
+        learned = read_lesson(path)
+        if learned is not None:
+            found.append((written_s, path.name.partition("-")[0], learned))
     return sorted(found, key=lambda entry: -entry[0])
 
 
@@ -45,11 +45,11 @@ def read_lesson(path: Path) -> Lesson | None:
                 return None
             offsets = {str(axis): np.asarray(found[f"offset_{axis}_um"], np.float64) for axis in found["axes"]}
             curve = tuple(float(value) for value in found["curve_um"])
-            lesson = Lesson(offsets, float(found["without_um"]), float(found["gain"]), curve)
+            learned = Lesson(offsets, float(found["without_um"]), float(found["gain"]), curve)
     except (zipfile.BadZipFile, *UNREADABLE):
         return None
     finite = all(u.ndim == 1 and np.isfinite(u).all() for u in offsets.values())
-    return lesson if offsets and finite and np.isfinite([lesson.without_um, lesson.gain]).all() else None
+    return learned if offsets and finite and np.isfinite([learned.without_um, learned.gain]).all() else None
 
 
 def write_lesson(path: Path, lesson: Lesson) -> None:

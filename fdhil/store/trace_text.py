@@ -209,8 +209,8 @@ def _table(body: Body, head: Head, decimal: str) -> RecordingTable:
             clocks.update(named[j])
     unclear = dict(head.uneven)
     for name, (line, places) in head.twice.items():
-        stands = " and ".join(f"#{j + 1}" for j in places)
-        unclear[name] = f"names {stands} (line {line}): use one of these as its name"
+        columns_of_name = " and ".join(f"#{j + 1}" for j in places)
+        unclear[name] = f"names {columns_of_name} (line {line}): use one of these as its name"
         doubts |= _uneven_times(name, [f"#{j + 1}" for j in places if j < body.layout.width], columns)
     doubts |= {name: why for name, why in unclear.items() if name not in columns}
     return RecordingTable({}, columns, frozenset(clocks), doubts, body.interruption, texts=texts)

@@ -115,8 +115,8 @@ def _answer_faults(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def wrong(_request: Request, error: RequestValidationError) -> Json:
-        told = "; ".join(f"{'.'.join(map(str, fault['loc'][1:]))}: {fault['msg']}" for fault in error.errors()[:5])
-        return Json(refusal("BadRequest", told, "correct the listed values"), 422)
+        faults = "; ".join(f"{'.'.join(map(str, fault['loc'][1:]))}: {fault['msg']}" for fault in error.errors()[:5])
+        return Json(refusal("BadRequest", faults, "correct the listed values"), 422)
 
     @app.exception_handler(HTTPException)
     async def none_such(_request: Request, error: HTTPException) -> Json:
@@ -124,8 +124,8 @@ def _answer_faults(app: FastAPI) -> None:
             return await refused(_request, error.__cause__)
         code = {404: "NotFound", 405: "NoSuchMethod"}.get(error.status_code, "BadRequest")
         text = {404: "there is nothing at this address", 405: "this address does not support the method"}
-        told = refusal(code, text.get(error.status_code, str(error.detail)), "see /api/openapi.json")
-        return Json(told, error.status_code, headers=error.headers)
+        faults = refusal(code, text.get(error.status_code, str(error.detail)), "see /api/openapi.json")
+        return Json(faults, error.status_code, headers=error.headers)
 
     @app.exception_handler(Exception)
     async def broken(request: Request, error: Exception) -> Json:

@@ -57,14 +57,14 @@ async def _context(connection: HTTPConnection) -> Context:
 
 
 async def _asker(connection: HTTPConnection) -> Asker:
-    asker = connection.scope["fdhil.asker"]  # set by the gate
-    assert isinstance(asker, Asker)
-    return asker
+    principal = connection.scope["fdhil.principal"]  # set by the gate
+    assert isinstance(principal, Asker)
+    return principal
 
 
-AtEntry = Annotated[Entry, Depends(_entry)]
+LoginDependency = Annotated[Entry, Depends(_entry)]
 """Route parameter: the login data."""
-Here = Annotated[Context, Depends(_context)]
-"""Route parameter: the machine, as in ``def windows(here: Here) -> ...``."""
-Asking = Annotated[Asker, Depends(_asker)]
+MachineDependency = Annotated[Context, Depends(_context)]
+"""Route parameter: the machine, as in ``def windows(context: MachineDependency) -> ...``."""
+PrincipalDependency = Annotated[Asker, Depends(_asker)]
 """Route parameter: the client's name and role."""

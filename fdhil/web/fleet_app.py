@@ -53,7 +53,7 @@ async def _answers(request: Request) -> Answers:
     return answers
 
 
-Asked = Annotated[Answers, Depends(_answers)]
+CacheDependency = Annotated[Answers, Depends(_answers)]
 
 
 def make_fleet_app(web: Web, ask: Ask) -> FastAPI:
@@ -64,35 +64,38 @@ def make_fleet_app(web: Web, ask: Ask) -> FastAPI:
 
 
 @router.get("")
-def machines(asked: Asked) -> Mapping[str, Any]:
+def machines(cache: CacheDependency) -> Mapping[str, Any]:
     """Return all machines, and what is due."""
-    return asked("status")
+    return cache("status")
 
 
 @router.get("/outliers")
-def outliers(asked: Asked, by: Label = "type") -> Mapping[str, Any]:
+def outliers(cache: CacheDependency, by: Label = "type") -> Mapping[str, Any]:
     """Return the axes that differ from their peers: those of machines with the same label ``by``."""
-    return asked("outliers", by=by, axis=None)
+    return cache("outliers", by=by, axis=None)
 
 
 @router.get("/compare")
 def compare(
-    asked: Asked, parameter: Literal["R", "L", "K", "Jt", "ft", "Cd"], by: Label = "type", axis: Axis | None = None
+    cache: CacheDependency,
+    parameter: Literal["R", "L", "K", "Jt", "ft", "Cd"],
+    by: Label = "type",
+    axis: Axis | None = None,
 ) -> Mapping[str, Any]:
     """Return one parameter of all machines side by side."""
-    return asked("compare", parameter=parameter, by=by, axis=axis)
+    return cache("compare", parameter=parameter, by=by, axis=axis)
 
 
 @router.get("/services")
-def services(asked: Asked, machine: Machine | None = None) -> Mapping[str, Any]:
+def services(cache: CacheDependency, machine: Machine | None = None) -> Mapping[str, Any]:
     """Return the services, and what each changed."""
-    return asked("services", machine=machine)
+    return cache("services", machine=machine)
 
 
 @router.get("/axis")
-def axis(asked: Asked, machine: Machine, axis: Axis) -> dict[str, Any]:
+def axis(cache: CacheDependency, machine: Machine, axis: Axis) -> dict[str, Any]:
     """Return the trend of each parameter of an axis, with its newest sets."""
-    courses = [asked("trend", machine=machine, axis=axis, parameter=name) for name in PARAMETERS]
+    courses = [cache("trend", machine=machine, axis=axis, parameter=name) for name in PARAMETERS]
     if not courses[0]["sets"]:
         raise Refused(
             404,

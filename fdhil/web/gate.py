@@ -60,13 +60,13 @@ class Gate:
         headers = Headers(scope=scope)
         try:
             self._check_place(scope, headers)
-            asker = self._check_asker(scope, headers)
+            principal = self._check_asker(scope, headers)
             most, within_s = (LARGEST_PROGRAM, PROGRAM_S) if _computes(scope["path"]) else (LARGEST_BODY, BODY_S)
             _check_length(headers, most)
         except Refused as refused:
             await _refuse(scope, send, refused)
             return
-        scope["fdhil.asker"] = asker
+        scope["fdhil.principal"] = principal
         if scope["type"] == "websocket":
             await self._app(scope, receive, send)
         else:
@@ -92,27 +92,27 @@ class Gate:
 
     def _check_asker(self, scope: Scope, headers: Headers) -> Asker:
         path, token = scope["path"], token_of(headers)
-        asker = self._access.asker(token)
+        principal = self._access.asker(token)
         writes = scope["type"] == "http" and scope["method"] not in READING
         if writes and headers.get("x-fdhil") != "1":
             raise Refused(403, "BadOrigin", "the header X-Fdhil is missing, nothing was done", "send X-Fdhil: 1")
         if not path.startswith(API) or path == SESSION:
-            return asker or Asker("", "watch")
-        if asker is None:
+            return principal or Asker("", "watch")
+        if principal is None:
             text = "not logged in, or the login has expired; nothing was done"
             raise Refused(401, "AuthRequired", text, "log in again")
         if writes and not _computes(path):
-            self._check_acting(path, asker)
-        return asker
+            self._check_acting(path, principal)
+        return principal
 
-    def _check_acting(self, path: str, asker: Asker) -> None:
+    def _check_acting(self, path: str, principal: Asker) -> None:
         if not self._access.by_login:
             text = "no user may act in the browser: there are no users; nothing was done"
             raise Refused(401, "AuthRequired", text, "set web.users_file and add a user with fdhil web-user")
         if path == DISARM:
             return
-        if asker.role != "operate":
-            text = f"{asker.name} has the role {asker.role}, nothing was done"
+        if principal.role != "operate":
+            text = f"{principal.name} has the role {principal.role}, nothing was done"
             raise Refused(403, "RoleRequired", text, "ask a user with the role operate")
         if not self._settings.acting:
             text = "only disarming is allowed in the browser here, nothing was done"
@@ -174,11 +174,11 @@ def _bounded(receive: Receive, most: int, within_s: float) -> Receive:
 
 
 def _with_headers(scope: Scope, send: Send) -> Send:
-    kept = "no-store" if scope["path"].startswith(API) else "no-cache"
+    cache_control = "no-store" if scope["path"].startswith(API) else "no-cache"
 
     async def sending(message: Message) -> None:
         if message["type"] == "http.response.start":
-            more = {**HEADERS, "cache-control": kept}
+            more = {**HEADERS, "cache-control": cache_control}
             message["headers"] = [*message["headers"], *((k.encode(), v.encode()) for k, v in more.items())]
         await send(message)
 

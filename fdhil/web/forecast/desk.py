@@ -254,5 +254,5 @@ async def _written(part: Path, content: AsyncIterable[bytes]) -> str:
 def shown(name: str) -> str:
     """Return a file name for display: its last part, printable, of limited length."""
     last = name.replace("\\", "/").rpartition("/")[2]
-    kept = "".join(letter for letter in last if letter.isprintable())[:LONGEST_NAME].strip()
-    return kept or "program"
+    printable = "".join(letter for letter in last if letter.isprintable())[:LONGEST_NAME].strip()
+    return printable or "program"

@@ -25,17 +25,17 @@ def lessons(config: MachineConfig, names: Mapping[str, str]) -> list[dict[str, A
     ``without_um`` that of the last pass without learned offsets.
     """
     curves = []
-    for stamp_s, program, lesson in kept_lessons(config.store.directory / "lessons", config.digest)[:SHOWN]:
+    for stamp_s, program, learned in kept_lessons(config.store.directory / "lessons", config.digest)[:SHOWN]:
         name = next((name for digest, name in names.items() if digest.startswith(program)), None)
         curves.append(
             {
                 "program": program,
                 "name": name,
                 "last_s": stamp_s,
-                "passes": len(lesson.curve_um),
-                "curve_um": list(lesson.curve_um),
-                "without_um": lesson.without_um,
-                "gain": lesson.gain,
+                "passes": len(learned.curve_um),
+                "curve_um": list(learned.curve_um),
+                "without_um": learned.without_um,
+                "gain": learned.gain,
             }
         )
     return curves

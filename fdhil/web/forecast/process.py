@@ -51,7 +51,7 @@ def forecast(program: Path, name: str, config: MachineConfig, folder: Path, repo
     models, parameters, config = newest_models(reference, config)
     report_progress({"step": "correct", "rows": reference.time_s.size})
     planned = correction.plan(reference, models, config)
-    predicted = known_gain(planned, models, config, any(told["revision"] for told in parameters.values()))
+    predicted = known_gain(planned, models, config, any(state["revision"] for state in parameters.values()))
     document = correction_document(name, planned, predicted, models) | {
         "rows": reference.time_s.size,
         "sync_period_s": reference.dt_s,

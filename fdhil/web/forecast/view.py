@@ -58,10 +58,10 @@ def view(forecast: Forecast, plane: tuple[int, int], box: Box | None, factor: fl
         rows = np.arange(first, last)[::step]
         most = max(8, MOST_POINTS * rows.size * step // max(1, count))
         points = rows if whole else rows[knots(_seen(forecast, flat, rows, size_mm), most)]
-        told = _run(forecast, flat, points, last)
+        run = _run(forecast, flat, points, last)
         if whole:
-            told |= {"table": [_table(forecast, plane, slice(first, last), case, factor) for case in (BEFORE, AFTER)]}
-        runs.append(told)
+            run |= {"table": [_table(forecast, plane, slice(first, last), case, factor) for case in (BEFORE, AFTER)]}
+        runs.append(run)
     return {"rows": count, "whole": whole, "factor": factor, "runs": runs}
 
 
@@ -117,19 +117,19 @@ def knots(seen: Float, most: int) -> Int:
     """
     end = len(seen) - 1
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(seen[:, :2], axis=0).T))])
-    kept = {0, end, *range(STRETCH, end, STRETCH)}
-    starts = sorted(kept)
+    knot_rows = {0, end, *range(STRETCH, end, STRETCH)}
+    starts = sorted(knot_rows)
     waiting = [_worst(seen, way, first, last) for first, last in pairwise(starts)]
     heapq.heapify(waiting)
-    while waiting and len(kept) < most:
+    while waiting and len(knot_rows) < most:
         off, first, at, last = heapq.heappop(waiting)
         if -off < 1.0:
             break
-        kept.add(at)
+        knot_rows.add(at)
         for begin, stop in ((first, at), (at, last)):
             if stop - begin > 1:
                 heapq.heappush(waiting, _worst(seen, way, begin, stop))
-    return np.array(sorted(kept))
+    return np.array(sorted(knot_rows))
 
 
 def _worst(seen: Float, way: Float, first: int, last: int) -> tuple[float, int, int, int]:

@@ -14,7 +14,7 @@ from fdhil.arming.token import TOKEN_NAME, given_credential, read_token
 from fdhil.config import MachineConfig
 from fdhil.daemon.status import config_difference
 from fdhil.web.answers import Refused, granted
-from fdhil.web.context import Asking, Context, Here
+from fdhil.web.context import Context, MachineDependency, PrincipalDependency
 from fdhil.web.gate import token_of
 from fdhil.web.programs import NAME, Program, listed, look_at
 
@@ -78,28 +78,30 @@ class Done(BaseModel):
 
 
 @router.get("/programs")
-def programs(here: Here) -> Choice:
+def programs(context: MachineDependency) -> Choice:
     """Return what can be armed from here."""
-    folder = here.config.web.programs_directory
-    feeds = any(axis.feedforward is not None for axis in here.config.axis.values())
+    folder = context.config.web.programs_directory
+    feeds = any(axis.feedforward is not None for axis in context.config.axis.values())
     return Choice(programs=listed(folder) if folder else [], methods=list(tables.CORRECTIONS), feedforward=feeds)
 
 
 @router.get("/plan")
 async def plan(
-    here: Here, program: Annotated[ProgramName | None, Query()] = None, method: Annotated[Method, Query()] = "inverse"
+    context: MachineDependency,
+    program: Annotated[ProgramName | None, Query()] = None,
+    method: Annotated[Method, Query()] = "inverse",
 ) -> Plan:
     """Return what arming would move. Nothing is done yet."""
-    return await _plan(here, program, method)
+    return await _plan(context, program, method)
 
 
-async def _plan(here: Context, name: str | None, method: Method) -> Plan:
+async def _plan(context: Context, name: str | None, method: Method) -> Plan:
     """Use the limits of the running daemon, whatever the configuration file contains by now."""
-    config = here.config
+    config = context.config
     if name is None and method != "flatness":
         raise Refused(422, "BadRequest", f"the method {method} needs a program, and none was named", "choose a program")
     program = None if name is None else await asyncio.to_thread(look_at, config.web.programs_directory, name)
-    status = await here.daemon.status()
+    status = await context.daemon.status()
     axes = _reaches(status["limits"], feeds=program is None)
     if not axes:
         text = "the configuration allows no offsets on any axis"
@@ -112,19 +114,19 @@ async def _plan(here: Context, name: str | None, method: Method) -> Plan:
 
 def _reaches(limits: Mapping[str, Mapping[str, float | None]], feeds: bool) -> dict[str, AxisReach]:
     return {
-        name: AxisReach(**{key: None if (key in FED) is not feeds else value for key, value in told.items()})
-        for name, told in limits.items()
-        if not feeds or told["max_torque_nm"] is not None
+        name: AxisReach(**{key: None if (key in FED) is not feeds else value for key, value in values.items()})
+        for name, values in limits.items()
+        if not feeds or values["max_torque_nm"] is not None
     }
 
 
 @router.post("/arm")
-async def arm(arming: Arming, request: Request, here: Here, asking: Asking) -> Done:
+async def arm(arming: Arming, request: Request, context: MachineDependency, principal: PrincipalDependency) -> Done:
     """Arm the confirmed plan; if the browser disconnects during the check, nothing is armed.
 
     The daemon's answer is compared with the plan, and disarmed if the program differs.
     """
-    shown = await _plan(here, arming.program, arming.method)
+    shown = await _plan(context, arming.program, arming.method)
     if shown.confirm != arming.confirm:
         text = "the program or the limits have changed since they were shown; nothing is armed"
         raise Refused(409, "PlanChanged", text, "check the present plan, and confirm again")
@@ -134,31 +136,31 @@ async def arm(arming: Arming, request: Request, here: Here, asking: Asking) -> D
         "program_digest": shown.program and shown.program.sha256,
         "method": arming.method,
         "whole": arming.whole,
-        "token": await asyncio.to_thread(_operators_token, here.config),
-        "by": asking.name,
+        "token": await asyncio.to_thread(_operators_token, context.config),
+        "by": principal.name,
     }
-    answer = granted(await _while_there(request, here, asked))
+    answer = granted(await _while_there(request, context, asked))
     if shown.program is not None and answer.get("program_digest") != shown.program.sha256:
-        await here.daemon.ask({"request": "disarm", "by": asking.name}, DISARM_S)
+        await context.daemon.ask({"request": "disarm", "by": principal.name}, DISARM_S)
         text = "the program was changed while it was armed; it was disarmed again"
         raise Refused(409, "PlanChanged", text, "check the present plan, and confirm again")
     return Done(text=str(answer["text"]), state=str(answer.get("state", "ARMED")))
 
 
-async def _while_there(request: Request, here: Context, asked: Mapping[str, Any]) -> Mapping[str, Any]:
+async def _while_there(request: Request, context: Context, asked: Mapping[str, Any]) -> Mapping[str, Any]:
     """Wait for the daemon while the browser waits and its user may arm; else the daemon abandons the check."""
-    asking = asyncio.ensure_future(here.daemon.ask(asked, ARM_S, progress=lambda _: None))
+    pending = asyncio.ensure_future(context.daemon.ask(asked, ARM_S, progress=lambda _: None))
     try:
-        while not (await asyncio.wait([asking], timeout=LOOK_S))[0]:
+        while not (await asyncio.wait([pending], timeout=LOOK_S))[0]:
             if await request.is_disconnected():
                 raise Refused(409, "Abandoned", "the browser disconnected, nothing is armed", "arm again")
-            asker = here.access.asker(token_of(request.headers))
-            if asker is None or asker.role != "operate":
+            principal = context.access.asker(token_of(request.headers))
+            if principal is None or principal.role != "operate":
                 text = "the login has expired, or the user lost the role operate; nothing is armed"
                 raise Refused(401, "AuthRequired", text, "log in again")
-        return await asking
+        return await pending
     finally:
-        asking.cancel()
+        pending.cancel()
 
 
 def _operators_token(config: MachineConfig) -> str:
@@ -168,7 +170,7 @@ def _operators_token(config: MachineConfig) -> str:
 
 
 @router.post("/disarm")
-async def disarm(here: Here, asking: Asking) -> Done:
+async def disarm(context: MachineDependency, principal: PrincipalDependency) -> Done:
     """Ramp the correction to zero and wait until zero is read back; what is being prepared is not armed."""
-    answer = granted(await here.daemon.ask({"request": "disarm", "by": asking.name}, DISARM_S))
+    answer = granted(await context.daemon.ask({"request": "disarm", "by": principal.name}, DISARM_S))
     return Done(text=str(answer["text"]), state=str(answer.get("state", "OFF")))

@@ -9,7 +9,7 @@ from pydantic import BaseModel, Field
 from fdhil.daemon.notice_book import MOST_NOTE
 from fdhil.store.history import RECENT_NOTICES
 from fdhil.web.answers import granted
-from fdhil.web.context import Asking, Here
+from fdhil.web.context import MachineDependency, PrincipalDependency
 from fdhil.web.file_answer import FileAnswer
 from fdhil.web.pages.black_boxes import BlackBox, Envelope, envelope, listed, opened
 from fdhil.web.pages.event_list import MOST_PAGE, Events, Severity, page
@@ -37,7 +37,7 @@ class Done(BaseModel):
 
 @router.get("")
 def events(
-    here: Here,
+    context: MachineDependency,
     axis: Annotated[str | None, Query(max_length=32)] = None,
     code: Annotated[str | None, Query(max_length=64)] = None,
     severity: Severity | None = None,
@@ -45,31 +45,31 @@ def events(
     limit: Annotated[int, Query(ge=1, le=MOST_PAGE)] = 50,
 ) -> Events:
     """Return the newest notices, the unacknowledged ones first."""
-    with here.history() as history:
+    with context.history() as history:
         notices = history.notices(limit=RECENT_NOTICES)
     return page(notices, limit=limit, before=before, axis=axis, code=code, severity=severity)
 
 
 @router.post("/acknowledge")
-async def acknowledge(wanted: Acknowledgement, here: Here, asking: Asking) -> Done:
+async def acknowledge(wanted: Acknowledgement, context: MachineDependency, principal: PrincipalDependency) -> Done:
     """Acknowledge notices; the daemon stores the user and the time."""
-    request = {"request": "acknowledge", **wanted.model_dump(exclude_none=True), "by": asking.name}
-    return Done.model_validate(granted(await here.daemon.ask(request)))
+    request = {"request": "acknowledge", **wanted.model_dump(exclude_none=True), "by": principal.name}
+    return Done.model_validate(granted(await context.daemon.ask(request)))
 
 
 @router.get("/black-boxes")
-def black_boxes(here: Here) -> list[BlackBox]:
+def black_boxes(context: MachineDependency) -> list[BlackBox]:
     """Return the stored black boxes, newest first."""
-    return listed(here.config.store.directory)
+    return listed(context.config.store.directory)
 
 
 @router.get("/black-boxes/{name}")
-def black_box(name: str, here: Here) -> Envelope:
+def black_box(name: str, context: MachineDependency) -> Envelope:
     """Return the envelope of the drives' signals in a black box."""
-    return envelope(here.config.store.directory, name, here.config)
+    return envelope(context.config.store.directory, name, context.config)
 
 
 @router.get("/black-boxes/{name}/file", response_class=Response)
-def black_box_file(name: str, here: Here) -> Response:
+def black_box_file(name: str, context: MachineDependency) -> Response:
     """Return a black box as a file: a log for candump's tools."""
-    return FileAnswer(opened(here.config.store.directory, name), name, "text/plain; charset=us-ascii")
+    return FileAnswer(opened(context.config.store.directory, name), name, "text/plain; charset=us-ascii")

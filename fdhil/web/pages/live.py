@@ -16,7 +16,7 @@ from starlette.websockets import WebSocketDisconnect
 from fdhil.daemon.control import SOCKET_NAME
 from fdhil.web.access import place_of
 from fdhil.web.answers import Refused
-from fdhil.web.context import Asking, Here
+from fdhil.web.context import MachineDependency, PrincipalDependency
 from fdhil.web.gate import token_of
 from fdhil.web.live_feed import KEPT_S, MAX_BROWSERS, LiveFeed, Viewer
 from fdhil.web.live_ring import DRAWN, UNITS
@@ -80,7 +80,7 @@ class Samples(BaseModel):
 
 @router.get("/samples")
 async def samples(  # a coroutine: in the loop, which also writes the rings
-    here: Here,
+    context: MachineDependency,
     feed: Feed,
     first_tick: Annotated[int, Query(ge=0, le=2**53)],
     end_tick: Annotated[int, Query(ge=0, le=2**53)],
@@ -91,7 +91,7 @@ async def samples(  # a coroutine: in the loop, which also writes the rings
 
     Missing samples are null: the last five minutes are stored, and only while a browser watches.
     """
-    named = _axes_of(here, axes)
+    named = _axes_of(context, axes)
     end = max(first_tick + 1, end_tick)
     first = max(first_tick, end - feed.rings[named[0]].capacity)
     per_column = max(1, -(-(end - first) // columns))
@@ -110,19 +110,19 @@ async def samples(  # a coroutine: in the loop, which also writes the rings
     )
 
 
-def _axes_of(here: Here, axes: str) -> list[str]:
-    named = list(dict.fromkeys(axes.split(","))) if axes else list(here.config.axis)
-    if unknown := [axis for axis in named if axis not in here.config.axis]:
+def _axes_of(context: MachineDependency, axes: str) -> list[str]:
+    named = list(dict.fromkeys(axes.split(","))) if axes else list(context.config.axis)
+    if unknown := [axis for axis in named if axis not in context.config.axis]:
         text = f"there is no axis {unknown[0]!r}"
-        raise Refused(404, "NoSuchAxis", text, f"use {', '.join(here.config.axis)}")
+        raise Refused(404, "NoSuchAxis", text, f"use {', '.join(context.config.axis)}")
     return named
 
 
 @router.websocket("/stream")
 async def stream(
     socket: WebSocket,
-    here: Here,
-    asking: Asking,
+    context: MachineDependency,
+    principal: PrincipalDependency,
     feed: Feed,
     seconds: Annotated[float, Query(ge=LEAST_S, le=MOST_S)] = 20.0,
     columns: Columns = 800,
@@ -132,30 +132,30 @@ async def stream(
     offered = socket.scope.get("subprotocols", [])
     await socket.accept("fdhil" if "fdhil" in offered else None)
     try:
-        named = _axes_of(here, axes)
+        named = _axes_of(context, axes)
     except Refused as refused:
         await socket.close(POLICY, refused.document["text"])
         return
-    owner = asking.name or place_of(socket.client.host if socket.client else "")
+    owner = principal.name or place_of(socket.client.host if socket.client else "")
     if not feed.make_room(owner):
         await socket.close(TRY_LATER, f"{MAX_BROWSERS} browsers are watching already; close one of them")
         return
     view = View(named, seconds, columns, feed.period_s)
-    travel = {axis: here.config.axis[axis].screw_pitch_mm / math.tau for axis in named}
+    travel = {axis: context.config.axis[axis].screw_pitch_mm / math.tau for axis in named}
     signals = [{"name": name, "unit": UNITS[name]} for name in DRAWN]
     begin = {"sync_period_s": feed.period_s, "axes": named, "signals": signals, "ticks_per_column": view.per_column}
     viewer = Viewer(owner, time.monotonic())
     async with feed.watched(viewer):
         with suppress(WebSocketDisconnect):  # the browser left
             await socket.send_json({**begin, "kept_s": KEPT_S, "mm_per_rad": travel})
-            await socket.close(POLICY, await _converse(socket, view, viewer, feed, here))
+            await socket.close(POLICY, await _converse(socket, view, viewer, feed, context))
 
 
-async def _converse(socket: WebSocket, view: View, viewer: Viewer, feed: LiveFeed, here: Here) -> str:
+async def _converse(socket: WebSocket, view: View, viewer: Viewer, feed: LiveFeed, context: MachineDependency) -> str:
     """Send samples and receive acknowledgements; return why it ended. WebSocketDisconnect if the browser left."""
     tasks = [
         asyncio.create_task(_hear(socket, view, viewer)),
-        asyncio.create_task(_tell(socket, view, viewer, feed, here)),
+        asyncio.create_task(_tell(socket, view, viewer, feed, context)),
     ]
     try:
         over, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -178,7 +178,7 @@ async def _hear(socket: WebSocket, view: View, viewer: Viewer) -> str:
             viewer.drawn_s = time.monotonic()
 
 
-async def _tell(socket: WebSocket, view: View, viewer: Viewer, feed: LiveFeed, here: Here) -> str:
+async def _tell(socket: WebSocket, view: View, viewer: Viewer, feed: LiveFeed, context: MachineDependency) -> str:
     """Send new columns about ten times a second, as fast as the browser draws; a sign of life without any.
 
     The login is checked each time: a removed user receives no further sample.
@@ -186,7 +186,7 @@ async def _tell(socket: WebSocket, view: View, viewer: Viewer, feed: LiveFeed, h
     sent_s, token = 0.0, token_of(socket.headers)
     while True:
         await asyncio.sleep(SEND_S)
-        if here.access.asker(token) is None:
+        if context.access.asker(token) is None:
             return "the login has expired; log in again"
         if viewer.replaced:
             return (

@@ -13,7 +13,7 @@ from fdhil.store.history import History
 from fdhil.store.rows import Revision
 from fdhil.store.set_document import parameters_status
 from fdhil.web.answers import Fault, document_of
-from fdhil.web.context import Asking, Here
+from fdhil.web.context import MachineDependency, PrincipalDependency
 from fdhil.web.pages.machine_lights import AxisLight, Light, Step, axis_light, change_light, steps
 
 router = APIRouter(prefix="/api/machine")
@@ -70,15 +70,15 @@ class AllPublished(BaseModel):
 
 
 @router.get("")
-async def machine(here: Here, asking: Asking) -> Machine:
+async def machine(context: MachineDependency, principal: PrincipalDependency) -> Machine:
     """Return the daemon's status document, at most half a second old, and its assessment."""
     try:
-        status = await here.daemon.status()
+        status = await context.daemon.status()
     except DeviceError as error:
         fault = Fault.model_validate(document_of(error))
-        silent = dict.fromkeys(here.config.axis, AxisLight(light="none", text="unknown: the daemon does not answer"))
-        return Machine(machine=here.config.machine.name, axes=silent, next=[START], status=None, fault=fault)
-    acting = here.config.web.acting and asking.role == "operate"
+        silent = dict.fromkeys(context.config.axis, AxisLight(light="none", text="unknown: the daemon does not answer"))
+        return Machine(machine=context.config.machine.name, axes=silent, next=[START], status=None, fault=fault)
+    acting = context.config.web.acting and principal.role == "operate"
     return Machine(
         machine=str(status["machine"]), axes=lights(status), next=list(steps(status, acting)), status=dict(status)
     )
@@ -89,18 +89,18 @@ def lights(status: Mapping[str, Any]) -> dict[str, AxisLight]:
     troubles: dict[str, list[str]] = {axis: [] for axis in status["axes"]}
     for trouble in status["troubles"]:
         troubles.get(trouble["axis"], []).append(f"{trouble['code']}: {trouble['text']}")
-    return {axis: axis_light(told, troubles[axis]) for axis, told in status["axes"].items()}
+    return {axis: axis_light(state, troubles[axis]) for axis, state in status["axes"].items()}
 
 
 @router.get("/parameters")
-def parameters(here: Here) -> AllPublished:
+def parameters(context: MachineDependency) -> AllPublished:
     """Return the newest published parameters, also while no daemon runs."""
     try:
-        with here.history() as history:
-            found = {axis: _published(history, axis, here.config) for axis in here.config.axis}
+        with context.history() as history:
+            found = {axis: _published(history, axis, context.config) for axis in context.config.axis}
     except StoreError as error:
         return AllPublished(axes={}, fault=Fault.model_validate(document_of(error)))
-    return AllPublished(axes={axis: told for axis, told in found.items() if told is not None})
+    return AllPublished(axes={axis: document for axis, document in found.items() if document is not None})
 
 
 def _published(history: History, axis: str, config: MachineConfig) -> Published | None:
@@ -117,12 +117,12 @@ def published_document(revisions: Sequence[Revision], first: Revision | None, co
     firsts = first.set.parameters.as_dict() if first else {}
     limits = config.maintenance.model_dump()
     found = {}
-    for name, told in parameters_status(shown).items():
-        half = None if told["high"] is None else told["high"] - told["value"]
-        change, light = change_light(told["value"], half, firsts.get(name), limits[name])
+    for name, figures in parameters_status(shown).items():
+        half = None if figures["high"] is None else figures["high"] - figures["value"]
+        change, light = change_light(figures["value"], half, firsts.get(name), limits[name])
         more = {"first": firsts.get(name), "change": change, "limit": limits[name], "light": light}
         more["course"] = [known[name] for each in revisions if name in (known := each.set.parameters.as_dict())]
-        found[name] = Parameter(**{key: told[key] for key in ("value", "low", "high", "unit")}, **more)
+        found[name] = Parameter(**{key: figures[key] for key in ("value", "low", "high", "unit")}, **more)
     return Published(
         revision=shown.revision,
         published_wall_s=newest.stamp.wall_s,

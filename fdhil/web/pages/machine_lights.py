@@ -83,11 +83,11 @@ def steps(status: Mapping[str, Any], acting: bool) -> Iterator[Step]:
 
 
 def _standing(status: Mapping[str, Any]) -> Iterator[Step]:
-    guard, stands = status.get("guard") or {}, status.get("may_stand") or {"nothing": True}
+    guard, residual = status.get("guard") or {}, status.get("may_stand") or {"nothing": True}
     if status["state"] == "lost":
-        yield Step(text=f"The guard is lost: {stands.get('text', '')}", advice=START_AND_ADOPT, urgent=True)
-    elif not stands["nothing"] and status["state"] in ("OFF", "FROZEN", "OFF(SHADOW)"):
-        yield Step(text=f"{stands['text']}", advice=ADOPT, urgent=True)
+        yield Step(text=f"The guard is lost: {residual.get('text', '')}", advice=START_AND_ADOPT, urgent=True)
+    elif not residual["nothing"] and status["state"] in ("OFF", "FROZEN", "OFF(SHADOW)"):
+        yield Step(text=f"{residual['text']}", advice=ADOPT, urgent=True)
     cause = guard.get("cause")
     if cause and cause["code"] not in ORDERED:
         yield Step(text=f"{cause['code']}: {cause['text']}", advice=cause.get("advice", ""))

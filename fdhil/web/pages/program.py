@@ -1,6 +1,6 @@
 """Programs before machining: their path error without and with correction, and what their passes taught.
 
-A dropped program is forecast in a child process. Nothing here reaches the machine.
+A dropped program is forecast in a child process. Nothing context reaches the machine.
 """
 
 import asyncio
@@ -16,7 +16,7 @@ from starlette.requests import HTTPConnection
 from fdhil.errors import ConnectError, DeviceTimeout, StoreError
 from fdhil.store.history import RECENT_NOTICES
 from fdhil.web.answers import Refused
-from fdhil.web.context import Here
+from fdhil.web.context import MachineDependency
 from fdhil.web.forecast.desk import STATES, Desk, Job, Work
 from fdhil.web.forecast.lessons import jobs, lessons, passes
 from fdhil.web.forecast.view import Box, course, line_place, plane_of, view
@@ -109,47 +109,51 @@ class Text(BaseModel):
 @asynccontextmanager
 async def _serving(app: FastAPI) -> AsyncIterator[None]:
     yield
-    desk = getattr(app.state, "programs", None)
-    if desk is not None:
-        await desk.close()
+    queue = getattr(app.state, "programs", None)
+    if queue is not None:
+        await queue.close()
 
 
 router = APIRouter(prefix="/api/program", lifespan=_serving)
 
 
-async def _desk(connection: HTTPConnection, here: Here) -> Desk:
+async def _desk(connection: HTTPConnection, context: MachineDependency) -> Desk:
     state = connection.app.state
     if getattr(state, "programs", None) is None:
-        state.programs = Desk(here.config)
-    desk = state.programs
-    assert isinstance(desk, Desk)
-    return desk
+        state.programs = Desk(context.config)
+    queue = state.programs
+    assert isinstance(queue, Desk)
+    return queue
 
 
-Programming = Annotated[Desk, Depends(_desk)]
+QueueDependency = Annotated[Desk, Depends(_desk)]
 Digest = Annotated[str, Path(pattern="^[0-9a-f]{64}$", description="SHA-256 of the program's bytes")]
 Mm = Annotated[float, Query(ge=-LARGEST_MM, le=LARGEST_MM, allow_inf_nan=False)]
 BODY = {"requestBody": {"content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}}}
 
 
 @router.get("")
-async def programs(desk: Programming) -> Programs:
+async def programs(queue: QueueDependency) -> Programs:
     """List the kept programs."""
-    kept = [Kept(digest=job.digest, name=job.name, state=job.forecasting.state) for job in desk.jobs]
-    return Programs(programs=kept, largest_bytes=LARGEST_PROGRAM)
+    listed = [Kept(digest=job.digest, name=job.name, state=job.forecasting.state) for job in queue.jobs]
+    return Programs(programs=listed, largest_bytes=LARGEST_PROGRAM)
 
 
 @router.post("", status_code=202, openapi_extra=BODY)
-async def drop(request: Request, desk: Programming, name: Annotated[str, Query(min_length=1, max_length=255)]) -> Told:
+async def drop(
+    request: Request, queue: QueueDependency, name: Annotated[str, Query(min_length=1, max_length=255)]
+) -> Told:
     """Store an NC program, or a demand if ``name`` ends in .csv, from the body's bytes, and have it forecast."""
-    return _told(await desk.take(name, request.stream()))
+    return _told(await queue.take(name, request.stream()))
 
 
 @router.post("/named", status_code=202)
-async def take_named(here: Here, desk: Programming, name: Annotated[str, Query(pattern=NAME)]) -> Told:
+async def take_named(
+    context: MachineDependency, queue: QueueDependency, name: Annotated[str, Query(pattern=NAME)]
+) -> Told:
     """Have a program of the folder of programs forecast."""
-    content = await asyncio.to_thread(content_of, here.config.web.programs_directory, name, LARGEST_PROGRAM)
-    return _told(await desk.take(name, _once(content)))
+    content = await asyncio.to_thread(content_of, context.config.web.programs_directory, name, LARGEST_PROGRAM)
+    return _told(await queue.take(name, _once(content)))
 
 
 async def _once(content: bytes) -> AsyncIterator[bytes]:
@@ -157,10 +161,10 @@ async def _once(content: bytes) -> AsyncIterator[bytes]:
 
 
 @router.get("/jobs")
-def finished_jobs(here: Here) -> Jobs:
+def finished_jobs(context: MachineDependency) -> Jobs:
     """Return the passes of corrected programs with predicted and measured errors; none without a history."""
     try:
-        with here.history() as history:
+        with context.history() as history:
             found = list(jobs(history.notices(limit=RECENT_NOTICES)))
     except StoreError:
         found = []
@@ -168,16 +172,16 @@ def finished_jobs(here: Here) -> Jobs:
 
 
 @router.get("/learning")
-async def learning(here: Here, desk: Programming) -> Learning:
+async def learning(context: MachineDependency, queue: QueueDependency) -> Learning:
     """Return what was learned in the passes of programs."""
     try:
-        status = await here.daemon.status()
+        status = await context.daemon.status()
     except (ConnectError, DeviceTimeout):
         status = None
     measured = passes(status)
     names = {str(each["program_digest"]): str(each["program"]).rpartition("/")[2] for each in measured}
-    names |= {job.digest: job.name for job in desk.jobs}
-    config = here.config
+    names |= {job.digest: job.name for job in queue.jobs}
+    config = context.config
     return Learning(
         daemon=status is not None,
         learning=config.correction.learning,
@@ -187,29 +191,29 @@ async def learning(here: Here, desk: Programming) -> Learning:
 
 
 @router.get("/{digest}")
-async def program(digest: Digest, desk: Programming) -> Told:
+async def program(digest: Digest, queue: QueueDependency) -> Told:
     """Return the progress of a forecast, and its results for the whole program."""
-    return _told(desk.job(digest))
+    return _told(queue.job(digest))
 
 
 @router.post("/{digest}/cancel")
-async def cancel(digest: Digest, desk: Programming) -> Told:
+async def cancel(digest: Digest, queue: QueueDependency) -> Told:
     """Cancel a running forecast."""
-    return _told(await desk.cancel(digest))
+    return _told(await queue.cancel(digest))
 
 
 @router.post("/{digest}/advise", status_code=202)
 async def feeds(
-    digest: Digest, desk: Programming, tolerance_um: Annotated[float, Query(gt=0.0, le=1e6, allow_inf_nan=False)]
+    digest: Digest, queue: QueueDependency, tolerance_um: Annotated[float, Query(gt=0.0, le=1e6, allow_inf_nan=False)]
 ) -> Told:
     """Compute the feeds that keep the path within a tolerance, as ``fdhil advise`` does."""
-    return _told(desk.advise(digest, tolerance_um))
+    return _told(queue.advise(digest, tolerance_um))
 
 
 @router.get("/{digest}/view")
 def part(
     digest: Digest,
-    desk: Programming,
+    queue: QueueDependency,
     across: Annotated[str, Query(max_length=16)],
     along: Annotated[str, Query(max_length=16)],
     left: Mm | None = None,
@@ -222,7 +226,7 @@ def part(
 
     ``factor`` enlarges the table's distance from the path; 0: as far as the view has room.
     """
-    forecast = desk.forecast(digest)
+    forecast = queue.forecast(digest)
     try:
         plane = plane_of(forecast, (across, along))
     except ValueError:
@@ -239,12 +243,12 @@ def part(
 @router.get("/{digest}/course")
 def over_time(
     digest: Digest,
-    desk: Programming,
+    queue: QueueDependency,
     start_s: Annotated[float, Query(ge=0.0, allow_inf_nan=False)] = 0.0,
     end_s: Annotated[float | None, Query(ge=0.0, allow_inf_nan=False)] = None,
 ) -> Json:
     """Return contour errors and feed over time."""
-    forecast = desk.forecast(digest)
+    forecast = queue.forecast(digest)
     rows = len(forecast.line)
     first = min(int(min(start_s / forecast.dt_s, rows)), rows - 1)
     last = rows if end_s is None else int(min(end_s / forecast.dt_s, rows))
@@ -252,9 +256,9 @@ def over_time(
 
 
 @router.get("/{digest}/line/{line}")
-def place_of_line(digest: Digest, line: Annotated[int, Path(ge=1, le=10**9)], desk: Programming) -> Json:
+def place_of_line(digest: Digest, line: Annotated[int, Path(ge=1, le=10**9)], queue: QueueDependency) -> Json:
     """Return where a program line has its largest error."""
-    found = line_place(desk.forecast(digest), line)
+    found = line_place(queue.forecast(digest), line)
     if found is None:
         raise Refused(404, "NotFound", f"line {line} of the program orders no motion", "choose a line that moves")
     return Json(found)
@@ -263,12 +267,12 @@ def place_of_line(digest: Digest, line: Annotated[int, Path(ge=1, le=10**9)], de
 @router.get("/{digest}/text")
 def text(
     digest: Digest,
-    desk: Programming,
+    queue: QueueDependency,
     first: Annotated[int, Query(ge=1, le=10**9)] = 1,
     count: Annotated[int, Query(ge=1, le=MOST_LINES)] = 40,
 ) -> Text:
     """Return lines of the program's text."""
-    job = desk.job(digest)
+    job = queue.job(digest)
     try:
         with job.program.open(encoding="utf-8", errors="replace", newline="\n") as file:
             found = list(islice(file, first - 1, first + count))
@@ -279,12 +283,12 @@ def text(
 
 
 def _printable(line: str) -> str:
-    kept = "".join(letter if letter.isprintable() else " " for letter in line.rstrip("\r\n")[:LONGEST_LINE])
-    return kept + ("..." if len(line) > LONGEST_LINE + 2 else "")
+    printable = "".join(letter if letter.isprintable() else " " for letter in line.rstrip("\r\n")[:LONGEST_LINE])
+    return printable + ("..." if len(line) > LONGEST_LINE + 2 else "")
 
 
 def _told(job: Job) -> Told:
-    work, advising = job.forecasting, job.advising
+    forecasting, advising = job.forecasting, job.advising
     advice = advising and Advice(
         tolerance_um=advising.tolerance_um or 0.0,
         state=advising.state,
@@ -295,10 +299,10 @@ def _told(job: Job) -> Told:
     return Told(
         digest=job.digest,
         name=job.name,
-        state=work.state,
-        step=work.progress.get("step"),
-        rows=work.progress.get("rows"),
-        fault=_fault(work),
+        state=forecasting.state,
+        step=forecasting.progress.get("step"),
+        rows=forecasting.progress.get("rows"),
+        fault=_fault(forecasting),
         forecast=None if job.forecast is None else job.forecast.document,
         advice=advice,
     )

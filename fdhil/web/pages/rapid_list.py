@@ -114,7 +114,7 @@ Verdict = Literal["accepted", "refused"]
 
 def page_of(
     history: History,
-    kept: Kept,
+    is_stored: Kept,
     axis: str | None = None,
     verdict: Verdict | None = None,
     code: str | None = None,
@@ -132,7 +132,7 @@ def page_of(
     values = {"before": before, "first": first, "axis": axis, "code": wanted["instr(reasons, :code)"]}
     found = history.chosen_windows(f"{where} ORDER BY id DESC", values, limit)
     oldest = found[-1].number if len(found) == limit else first
-    return Rapids(rapids=[rapid_of(window, kept) for window in found], older_before=oldest if oldest > 1 else None)
+    return Rapids(rapids=[rapid_of(window, is_stored) for window in found], older_before=oldest if oldest > 1 else None)
 
 
 def newest_id(history: History) -> int:
@@ -156,7 +156,7 @@ def counts_of(history: History, axes: Iterable[str], axis: str | None = None) ->
     return Counts(axes=[*axes], searched=accepted + refused, accepted=accepted, refused=refused, by_reason=reasons)
 
 
-def rapid_of(window: StoredWindow, kept: Kept) -> Rapid:
+def rapid_of(window: StoredWindow, is_stored: Kept) -> Rapid:
     """Return a stored window for the browser."""
     return Rapid(
         id=window.number,
@@ -171,7 +171,7 @@ def rapid_of(window: StoredWindow, kept: Kept) -> Rapid:
         warnings=[_said(warning) for warning in window.warnings],
         nc=None if window.nc is None else NcSaid(**window.nc),
         file=window.file,
-        kept=kept(window.file),
+        kept=is_stored(window.file),
     )
 
 
@@ -180,7 +180,7 @@ def _said(reason: str) -> Said:
     return Said(code=code, text=typeset(text.strip()))
 
 
-def told_of(history: History, window: StoredWindow, kept: Kept) -> RapidTold:
+def told_of(history: History, window: StoredWindow, is_stored: Kept) -> RapidTold:
     """Return the stored data of one rapid."""
     values = {"axis": window.axis, "id": window.number, "direction": window.direction}
 
@@ -189,8 +189,8 @@ def told_of(history: History, window: StoredWindow, kept: Kept) -> RapidTold:
         return next((int(row[0]) for row in history.figures(query, values)), None)
 
     return RapidTold(
-        rapid=rapid_of(window, kept),
-        parameters=[figure_of(name, told) for name, told in (window.parameters or {}).items()],
+        rapid=rapid_of(window, is_stored),
+        parameters=[figure_of(name, values_of) for name, values_of in (window.parameters or {}).items()],
         older_id=nearest("id < :id", "DESC"),
         newer_id=nearest("id > :id", "ASC"),
         alike_id=nearest("id < :id AND direction = :direction AND accepted = 1", "DESC"),

@@ -13,7 +13,7 @@ from starlette.requests import HTTPConnection
 from fdhil.daemon.outcome_store import WINDOWS_FOLDER
 from fdhil.errors import StoreError
 from fdhil.store.named_file import open_named
-from fdhil.web.context import Asking, Context, Here
+from fdhil.web.context import Context, MachineDependency, PrincipalDependency
 from fdhil.web.file_answer import FileAnswer
 from fdhil.web.pages.rapid_list import (
     LARGEST_ID,
@@ -53,7 +53,7 @@ async def _replayer(connection: HTTPConnection) -> Replayer:
 
 
 router = APIRouter(prefix="/api/rapids", lifespan=_replaying)
-Replaying = Annotated[Replayer, Depends(_replayer)]
+ReplayerDependency = Annotated[Replayer, Depends(_replayer)]
 LOG = logging.getLogger("fdhil.web")
 Axis = Annotated[str, Path(pattern="^[A-Z]2?$")]
 Number = Annotated[int, Path(ge=1, le=LARGEST_ID)]
@@ -62,7 +62,7 @@ PARQUET = "application/vnd.apache.parquet"
 
 @router.get("")
 def rapids(
-    here: Here,
+    context: MachineDependency,
     axis: Annotated[str | None, Query(pattern="^[A-Z]2?$")] = None,
     verdict: Verdict | None = None,
     code: Annotated[str | None, Query(max_length=64)] = None,
@@ -70,45 +70,45 @@ def rapids(
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
 ) -> Rapids:
     """Return the newest rapids, or those ``before`` a number, by axis, verdict and reason."""
-    with here.history() as history:
-        return page_of(history, _kept(here), axis, verdict, code, before, limit)
+    with context.history() as history:
+        return page_of(history, _kept(context), axis, verdict, code, before, limit)
 
 
 @router.get("/counts")
-def counts(here: Here, axis: Annotated[str | None, Query(pattern="^[A-Z]2?$")] = None) -> Counts:
+def counts(context: MachineDependency, axis: Annotated[str | None, Query(pattern="^[A-Z]2?$")] = None) -> Counts:
     """Return how many of the newest rapids were accepted, and why the others were refused."""
-    with here.history() as history:
-        return counts_of(history, here.config.axis, axis)
+    with context.history() as history:
+        return counts_of(history, context.config.axis, axis)
 
 
 @router.get("/recordings/{name:path}", response_class=Response)
-def recording(here: Here, asking: Asking, name: str) -> Response:
+def recording(context: MachineDependency, principal: PrincipalDependency, name: str) -> Response:
     """Return a recording as its file, for ``fdhil replay`` and ``fdhil export``."""
     try:
-        return FileAnswer(open_named(_folder(here), name), name, PARQUET)
+        return FileAnswer(open_named(_folder(context), name), name, PARQUET)
     except StoreError as error:
         if error.code == "BadName":
-            LOG.warning("BadName: %a asked for a recording %a", asking.name, name[:200])
+            LOG.warning("BadName: %a asked for a recording %a", principal.name, name[:200])
         raise
 
 
 @router.get("/{axis}/{number}")
-def rapid(here: Here, axis: Axis, number: Number) -> RapidTold:
+def rapid(context: MachineDependency, axis: Axis, number: Number) -> RapidTold:
     """Return the stored data of one rapid."""
-    with here.history() as history:
-        return told_of(history, the_window(history, axis, number), _kept(here))
+    with context.history() as history:
+        return told_of(history, the_window(history, axis, number), _kept(context))
 
 
 @router.get("/{axis}/{number}/signals", response_model=RapidSignals)
-async def signals(replayer: Replaying, axis: Axis, number: Number) -> Response:
+async def signals(replayer: ReplayerDependency, axis: Axis, number: Number) -> Response:
     """Return a rapid's signals with the model, as replayed now."""
     return Response(await replayer.signals(axis, number), media_type="application/json")
 
 
-def _folder(here: Context) -> FilePath:
-    return here.config.store.directory / WINDOWS_FOLDER
+def _folder(context: Context) -> FilePath:
+    return context.config.store.directory / WINDOWS_FOLDER
 
 
-def _kept(here: Context) -> Kept:
-    folder = _folder(here)
+def _kept(context: Context) -> Kept:
+    folder = _folder(context)
     return lambda name: bool(name) and (folder / name).is_file()

@@ -7,7 +7,7 @@ from pydantic import BaseModel, Field
 
 from fdhil.config.users import LONGEST_PASSWORD, Role
 from fdhil.web.access import LIFE_S
-from fdhil.web.context import AtEntry
+from fdhil.web.context import LoginDependency
 from fdhil.web.gate import token_of
 
 router = APIRouter(prefix="/api/session")
@@ -37,25 +37,27 @@ class LoggedIn(Who):
 
 
 @router.get("")
-async def who(request: Request, here: AtEntry) -> Who:
+async def who(request: Request, context: LoginDependency) -> Who:
     """Return the client's name and role."""
-    asker = here.access.asker(token_of(request.headers))
-    acting = here.web.acting
-    role, name = (asker.role, asker.name) if asker else (None, "")
-    return Who(name=name, role=role, login_needed=here.access.by_login, acting=acting and role == "operate")
+    principal = context.access.asker(token_of(request.headers))
+    acting = context.web.acting
+    role, name = (principal.role, principal.name) if principal else (None, "")
+    return Who(name=name, role=role, login_needed=context.access.by_login, acting=acting and role == "operate")
 
 
 @router.post("")
-async def log_in(login: Login, request: Request, here: AtEntry) -> LoggedIn:
+async def log_in(login: Login, request: Request, context: LoginDependency) -> LoggedIn:
     """Log in."""
     address = request.client.host if request.client else ""
-    token, session = await here.access.log_in(login.name, login.password, address)
-    asker, acting = session.asker, here.web.acting and session.asker.role == "operate"
-    return LoggedIn(name=asker.name, role=asker.role, login_needed=True, acting=acting, token=token, life_s=LIFE_S)
+    token, session = await context.access.log_in(login.name, login.password, address)
+    principal, acting = session.asker, context.web.acting and session.asker.role == "operate"
+    return LoggedIn(
+        name=principal.name, role=principal.role, login_needed=True, acting=acting, token=token, life_s=LIFE_S
+    )
 
 
 @router.delete("")
-async def log_out(request: Request, here: AtEntry) -> Who:
+async def log_out(request: Request, context: LoginDependency) -> Who:
     """Log out: the token becomes invalid."""
-    here.access.log_out(token_of(request.headers))
-    return await who(request, here)
+    context.access.log_out(token_of(request.headers))
+    return await who(request, context)
