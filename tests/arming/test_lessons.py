@@ -1,4 +1,4 @@
-"""A program that is armed again carries what its last pass taught; a disturbed pass teaches nothing."""
+"""A program armed again applies the offsets learned in its last pass; a disturbed pass is not used."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ WAVE_MM = 2e-3
 
 @pytest.fixture
 def config(tmp_path: Path) -> MachineConfig:
-    """The bench, two axes, commissioned; it learns."""
     config = config_of(tmp_path, ("X", "Y")).model_copy(update={"correction": Learning(learning=True)})
     save_records(config)
     return config

@@ -1,4 +1,4 @@
-"""The audit: each line is chained to the one before, and every change of the file is seen."""
+"""The audit log: lines are chained, and every change of the file is detected."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ def written(tmp_path: Path) -> Path:
 
 
 def wrong(folder: Path) -> list[int]:
-    """Return the numbers of the lines that are not as they were written."""
     return [number for number, (_, fault) in enumerate(audit.entries(folder)) if fault]
 
 

@@ -1,4 +1,4 @@
-"""Files of oscilloscopes and drives, as their makers write them, become recordings by a column map."""
+"""Files of oscilloscopes and drives become recordings by a column map."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ def _comma(value: float) -> str:
 
 
 def _twincat(columns: dict[str, np.ndarray]) -> bytes:
-    """Blocks of channel heads side by side, each channel with times of its own, decimal commas, tabs, EOF."""
     lines = ["Name\tScope Project", "File\tC:\\scope.csv", "Starttime of export\t128783093223690000", ""]
     lines.append("\t".join(f"Name\t{name}" for name in columns))
     lines.append("\t".join("SampleTime[ms]\t1" for _ in columns))
@@ -38,14 +37,12 @@ def _twincat(columns: dict[str, np.ndarray]) -> bytes:
 
 
 def _semicolon(columns: dict[str, np.ndarray]) -> bytes:
-    """Names, then units, then rows with semicolons and decimal points, in UTF-16."""
     lines = [";".join(["Time", *columns]), ";".join(["ms", *("[]" for _ in columns)])]
     lines += [";".join([f"{k}", *(f"{v[k]:.9g}" for v in columns.values())]) for k in range(N)]
     return "\r\n".join([*lines, ""]).encode("utf-16")
 
 
 def _quoted(columns: dict[str, np.ndarray]) -> bytes:
-    """A head of free text with umlauts in cp1252, quoted names, commas."""
     lines = ["Oszilloskop, Kanäle Achse X", ",".join(['"Zeit"', *(f'"{name}"' for name in columns)])]
     lines += [",".join([f"{k * 1e-3:.6f}", *(f"{v[k]:.9g}" for v in columns.values())]) for k in range(N)]
     return ("\n".join(lines) + "\n").encode("cp1252")

@@ -1,4 +1,4 @@
-"""Every recording format gives back what was written, to other programs too; a damaged file is one error."""
+"""Every recording format is lossless; damaged files are refused."""
 
 from __future__ import annotations
 

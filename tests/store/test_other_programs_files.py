@@ -1,4 +1,4 @@
-"""Files of MATLAB, HDF5, MDF 4 and Parquet as other programs lay them out, read by a column map."""
+"""MATLAB, MDF, HDF5 and Parquet files of other programs become recordings by a column map."""
 
 from __future__ import annotations
 
@@ -45,7 +45,6 @@ def _map(names: Mapping[str, str] | None = None, rate_hz: float | None = None, t
 
 
 def _table(path: Path, told: ColumnMap) -> RecordingTable:
-    """Read a file in this process; that a process of its own gives the same is tested once."""
     return mapped(READERS[path.suffix](path.read_bytes(), path.name), told, path.name)
 
 
@@ -64,7 +63,6 @@ def _matlab_5(path: Path, variables: Mapping[str, Any]) -> None:
 
 
 def _put(group: Any, name: str, value: Any) -> Any:
-    """Store a variable as MATLAB 7.3 does: transposed, texts as numbers, structures as groups."""
     if isinstance(value, dict):
         group = group.create_group(name)
         group.attrs["MATLAB_class"] = np.bytes_("struct")

@@ -1,4 +1,4 @@
-"""What a damaged file does to the library that reads it, it does to a process of its own: the caller has a sentence."""
+"""Files are read in a child process, which damage may crash, block or fill."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""CSV recordings: what is read, and how each fault is told."""
+"""Recordings as CSV: what is read, and what is refused in one sentence."""
 
 from __future__ import annotations
 
@@ -155,7 +155,6 @@ def test_damaged_samples_of_a_slow_sensor_are_refused(key: str, value: str) -> N
 def test_a_file_larger_than_any_recording_is_refused_before_it_is_taken_apart(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of an endless file no more than the limit is read; rows of nothing are counted before they are split."""
     monkeypatch.setattr(csv_text, "MAX_BYTES", 1 << 20)
     monkeypatch.setattr(csv_text, "MAX_ROWS", 1000)
     with pytest.raises(RecordingError, match="larger than 1 MiB or 1000 rows: cut it into parts"):
@@ -229,7 +228,6 @@ def test_a_recording_saved_with_other_separators_shows_what_it_has() -> None:
 
 
 def _angular(text: str) -> str:
-    """The same motor, its axis told as a rotary one of 12 degrees a turn."""
     text = text.replace("# pitch_m_per_rev: 0.02", "# pitch_deg_per_rev: 12\n# radius_m: 0.1")
     text = text.replace("# rapid_speed_m_per_s: 0.5", "# rapid_speed_deg_per_s: 300")
     return text.replace("position_m", "position_deg").replace("demand_m", "demand_deg")

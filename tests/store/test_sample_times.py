@@ -1,4 +1,4 @@
-"""Times with too few digits are the even grid that they stand for, where there is only one."""
+"""Times with too few digits become the even grid that they approximate, if it is unambiguous."""
 
 from __future__ import annotations
 

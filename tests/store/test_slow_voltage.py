@@ -1,4 +1,4 @@
-"""A window with the voltage of a slow sensor comes out of its file as it went in."""
+"""A window with the voltage of a slow sensor is stored exactly."""
 
 from __future__ import annotations
 

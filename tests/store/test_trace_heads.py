@@ -1,4 +1,4 @@
-"""Heads as oscilloscopes, drives and programs write them: which names and places a column map can use."""
+"""File heads of oscilloscopes, drives and programs: which names a column map can use."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who may ask for what: the parts, without HTTP."""
+"""Logins, tokens and throttling, without HTTP."""
 
 from __future__ import annotations
 
@@ -27,8 +27,6 @@ from tests.web.clients import PASSWORD, user
 
 
 class Clock:
-    """A clock that stands until it is moved."""
-
     def __init__(self) -> None:
         self.now_s = 1000.0
 

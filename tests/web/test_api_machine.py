@@ -1,4 +1,4 @@
-"""What the page of the machine asks for: from a real daemon, from a store, and while the daemon is silent."""
+"""The data of the page Machine: from a running daemon, from the store, and while the daemon is silent."""
 
 from __future__ import annotations
 
@@ -88,7 +88,6 @@ async def test_many_browsers_ask_the_daemon_no_more_than_one_does(tmp_path: Path
 
 
 async def test_half_a_character_and_a_number_that_is_none_end_no_answer(tmp_path: Path) -> None:
-    """As a program's name that is no UTF-8 has it; in what is told, and in what is refused."""
     config = machine_of(tmp_path)
     told = {**STATUS, "text": "b\udcf6hlen.ngc", "ratio": math.nan}
     async with (

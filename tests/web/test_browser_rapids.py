@@ -1,4 +1,4 @@
-"""The rapids in a real browser: chosen, opened, looked into by the keyboard, compared, saved."""
+"""The rapids in a real browser: filtered, opened, examined by keyboard, compared, saved."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ pytestmark = [pytest.mark.debian, pytest.mark.timeout(900)]
 
 @pytest.fixture
 def reader(stage: Stage, chromium: Browser) -> Iterator[Tab]:
-    """A tab of someone who may look."""
     with opened(chromium, stage.url) as tab:
         tab.log_in(stage.token("watcher"))
         yield tab
