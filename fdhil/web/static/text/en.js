@@ -1,4 +1,4 @@
-// All words in English, by key. The words of a page are in en/PAGE.js; what all pages share is here.
+// All texts in English, by key. The texts of a page are in en/PAGE.js, the shared ones here.
 
 import events from "/static/text/en/events.js";
 import fleet from "/static/text/en/fleet.js";
