@@ -192,12 +192,12 @@ class ArmingDesk:
             return _refused(checked)
         if (broken := self._passes.broken(request.program_digest, request.models)) is not None:
             return _refused(Refused((broken,)))
-        rows, pupil = await asyncio.to_thread(taught, checked, request, self._config.digest)
+        rows, learner = await asyncio.to_thread(taught, checked, request, self._config.digest)
         known, rest = self.knowledge.now(), self._standstill.now()
         armament = await asyncio.to_thread(prepare_armament, request, rows, self._config, known, rest)
         summary = armament.summary()
         ahead_mm = await asyncio.to_thread(ahead_of_motors_mm, rows, request)
-        self._passes.begin(armament.begin.demand, armament.rows, request.models, pupil, ahead_mm)
+        self._passes.begin(armament.begin.demand, armament.rows, request.models, learner, ahead_mm)
         answer = await self._hand_over(self.guard.arm, armament, summary, token)
         if not answer["ok"]:
             self._passes.forget()

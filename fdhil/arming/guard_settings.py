@@ -77,7 +77,7 @@ def _user_id(name: str | None) -> int | None:
     try:
         return pwd.getpwnam(name).pw_uid
     except KeyError:
-        fault = ConfigFault("guard.daemon_user", f"there is no user {name!r}", "name the user of fdhil.service")
+        fault = ConfigFault("guard.daemon_user", f"the user {name!r} does not exist", "name the user of fdhil.service")
         raise ConfigError("config", [fault]) from None
 
 

@@ -69,14 +69,14 @@ class Passes:
         demand: Mapping[str, Sequence[int]],
         rows: int | None,
         models: Mapping[str, Parameters],
-        pupil: Pupil | None = None,
+        learner: Pupil | None = None,
         ahead_mm: Float | None = None,
     ) -> None:
         """Start a pass, before a program is armed: its first table rows in increments, the row count, its learner.
 
         ``ahead_mm`` (n, axes) is the table position less the encoder position, if it is known.
         """
-        self._running = Pass(self._config, demand, rows, pupil, ahead_mm)
+        self._running = Pass(self._config, demand, rows, learner, ahead_mm)
         self._models = models
 
     def broken(self, program_digest: str, models: Mapping[str, Parameters]) -> Reason | None:
@@ -168,10 +168,10 @@ class Pass:
         config: MachineConfig,
         demand: Mapping[str, Sequence[int]],
         rows: int | None,
-        pupil: Pupil | None = None,
+        learner: Pupil | None = None,
         ahead_mm: Float | None = None,
     ) -> None:
-        self._pupil = pupil
+        self._learner = learner
         self._ahead_mm = ahead_mm
         self._learned_rows: list[tuple[Float, Float]] = []
         self._left = rows if rows is not None else sys.maxsize
@@ -254,7 +254,7 @@ class Pass:
             self._squares += float(error @ error)
             self._max_um = max(self._max_um, float(error.max()))
             self._following += np.sum((position - self._demand[self._first : end]) ** 2, axis=0) * 1e6
-            if self._pupil is not None:
+            if self._learner is not None:
                 self._learned_rows.append((self._demand[self._first : end].copy(), position.copy()))
         drop = max(0, end - self._margin) if self._left else len(self._demand)
         self._demand, self._position, self._first = self._demand[drop:], self._position[drop:], max(0, end - drop)
@@ -274,10 +274,10 @@ class Pass:
 
     def learn(self) -> Lesson | None:
         """Return what was learned from the completed pass; None without a learner, or if it was not as planned."""
-        if self._pupil is None or not self._learned_rows:
+        if self._learner is None or not self._learned_rows:
             return None
         demand, position = (np.concatenate([rows[k] for rows in self._learned_rows]) for k in range(2))
-        return self._pupil.learn(demand, position)
+        return self._learner.learn(demand, position)
 
 
 def disturbance(state: NcState) -> str | None:

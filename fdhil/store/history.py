@@ -41,12 +41,12 @@ class History:
     """The history of one store directory. Every method raises StoreError if the database refuses."""
 
     def __init__(
-        self, db: sqlite3.Connection, path: Path, version: int, tell: Warn | None = None, also: Also | None = None
+        self, db: sqlite3.Connection, path: Path, version: int, warn: Warn | None = None, also: Also | None = None
     ) -> None:
         self._db = db
         self._path = path
         self.version = version
-        self._tell = tell
+        self._warn = warn
         self._damaged: dict[tuple[str, int], dict[str, Any]] = {}
         self._also = also
         self._wal = path.with_name(path.name + "-wal")
@@ -76,15 +76,15 @@ class History:
         return cls(db, path, schema.SCHEMA_VERSION, also=also)
 
     @classmethod
-    def read(cls, directory: Path, tell: Warn | None = None, checked: set[tuple[int, int]] | None = None) -> History:
+    def read(cls, directory: Path, warn: Warn | None = None, checked: set[tuple[int, int]] | None = None) -> History:
         """Open for reading only, also from a read-only disk. Raises StoreError if there is none or it is unusable.
 
-        ``tell`` receives the damaged rows that were left out, at close. A caller that reopens it often keeps in
+        ``warn`` receives the damaged rows that were left out, at close. A caller that reopens it often keeps in
         ``checked`` the files whose structure was intact (device and inode); rows are still verified one by one.
         """
         path = directory / FILE_NAME
         db, version = schema.open_to_read(path, checked)
-        return cls(db, path, version, tell)
+        return cls(db, path, version, warn)
 
     def checkpoint(self) -> None:
         """Move the write-ahead log into the file as far as possible, and note the file's state."""
@@ -107,9 +107,9 @@ class History:
     def close(self) -> None:
         """Close the database; report the rows that were left out."""
         self._db.close()
-        if self._damaged and self._tell is not None:
+        if self._damaged and self._warn is not None:
             places = schema.named(self._damaged)
-            self._tell(f"{self._path}: {places} damaged and left out; start the daemon, which quarantines them")
+            self._warn(f"{self._path}: {places} damaged and left out; start the daemon, which quarantines them")
             self._damaged.clear()
 
     def __enter__(self) -> History:

@@ -11,15 +11,15 @@ from fdhil.store.rows import Revision
 
 
 def read_newest_sets(
-    store_directory: Path, axes: Iterable[str], tell: Callable[[str], object] | None = None
+    store_directory: Path, axes: Iterable[str], warn: Callable[[str], object] | None = None
 ) -> dict[str, Revision]:
     """Return the newest published parameter set of each axis; empty if nothing was recorded yet.
 
-    ``tell`` receives the damaged rows. Raises StoreError if a history exists but cannot be read.
+    ``warn`` receives the damaged rows. Raises StoreError if a history exists but cannot be read.
     """
     if not (store_directory / FILE_NAME).is_file():
         return {}
-    with History.read(store_directory, tell) as history:
+    with History.read(store_directory, warn) as history:
         return newest_sets(history, axes)
 
 

@@ -185,7 +185,7 @@ def _read_and_end(reader: Any, descriptor: int) -> None:
         source, longest_s = json.loads(asked.recv_bytes())
         answer(asked, reader, asked.recv_bytes(), source, longest_s)
         code = 0
-    except BaseException:  # noqa: BLE001 - this process is nobody's but the file's
+    except BaseException:  # noqa: BLE001 - this process exists for this file alone
         traceback.print_exc()
     finally:
         os._exit(code)

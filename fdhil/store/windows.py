@@ -205,7 +205,7 @@ def _check_declared(file: pq.ParquetFile, content: bytes) -> None:
             if column.physical_type not in ("INT64", "DOUBLE") or shape.max_repetition_level:
                 raise ValueError(f"its column {name} does not contain plain numbers")
             if column.has_dictionary_page:
-                raise ValueError(f"its column {name} has a dictionary, unlike a window")
+                raise ValueError(f"its column {name} has a dictionary, which windows never have")
             size = uncompressed_bytes(content, column.data_page_offset, column.total_compressed_size)
             if size > ROW_BYTES * group.num_rows + SPARE_BYTES:
                 raise ValueError(f"its column {name} declares {size} bytes for {group.num_rows} rows")

@@ -1,4 +1,4 @@
-"""The page of many machines: their state, due maintenance, axes unlike their peers, parameter trends.
+"""The page of many machines: their state, due maintenance, axes that differ from their peers, parameter trends.
 
 It reads the fleet's database through the given query function and reaches no machine.
 """

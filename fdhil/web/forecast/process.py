@@ -183,9 +183,9 @@ def main() -> None:
         config = MachineConfig.model_validate(request["config"])
         tolerance_um = request["tolerance_um"]
         if tolerance_um is None:
-            forecast(program, name, config, Path(request["folder"]), lambda told: report({"progress": told}))
+            forecast(program, name, config, Path(request["folder"]), lambda progress: report({"progress": progress}))
         else:
-            lines = advice(program, name, config, tolerance_um, lambda told: report({"progress": told}))
+            lines = advice(program, name, config, tolerance_um, lambda progress: report({"progress": progress}))
             kept.write_advice(Path(request["folder"]), tolerance_um, lines)
     except FdhilError as error:
         line = getattr(error, "line", None)

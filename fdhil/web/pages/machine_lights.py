@@ -122,7 +122,7 @@ def _waiting(status: Mapping[str, Any]) -> Iterator[Step]:
 
 
 def _learning(status: Mapping[str, Any]) -> Iterator[Step]:
-    unknown = [axis for axis, told in status["axes"].items() if told["parameters"] is None]
+    unknown = [axis for axis, state in status["axes"].items() if state["parameters"] is None]
     if unknown and status["source"]["state"] == "listening":
         text = f"The parameters of {', '.join(unknown)} are not identified yet."
         yield Step(text=text, advice="run a few rapids (G0) of each in both directions, over most of the travel")
