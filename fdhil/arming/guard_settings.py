@@ -37,9 +37,7 @@ def corrected_bus(machine: MachineConfig, source: str) -> str:
     """Return the one bus with corrected axes. Raises ConfigError if there is none, or more than one."""
     buses = {axis.drive.bus for axis in machine.axis.values() if axis.correction is not None}
     if not buses:
-        fault = ConfigFault(
-            "axis.*.correction", "no axis has this section: no offset can be written", "add it to an axis"
-        )
+        fault = ConfigFault("axis.*.correction", "no axis has this section: writing is off", "add it to an axis")
         raise ConfigError(source, [fault])
     if len(buses) > 1:
         fault = ConfigFault("axis.*.drive.bus", f"corrected axes are on {', '.join(sorted(buses))}", "use one bus")
