@@ -12,10 +12,10 @@ from fdhil.daemon.blackbox import FOLDER, kept
 from fdhil.drivers.cia402.candump_samples import LARGEST_LOG, samples_of_log
 from fdhil.records import AxisSamples, Float
 from fdhil.store.named_file import open_named
+from fdhil.web.pages.rapid_signals import round_digits
 
 COLUMNS = 400
 """Columns of an envelope: minimum and maximum of each are kept, so that no peak is lost."""
-DIGITS = 6
 
 
 class BlackBox(BaseModel):
@@ -96,7 +96,7 @@ def _axis(samples: AxisSamples, last_tick: int, period_s: float) -> AxisEnvelope
     time_s: Float = np.asarray((first + column[starts] * per - last_tick) * period_s, np.float64)
     return AxisEnvelope(
         axis=samples.axis,
-        time_s=_short(time_s),
+        time_s=round_digits(time_s),
         samples=samples.tick.size,
         lost_frames=samples.lost,
         signals=[
@@ -109,8 +109,4 @@ def _axis(samples: AxisSamples, last_tick: int, period_s: float) -> AxisEnvelope
 def _least(values: Float, starts: Any, sign: float) -> list[float | None]:
     """Return the minimum (``sign`` 1) or the maximum (-1) of each column."""
     least: Float = np.fmin.reduceat(sign * values, starts)
-    return _short(sign * least)
-
-
-def _short(values: Float) -> list[Any]:
-    return [float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None for value in values.tolist()]
+    return round_digits(sign * least)

@@ -16,7 +16,6 @@ from fdhil.web.pages.rapid_list import Said
 
 MOST_POINTS = 6000
 """Points of one curve: more than a screen shows, and few enough for a browser on a phone."""
-DIGITS = 6
 
 Points = list[float | None]
 
@@ -96,13 +95,13 @@ def signals_of(overlay: Overlay) -> RapidSignals:
     verdict = overlay.outcome.verdict
     return RapidSignals(
         every=every,
-        time_s=_digits(np.arange(0, window.n, every) * window.dt_s),
+        time_s=round_digits(np.arange(0, window.n, every) * window.dt_s, 9),
         move_begin_s=begin * window.dt_s,
         move_end_s=end * window.dt_s,
         stages=_stages(window),
         direction=window.direction,
         turns_hz=float(np.nanmax(np.abs(window.speed_rad_s), initial=0.0)) / (2.0 * math.pi),
-        frequency_hz=_digits(frequency[:: _step(frequency.size)]),
+        frequency_hz=round_digits(frequency[:: _step(frequency.size)], 9),
         signals=[_signal(course, slice(begin, end), every) for course in _courses(overlay)],
         replayed=Replayed(
             accepted=verdict.accepted,
@@ -181,12 +180,12 @@ def _signal(course: _Course, moving: slice, every: int) -> Signal:
         unit=course.unit,
         shown_unit=typeset(course.unit),
         model=course.model,
-        measured=_told(measured[::every]),
-        modelled=None if modelled is None else _told(modelled[::every]),
-        residual=None if residual is None else _told(residual[::every]),
+        measured=round_digits(measured[::every]),
+        modelled=None if modelled is None else round_digits(modelled[::every]),
+        residual=None if residual is None else round_digits(residual[::every]),
         residual_rms=rms(left) if left.size else None,
-        measured_spectrum=_told(spectrum(measured)),
-        residual_spectrum=None if residual is None else _told(spectrum(residual)),
+        measured_spectrum=round_digits(spectrum(measured)),
+        residual_spectrum=None if residual is None else round_digits(spectrum(residual)),
     )
 
 
@@ -210,9 +209,6 @@ def _step(size: int) -> int:
     return max(1, -(-size // MOST_POINTS))
 
 
-def _told(values: Float) -> Points:
-    return [float(f"{v:.{DIGITS}g}") if math.isfinite(v) else None for v in values.tolist()]
-
-
-def _digits(values: npt.NDArray[Any]) -> list[float]:
-    return [float(f"{v:.9g}") for v in values.tolist()]
+def round_digits(values: npt.NDArray[Any], digits: int = 6) -> list[Any]:
+    """Return numbers for JSON with so many significant digits; None for non-finite ones."""
+    return [float(f"{value:.{digits}g}") if math.isfinite(value) else None for value in values.tolist()]
