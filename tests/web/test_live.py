@@ -286,13 +286,13 @@ async def test_a_stranger_is_told_nothing_and_a_login_that_ends_ends_the_stream(
             assert socket.subprotocol == "fdhil"  # the token is not said back
             await asyncio.wait_for(socket.recv(), WAIT_S)
             await client.delete("/api/session", headers={"Authorization": f"Bearer {token}"})
-            with pytest.raises(ConnectionClosed, match="the login has ended"):
+            with pytest.raises(ConnectionClosed, match="the login has expired"):
                 await heard_out(socket)
         token = (await client.post("/api/session", json={"name": "ann", "password": PASSWORD})).json()["token"]
         async with stream_of(place, subprotocols=["fdhil", f"bearer.{token}"]) as socket:
             await socket.recv()
             write_users(tmp_path / "users.json", {})
             told: list[object] = []
-            with pytest.raises(ConnectionClosed, match="the login has ended"):
+            with pytest.raises(ConnectionClosed, match="the login has expired"):
                 await heard_out(socket, told)
             assert len(told) <= 1  # which was on its way
