@@ -8,11 +8,12 @@ import contextlib
 import json
 import os
 import resource
+import select
 import signal
 import sys
 import threading
 from asyncio.subprocess import PIPE, Process
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +98,13 @@ def receive_request() -> dict[str, Any]:
     request: dict[str, Any] = json.loads(sys.stdin.buffer.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
     return request
+
+
+def receive_requests(idle_s: float) -> Iterator[dict[str, Any]]:
+    """Yield one request after another until the parent is gone, or has sent none for ``idle_s``."""
+    with open(0, "rb", buffering=0, closefd=False) as lines:  # select does not see buffered lines
+        while select.select([lines], [], [], idle_s)[0] and (line := lines.readline()):
+            yield json.loads(line)
 
 
 def _end_with_parent() -> None:

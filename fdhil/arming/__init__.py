@@ -1,1 +1,1 @@
-"""Arming: from a program to rows that were checked, handed to the guard and fed to it while the machine runs."""
+"""Arming: checks a program, hands its table rows to the guard, and feeds more rows while the machine runs."""

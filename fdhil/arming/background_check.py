@@ -1,4 +1,4 @@
-"""Starts the check of a long program, follows it ahead of the motion, abandons and remembers it."""
+"""Runs the check of a long program in the background: starts it, follows it ahead of the motion, abandons it."""
 
 import asyncio
 import contextlib
@@ -23,7 +23,7 @@ Enough = Callable[[CheckedProgram], bool]
 
 
 class BackgroundCheck:
-    """At most one check at a time; it goes on by itself when enough has passed, until it ends or is abandoned."""
+    """Runs at most one check at a time; it continues after the caller has enough, until it ends or is abandoned."""
 
     def __init__(self, config: MachineConfig) -> None:
         self._config = config
@@ -32,7 +32,7 @@ class BackgroundCheck:
 
     @property
     def progress(self) -> Mapping[str, Any] | None:
-        """What the check said last; None while none runs."""
+        """The last progress report; None while no check runs."""
         return None if self._going is None or self._going.ended else self._going.progress
 
     async def run(
@@ -43,11 +43,11 @@ class BackgroundCheck:
         enough: Enough,
         config: MachineConfig | None = None,
     ) -> CheckedProgram | tuple[Reason, ...]:
-        """Return the program as soon as ``enough`` of it or all has passed, or why it is refused: every place.
+        """Return the program once ``enough`` of it, or all of it, has passed; else every reason why it is refused.
 
-        ``config`` is that of the machine with its regulators as they were identified; left out: as configured.
-        What was checked before is not checked again; a check that still goes on is taken up, one of another program is
-        ended. StoreError when no rows can be written.
+        ``config`` is the configuration with the identified regulators; the default is the configured one. Results of
+        earlier checks are reused. A running check of the same program is joined, one of another program is ended.
+        Raises StoreError if the rows cannot be written.
         """
         config = config or self._config
         key = self._key(program_digest, models, config)
@@ -59,18 +59,18 @@ class BackgroundCheck:
             await self.close()
             request = self._request(program, program_digest, models, key, config)
             going = self._going = _RunningCheck(request, await asyncio.to_thread(self._opened, key))
-        with contextlib.ExitStack() as left:  # who waits for it was cancelled, or cannot judge it
-            left.callback(self.abandon)
+        with contextlib.ExitStack() as on_failure:  # the caller was cancelled, or ``enough`` failed
+            on_failure.callback(self.abandon)
             found = await going.passed(enough)
-            left.pop_all()
+            on_failure.pop_all()
         return found
 
     def _key(self, program_digest: str, models: Mapping[str, Parameters], config: MachineConfig) -> str:
-        of = [SCHEMA, program_digest, config.digest, {axis: values_of(m) for axis, m in models.items()}]
-        return hashlib.sha256(json.dumps(of).encode()).hexdigest()[:32]
+        parts = [SCHEMA, program_digest, config.digest, {axis: values_of(m) for axis, m in models.items()}]
+        return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
 
     def _opened(self, key: str) -> CheckedProgram:
-        """Open the file before the process writes it: no rename or removal can come in between."""
+        """Open the file before the child process writes it, so that no rename or removal can come in between."""
         part = part_file(self._folder, key)
         try:
             part.parent.mkdir(parents=True, exist_ok=True)
@@ -93,26 +93,21 @@ class BackgroundCheck:
         }
 
     def abandon(self) -> bool:
-        """End a check that runs; return whether one did."""
+        """End a running check; return whether there was one."""
         return self._going is not None and self._going.abandon()
 
     async def attend(self) -> None:
-        """Raise what went wrong in following a check that goes on by itself."""
         if self._going is not None and self._going.ended:
             await self._going.task
 
     async def close(self) -> None:
-        """End a check that runs and wait for its end."""
         self.abandon()
         if self._going is not None:
             await asyncio.wait([self._going.task])
 
 
 class _RunningCheck:
-    """One check on its way: its process, what it said last, and the rows that passed."""
-
     def __init__(self, request: Mapping[str, Any], checked: CheckedProgram) -> None:
-        """Start to follow the process that answers the request; what goes wrong in that is raised by ``task``."""
         self.key, self.checked = str(request["key"]), checked
         self.ended = self._abandoned = False
         self._program = str(request["program"])
@@ -123,7 +118,6 @@ class _RunningCheck:
         self.task = asyncio.create_task(self._follow(request), name=f"check of {self._program}")
 
     async def passed(self, enough: Enough) -> CheckedProgram | tuple[Reason, ...]:
-        """Wait until enough or all has passed, or until all is known of why it is refused."""
         while not self.ended:
             if not self.checked.refused and enough(self.checked):
                 return self.checked
@@ -133,7 +127,6 @@ class _RunningCheck:
         return self.checked if self.checked.whole else self.checked.refused
 
     def abandon(self) -> bool:
-        """End the process; return whether it ran."""
         running = not self.ended
         self._abandoned = self._abandoned or running
         self._process.kill()
@@ -149,23 +142,22 @@ class _RunningCheck:
             self.ended = True
             self._news.set()
 
-    def _take(self, told: Mapping[str, Any]) -> None:
+    def _take(self, message: Mapping[str, Any]) -> None:
         checked = self.checked
         self._news.set()
-        if "progress" in told:
-            self.progress = {"program": self._program, **told["progress"]}
-        elif "block" in told:
-            end, sha256 = told["block"]
-            checked.take(Block(end, sha256, told["last"]), told["errors"])
-        elif "header" in told:
-            checked.refused = tuple(Reason(**each) for each in told["header"]["refused"])
+        if "progress" in message:
+            self.progress = {"program": self._program, **message["progress"]}
+        elif "block" in message:
+            end, sha256 = message["block"]
+            checked.take(Block(end, sha256, message["last"]), message["errors"])
+        elif "header" in message:
+            checked.refused = tuple(Reason(**each) for each in message["header"]["refused"])
             if not checked.refused:
-                checked.conclude(told["header"])
-        elif refused := told.get("refused") or told.get("error"):
+                checked.conclude(message["header"])
+        elif refused := message.get("refused") or message.get("error"):
             checked.refused += (Reason(**refused),)
 
     def _conclude(self, code: int) -> None:
-        """A check that ended without a word on the whole has died."""
         if self.checked.whole or (self.checked.refused and code == 0):
             return
         if self._abandoned:

@@ -1,8 +1,8 @@
-"""Holds a program's checked rows: it is armed with its first seconds, the rest is handed on as it runs.
+"""Holds the checked table rows of a program: it is armed with its first seconds, the rest follows as it runs.
 
-What is handed on are the very rows of the check, each block compared with the digest that the check told of it, so
-nothing is computed while it runs. The check may still be ahead of the motion: a block that it has not passed does not
-exist here. Where no more rows come the guard ramps to zero by itself (``TableStarved``), with a second of reserve left.
+The rows are those of the check, each block compared with the digest that the check reported, so that nothing is
+computed while the program runs. The check may still run ahead of the motion; blocks that it has not passed yet do not
+exist here. If no more rows arrive, the guard ramps to zero on its own (``TableStarved``) with one second of reserve.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from fdhil.errors import ProgramError, StoreError
 from fdhil.program import program_digest
 from fdhil.records import Reason
 
-RING_S = 10.0  # of rows that the guard is given ahead of where the machine is; it ramps down below 1 s
+RING_S = 10.0  # of rows held by the guard ahead of the machine; below 1 s it ramps down
 FIRST_S = 10.0
 
 NO_ERROR: Mapping[str, float] = {"rms_um": 0.0, "max_um": 0.0}
@@ -34,7 +34,7 @@ Rows = dict[str, list[int]]
 
 
 class Piece(NamedTuple):
-    """Rows from ``first`` on: demand and offset per axis, in increments; ``final``: no more follow."""
+    """Table rows from row ``first`` on: demand and offset per axis, in increments; ``final``: no more rows follow."""
 
     first: int
     demand: Rows
@@ -43,7 +43,7 @@ class Piece(NamedTuple):
 
 
 class Block(NamedTuple):
-    """Rows that passed, up to ``end``; ``last``: the program ends with them."""
+    """A block of checked rows, up to row ``end``; ``last``: the program ends with it."""
 
     end: int
     sha256: str
@@ -51,15 +51,15 @@ class Block(NamedTuple):
 
 
 class CheckedProgram:
-    """The rows of one program that passed the gate: all of them, or while the check goes on those so far.
+    """The rows of one program that passed the gate: all of them, or those checked so far.
 
-    ``header`` is what the check found of the whole, None before its end; ``refused`` why the rows end where they end.
-    ``half_um`` is half the 95 % interval of the error that is left, as a plan of the whole has it; None: the skill of
-    the last moves is all that is known. The file stays open: what is armed is read from it, whatever its name becomes.
+    ``header`` holds the results of the whole check, None before its end; ``refused`` says why the rows end where they
+    end. ``half_um`` is half the 95 % interval of the residual error as the plan of the whole program predicts it, None
+    if only the skill of the last moves is known. The file stays open, so that renaming it does no harm.
     """
 
     def __init__(self, rows: Path | int, axes: Sequence[str]) -> None:
-        """Open the rows, or take over the descriptor of those in memory; OSError when they are not there."""
+        """Open the rows, or take over the file descriptor of rows in memory. Raises OSError if there are none."""
         self.axes = tuple(axes)
         self.method = "inverse"
         self.half_um: float | None = None
@@ -72,10 +72,10 @@ class CheckedProgram:
         weakref.finalize(self, os.close, self._descriptor)
 
     @staticmethod
-    def find(folder: Path, key: str, beside: Path) -> CheckedProgram | None:
-        """Return what was checked under ``key``; None when nothing was, by other code, or not all its rows are there.
+    def find(folder: Path, key: str, program_folder: Path) -> CheckedProgram | None:
+        """Return the result stored under ``key``; None if there is none, other code made it, or rows are missing.
 
-        ``beside`` is the program's folder: the subroutines there must be those of the check.
+        The subroutines in ``program_folder`` must be those of the check.
         """
         try:
             header = json.loads((folder / (key + HEADER)).read_bytes())
@@ -83,12 +83,12 @@ class CheckedProgram:
                 return None
             found = CheckedProgram(folder / (key + ROWS), header["axes"])
             good = header["schema"] == SCHEMA and header["code"] == code_digest() and not header["refused"]
-            good = good and all(program_digest(beside / name) == sha for name, sha in header["files"].items())
+            good = good and all(program_digest(program_folder / name) == sha for name, sha in header["files"].items())
             blocks = [Block(end, sha256, end == header["rows"]) for end, sha256 in header["blocks"]]
             for k, block in enumerate(blocks if good else []):
                 found.blocks.append(block)
                 found.content(k)
-            os.utime(folder / (key + HEADER))  # what is used is not the oldest
+            os.utime(folder / (key + HEADER))  # the oldest results are deleted
             found.conclude(header)
         except (OSError, StoreError, ValueError, LookupError, TypeError, AttributeError, RecursionError, ProgramError):
             return None
@@ -100,33 +100,30 @@ class CheckedProgram:
         self.errors = errors
 
     def conclude(self, header: Mapping[str, Any]) -> None:
-        """Take what the check found of the whole."""
         self.errors = {which: header[which] for which in ("before", "after")}
         self.header = header
 
     @property
     def rows(self) -> int:
-        """How many rows have passed."""
         return self.blocks[-1].end if self.blocks else 0
 
     @property
     def whole(self) -> bool:
-        """Whether all of the program passed."""
         return self.header is not None and not self.refused
 
     @property
     def gain_um(self) -> float:
-        """By how much the contour error's RMS is predicted to shrink in these rows; 0 where the gate lets none pass."""
+        """The predicted reduction of the contour error's RMS in these rows; 0 if the gate refuses it."""
         then, now = self.errors["before"]["rms_um"], self.errors["after"]["rms_um"]
         return 0.0 if gate.gains(then, now) else then - now
 
     @property
     def largest_um(self) -> float:
-        """The largest offset; of a program that is not known to its end, any."""
+        """The largest offset; infinite while the check goes on."""
         return float(self.header["largest_um"]) if self.header is not None else math.inf
 
     def content(self, k: int) -> bytes:
-        """Return the rows of a block; StoreError when they are not those that the check told of."""
+        """Return the rows of a block. Raises StoreError if they are not those that the check reported."""
         block, first = self.blocks[k], self.blocks[k - 1].end if k else 0
         size = 8 * len(self.axes)
         try:
@@ -139,10 +136,9 @@ class CheckedProgram:
 
 
 class RowStream:
-    """The rows of one checked program in the guard's increments; ``end`` is one past the last row handed out."""
+    """The rows of a checked program in the guard's increments; ``end`` is one past the last row handed out."""
 
     def __init__(self, checked: CheckedProgram, program_digest: str, sync_period_s: float) -> None:
-        """Begin at the first row; nothing is read yet."""
         self.checked, self.program_digest = checked, program_digest
         self.axes = checked.axes
         self.end = 0
@@ -151,23 +147,22 @@ class RowStream:
 
     @property
     def ready(self) -> bool:
-        """Whether a block waits; the last one waits for what is found of the whole."""
+        """Whether a block can be handed out; the last one only after the check has ended."""
         blocks = self.checked.blocks
         return self._next < len(blocks) and (self.checked.whole or not blocks[self._next].last)
 
     @property
     def reach_s(self) -> float:
-        """Where the rows end that passed and may be handed out, seconds of the program."""
+        """The end of the rows that passed and may be handed out, in seconds of the program."""
         blocks, whole = self.checked.blocks, self.checked.whole
         return max((block.end for block in blocks[-2:] if whole or not block.last), default=0) * self.period_s
 
     @property
     def done(self) -> bool:
-        """Whether no more rows come, all of the program being handed out."""
         return self.checked.whole and self._next == len(self.checked.blocks)
 
     def take(self, seconds: float = 0.0) -> Piece:
-        """Return the next block, and more where ``seconds`` ask for it; StoreError when its rows are not there."""
+        """Return the next block, or more blocks covering ``seconds``. Raises StoreError if the rows cannot be read."""
         first, content = self.end, [self._block()]
         while self.ready and (self.end - first) * self.period_s < seconds:
             content.append(self._block())
@@ -183,11 +178,11 @@ class RowStream:
         return content
 
     def lacks(self, status: Mapping[str, Any]) -> bool:
-        """Whether the guard, by its status, holds less than the ring ahead of the machine."""
+        """Return whether the guard, by its status, holds less than the ring ahead of the machine."""
         return not self.done and self.left_s(status) < RING_S
 
     def left_s(self, status: Mapping[str, Any]) -> float:
-        """Return the seconds that the guard, by its status, holds ahead of the machine."""
+        """Return the seconds of rows that the guard, by its status, holds ahead of the machine."""
         rows = status.get("rows")
         return (int(rows[1]) - int(status.get("row") or 0)) * self.period_s if rows else math.inf
 

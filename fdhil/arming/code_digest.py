@@ -1,4 +1,4 @@
-"""Digests the code that makes checked rows: what other code made under the same version is not reused."""
+"""Computes a digest of the code that makes checked rows, so that rows of other code are not reused."""
 
 import hashlib
 import json
@@ -29,7 +29,7 @@ def code_digest() -> str:
 
 
 def code_files(home: Path) -> dict[str, bytes]:
-    """Return the files of the package in ``home`` that the maker of rows imports, or that a table lists for it."""
+    """Return the package files below ``home`` that the check imports, or that a table in tables.py lists."""
     found: dict[str, bytes] = {}
     waiting, seen = [MAKER], set[str]()
     while waiting:
@@ -41,7 +41,7 @@ def code_files(home: Path) -> dict[str, bytes]:
         for file in (place.with_suffix(".py"), place / "__init__.py"):
             if file.is_file():
                 content = found[str(file.relative_to(home))] = file.read_bytes()
-                if module != "fdhil":  # which offers the Python interface, and imports it for no row
+                if module != "fdhil":  # which only offers the Python interface
                     waiting += _imported(content.decode())
         waiting.append(module.rpartition(".")[0] or "fdhil")  # a package is imported with its modules
     return found

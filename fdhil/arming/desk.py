@@ -1,4 +1,4 @@
-"""Arms and disarms for the operator, by what is known of the models, and vouches for what is armed."""
+"""Arms and disarms for the operator, as far as the models allow it, and supervises what is armed."""
 
 import asyncio
 import contextlib
@@ -40,23 +40,21 @@ from fdhil.store.rows import Revision
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 STREAM_S = 0.05
-ALIVE_S = 0.1  # the guard calls us lost after 0.5 s
+ALIVE_S = 0.1  # the guard considers the daemon lost after 0.5 s
 REFRESH_S = 0.5
-LANDING_S = 1.0  # without a SYNC; while there is SYNC, what ended a moment ago comes to rest by itself
+LANDING_S = 1.0  # without SYNC; with SYNC a ramp-down that has begun completes on its own
 
-Tell = Callable[[Sequence[Notice]], None]
+Record = Callable[[Sequence[Notice]], None]
 Prepared = TypeVar("Prepared", Armament, Feeding)
 
 
 class Storing(Protocol):
-    """The store of the outcomes, as far as arming asks."""
-
     fault: str | None
-    """Why nothing can be stored now; None while all is well."""
+    """Why nothing can be stored now; None while storing works."""
 
 
 class ArmingDesk:
-    """Knows when a correction may be armed, and withdraws what it no longer vouches for."""
+    """Decides whether a correction may be armed, and withdraws the facts that no longer hold."""
 
     def __init__(self, config: MachineConfig, store: Storing, run_directory: Path, clock: Clock = SYSTEM_CLOCK) -> None:
         self._config, self._clock = config, clock
@@ -77,40 +75,39 @@ class ArmingDesk:
         self.guard = GuardLink(config.guard.run_directory or run_directory, config.store.directory, clock)
 
     def begin(self, newest: Mapping[str, Revision], skills: Sequence[Skill]) -> None:
-        """Start from what the history knows; the token is made where there is none. DeviceError when it cannot be."""
+        """Start from the stored parameters and skills; create the token if there is none. Raises DeviceError."""
         self._token = ensure_token(self._run_directory)
         self.knowledge.begin(newest, skills)
 
     def restore_token(self) -> None:
-        """Write the token again where it was cleaned away (blocking). DeviceError when it cannot be kept secret."""
+        """Write the token again if it was removed (blocking). Raises DeviceError if it cannot be kept secret."""
         ensure_token(self._run_directory, self._token)
 
     def hear(self, samples: AxisSamples) -> None:
-        """Take samples: those of a pass of the armed program are compared with what was predicted."""
+        """Take samples: those of a pass of the armed program are compared with the prediction."""
         self._passes.take(samples)
         self._standstill.take(samples)
 
     def hear_nc(self, state: NcState) -> None:
-        """Take what the NC says: a pass that it held, or ran at another speed, is not as planned."""
         self._passes.hear_nc(state)
 
     @property
     def passes(self) -> list[Mapping[str, Any]]:
-        """What the last passes under a correction measured, oldest first."""
-        return list(self._passes.told)
+        """The measurements of the last passes under a correction, oldest first."""
+        return list(self._passes.reports)
 
     @property
     def armed(self) -> Mapping[str, Any] | None:
-        """What was armed last and still is, None otherwise; of a program also how far its check is."""
+        """What is armed, None if nothing is; of a program also how far its check is."""
         if self._armed is None:
             return None
         armed, summary = self._armed
         return {**summary, **armed.progress()}
 
     async def arm(self, request: Mapping[str, Any], hung_up: Callable[[], bool] = lambda: False) -> Answer:
-        """Plan, load and arm one program; every no has its class, cause and next action.
+        """Plan, load and arm one program; a refusal has code, cause and next action.
 
-        ``hung_up`` is asked in a thread, right before the guard is: nothing is armed for one who has left.
+        ``hung_up`` is called in a thread right before the guard is asked: nothing is armed for a client that has left.
         """
         token, program, method = (request.get(key) for key in ("token", "program", "method"))
         if not isinstance(token, str) or not hmac.compare_digest(
@@ -119,14 +116,18 @@ class ArmingDesk:
             return refusal("AuthRequired", "the operator's token is missing or wrong", "use the run directory's token")
         feeding = program is None and method == "flatness"
         if not (feeding or _is_name(program)) or not (method is None or method in tables.CORRECTIONS):
-            return refusal("BadRequest", "program or method is no name", f"methods: {', '.join(tables.CORRECTIONS)}")
+            return refusal(
+                "BadRequest",
+                "invalid program or method",
+                f"methods: {', '.join(tables.CORRECTIONS)}",
+            )
         if self._arming.locked():
-            return refusal("NotOff", "another program is being armed", "wait for its answer")
+            return refusal("NotOff", "another program is being armed", "wait for it, then arm again")
         async with self._arming:
             self._given_up, self._hung_up = False, hung_up
             if not await self._landed():
-                text = f"what was armed before is still on, in state {self.guard.state}"
-                return refusal("NotOff", text, "run fdhil disarm or wait until it has ended, then arm again")
+                text = f"the previous correction is still active, in state {self.guard.state}"
+                return refusal("NotOff", text, "run fdhil disarm or wait for its end, then arm again")
             self._disarms = self.guard.disarms
             if self.guard.state in ("FROZEN", "lost"):
                 way_out = ADOPT if self.guard.connected else START_AND_ADOPT
@@ -137,7 +138,6 @@ class ArmingDesk:
             return await self._arm(Path(str(program)), method, token, request)
 
     async def _landed(self) -> bool:
-        """Wait a moment for the end of what ramps down; return whether the guard is at rest, or absent."""
         await in_own_thread(landed, self.guard.look, LANDING_S, LANDING, self._clock)
         if self.guard.state in REST:
             self._release()
@@ -145,12 +145,11 @@ class ArmingDesk:
 
     def _release(self) -> None:
         if self._armed is not None:
-            told = {"code": "GuardLost"} if self.guard.state in GONE else self.guard.status.get("cause") or {}
-            self._passes.end(told.get("code", ""), self._armed[0].summary(), told.get("late", ""))
+            cause = {"code": "GuardLost"} if self.guard.state in GONE else self.guard.status.get("cause") or {}
+            self._passes.end(cause.get("code", ""), self._armed[0].summary(), cause.get("late", ""))
         self._armed = self._feeder = None
 
     async def _feed_forward(self, token: str) -> Answer:
-        """Switch the on-line feed-forward on: it needs no program."""
         prepared = await asyncio.to_thread(prepare_feeding, self._config, self.knowledge.now())
         if isinstance(prepared, Refused):
             return _refused(prepared)
@@ -158,7 +157,7 @@ class ArmingDesk:
         answer = await self._hand_over(self.guard.feed_forward, prepared, summary, token)
         if not answer["ok"]:
             return answer
-        text = f"speed and torque of {', '.join(prepared.laws)} are fed forward on line, whatever program runs"
+        text = f"on-line feed-forward of speed and torque is active on {', '.join(prepared.laws)} for every program"
         return {"ok": True, "state": "FEEDFORWARD", "text": text, **summary}
 
     async def _hand_over(
@@ -168,7 +167,6 @@ class ArmingDesk:
         summary: Answer,
         token: str,
     ) -> Answer:
-        """Ask the guard in a thread; what it grants is armed, what it refuses is answered with what was planned."""
         prepared.facts["journal_writable"] = self._store.fault is None
         try:
             answer = await in_own_thread(ask, prepared, token, self._unwanted, self._disarms)
@@ -187,19 +185,19 @@ class ArmingDesk:
         if isinstance(request, Refused):
             return _refused(request)
         if asked.get("program_digest") not in (None, request.program_digest):
-            text = f"{program} is not the program that was meant: its content has another digest"
-            return refusal("ProgramMismatch", text, "see who changed it, then arm again")
+            text = f"{program} has changed: its digest is not the confirmed one; nothing was armed"
+            return refusal("ProgramMismatch", text, "check the program, then arm again")
         checked = await self._checked(request, asked.get("whole") is True)
         if isinstance(checked, Refused):
             return _refused(checked)
         if (broken := self._passes.broken(request.program_digest, request.models)) is not None:
             return _refused(Refused((broken,)))
-        rows, pupil = await asyncio.to_thread(taught, checked, request, self._config.digest)
+        rows, learner = await asyncio.to_thread(taught, checked, request, self._config.digest)
         known, rest = self.knowledge.now(), self._standstill.now()
         armament = await asyncio.to_thread(prepare_armament, request, rows, self._config, known, rest)
         summary = armament.summary()
         ahead_mm = await asyncio.to_thread(ahead_of_motors_mm, rows, request)
-        self._passes.begin(armament.begin.demand, armament.rows, request.models, pupil, ahead_mm)
+        self._passes.begin(armament.begin.demand, armament.rows, request.models, learner, ahead_mm)
         answer = await self._hand_over(self.guard.arm, armament, summary, token)
         if not answer["ok"]:
             self._passes.forget()
@@ -207,37 +205,36 @@ class ArmingDesk:
         self._feeder = StreamFeeder(armament, self.guard, self._standstill)
         text = f"armed {program.name} by {summary['method']}: {summary['promise']}"
         if not summary["check"]["whole"]:
-            text += f" in its first {summary['check']['checked_s']:.0f} s; the check of the rest goes on ahead of it"
-        text += "; start the program, its error is measured as it runs"
+            text += f" in its first {summary['check']['checked_s']:.0f} s; the rest is checked ahead of the motion"
+        text += "; start the program: its error is measured as it runs"
         return {"ok": True, "state": answer.get("state", "ARMED"), "text": text, **summary}
 
     async def _checked(self, request: ArmRequest, whole: bool) -> CheckedProgram | Refused:
-        """Have a program checked: at once, or ahead of the motion as far as arming asks, or as a ``whole``."""
         if not request.ahead:
             return await asyncio.to_thread(plan_whole, request, self.knowledge.now())
 
         def enough(checked: CheckedProgram) -> bool:
             return not whole and may_begin(checked, self._config, self.knowledge.now())
 
-        of = (request.program, request.program_digest, request.models)
-        checked = await self._check.run(*of, enough, request.config)
+        arguments = (request.program, request.program_digest, request.models)
+        checked = await self._check.run(*arguments, enough, request.config)
         return Refused(checked) if isinstance(checked, tuple) else checked
 
     @property
     def checking(self) -> Mapping[str, Any] | None:
-        """How far the check of a long program is; None while none runs."""
+        """The progress of a long program's check; None while none runs."""
         return self._check.progress
 
     def abandon(self) -> bool:
-        """Arm nothing of what is being prepared; return whether its check was ended. That of what is armed goes on."""
+        """Arm nothing of what is being prepared; return whether its check was ended. Armed programs are unaffected."""
         self._given_up = True
         return self._feeder is None and self._check.abandon()
 
     async def disarm(self) -> Answer:
-        """Have the guard ramp to zero: ok only when it is reached. What is being planned or checked is not armed."""
-        self._feeder = None  # no more rows, no more words about them
+        """Have the guard ramp to zero; ok only when zero is reached. What is being prepared is not armed."""
+        self._feeder = None  # neither rows nor notices of it from here on
         abandoned = self.abandon()
-        if self._disarming is None or self._disarming.done():  # who asks again meanwhile waits for the same ramp
+        if self._disarming is None or self._disarming.done():  # repeated requests wait for the same ramp
             self._disarming = asyncio.ensure_future(self._to_zero())
         answer = await asyncio.shield(self._disarming)
         return {**answer, "text": f"{answer['text']}; the check was abandoned"} if abandoned else answer
@@ -254,17 +251,17 @@ class ArmingDesk:
         return verdict(self.guard.status)
 
     def _without_guard(self, error: DeviceError) -> Answer:
-        """Return the refusal without a guard; what the last one may have left is told."""
-        stands = self.guard.standing
-        if stands.nothing:
+        """Return the refusal without a guard, with the offset that the last one may have left."""
+        residual = self.guard.standing
+        if residual.nothing:
             text, _, advice = str(error).rpartition("; ")
             return refusal("GuardAbsent", text, advice)
-        return refusal("OffsetStands", f"{error}; {stands}", START_AND_ADOPT)
+        return refusal("OffsetStands", f"{error}; {residual}", START_AND_ADOPT)
 
-    async def attend(self, tell: Tell) -> None:
-        """Tell the guard that this loop turns and what is still vouched for, and the log what the guard does.
+    async def attend(self, record: Record) -> None:
+        """Report to the guard that the daemon is alive and which facts hold; record what the guard does.
 
-        The guard's answer is not waited for: while a program is handed over it takes its time.
+        The guard's answer is not awaited: it takes its time while a program is handed over.
         """
         looking: asyncio.Future[list[Notice]] | None = None
         turn = 0
@@ -275,22 +272,21 @@ class ArmingDesk:
             await asyncio.sleep(ALIVE_S)
             turn += 1
             if looking is not None and looking.done():
-                tell(looking.result())
+                record(looking.result())
                 looking = None
                 if self.guard.state in REST:
                     self._release()
 
-    async def stream(self, tell: Tell) -> None:
-        """Hand a long program's rows to the guard as they pass and as it runs, and tell what is refused of them."""
+    async def stream(self, record: Record) -> None:
+        """Hand a long program's rows to the guard as they pass the check, and record refusals."""
         while True:
             await asyncio.sleep(STREAM_S)
             if self._feeder is not None:
-                tell(await asyncio.to_thread(self._feeder.go_on))
-            tell(await asyncio.to_thread(self._passes.digest))
+                record(await asyncio.to_thread(self._feeder.go_on))
+            record(await asyncio.to_thread(self._passes.digest))
             await self._check.attend()
 
     def _facts(self) -> Mapping[str, bool] | None:
-        """Return what is still vouched for while a correction runs; None while none does."""
         if self._armed is None:
             return None
         facts = self._armed[0].standing_facts(self._config, self.knowledge.now())

@@ -1,10 +1,9 @@
-"""Begins a correction from what the drives hold at rest: its first rows are found anew when the axes stand there.
+"""Recomputes the first rows of a correction from the current that the axes hold at standstill.
 
-A check of a program knows nothing of the current at which an axis will stand when it starts: that is somewhere in the
-band of its dry friction, wherever the last move has left it, and up to the first corner it is most of the error that
-the check's own rows leave. Once the axes stand at the start it is heard on the bus. The rows that are found from it go
-over into the checked ones, and take their place only where the model says that they are better. Until the axes stand
-there, what the way to the start will leave is expected.
+The check of a program cannot know the current at which an axis will stand when the program starts: it lies in the band
+of dry friction, depending on the last move, and causes most of the residual error up to the first corner. Once the axes
+stand at the start, the current is measured on the bus. The recomputed rows blend into the checked ones and replace them
+only if the model predicts an improvement. Until then the current that the move to the start will leave is predicted.
 """
 
 from collections.abc import Mapping
@@ -26,16 +25,16 @@ from fdhil.prediction.contour import contour_error_um
 from fdhil.prediction.model_terms import Band, band
 from fdhil.records import Float, Parameters, rms, table_path
 
-ALONE_S, JOINED_S = 0.9, 1.4  # from where on rows go over into the checked ones, and where they are those
+ALONE_S, JOINED_S = 0.9, 1.4  # begin and end of the blend into the checked rows
 AT_START_INCREMENTS = 1.5
-CHANGED_SHARE = 0.05  # of the dry friction: a current that differs by less from the one that was used changes nothing
+CHANGED_SHARE = 0.05  # of the dry friction: smaller changes of the current are ignored
 
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """What was found for one axis: its offsets (n,) in increments, and whether the limits allow them.
+    """The solution of one axis: its offsets (n,) in increments, and whether the limits allow them.
 
-    The positions are those that the model's own rows lead to, with what is in force added to them, and with this.
+    ``old_mm`` and ``new_mm`` (n,) are the positions predicted with the offsets in force and with these.
     """
 
     offset: Float
@@ -45,7 +44,7 @@ class _Found:
 
 
 class FirstBlock:
-    """The first rows of an inverse correction, as they are in force, and what is needed to find them anew."""
+    """The first rows of an inverse correction that are in force, and what is needed to recompute them."""
 
     def __init__(
         self,
@@ -57,13 +56,13 @@ class FirstBlock:
     ) -> None:
         """Prepare for a checked program that begins with ``begin``.
 
-        ProgramError when it can no longer be read, or is not the one with the digest ``sha256``.
+        Raises ProgramError if it can no longer be read, or does not have the digest ``sha256``.
         """
         self.begin = self._checked = begin
         self._models, self._config, self._period_s = models, config, config.machine.sync_period_s
         self._path = _first_rows(program, config, sha256)
         rapid = {axis: config.axis[axis].rapid_speed_mm_s for axis in begin.offset}
-        # rows that lag on purpose lag by what the whole path asks for
+        # the lag of rows that lag on purpose depends on the whole path
         self._fits = set(begin.offset) <= set(self._path) and common_delay_s(rapid, models, config)[0] == 0.0
         self._walks = {}
         if self._fits:
@@ -73,10 +72,9 @@ class FirstBlock:
         self._own: dict[str, Float] = {}
 
     def renew(self, rest: Mapping[str, AtRest]) -> Piece | None:
-        """Return rows that begin where the axes stand; None where those that are in force are to stay.
+        """Return rows that begin where the axes stand; None if the rows in force are to stay.
 
-        They are where an axis does not stand at the program's start, where all stand as they were known to, or where
-        nothing is gained.
+        They stay if an axis does not stand at the program's start, if no current has changed, or if nothing is gained.
         """
         axes = tuple(self.begin.offset)
         if not self._fits or not all(self._stands(axis, rest.get(axis)) for axis in axes):
@@ -93,15 +91,15 @@ class FirstBlock:
         return Piece(0, {axis: values[:rows] for axis, values in self.begin.demand.items()}, offset, self.begin.final)
 
     def take(self, rows: Piece) -> None:
-        """Know that these are in force."""
+        """Note that these rows are in force."""
         behind = {axis: values[len(rows.offset[axis]) :] for axis, values in self.begin.offset.items()}
         self.begin = self.begin._replace(offset={axis: rows.offset[axis] + behind[axis] for axis in rows.offset})
 
     def expect(self, rest: Mapping[str, AtRest]) -> Piece | None:
-        """Return rows for a machine that is taken to the start from where its axes ``rest``, as :meth:`renew` does.
+        """Return rows for a machine that will move to the start from where its axes ``rest``, like :meth:`renew`.
 
-        Each axis that has a way to go will stop with its regulators' integral at the edge of the dry friction's band,
-        on the side of its last motion: creeping to its target it has nothing else to push against.
+        An axis that has to move will stop with its regulators' integral at the edge of the dry friction's band, on the
+        side of its last motion.
         """
         return self.renew({axis: self._arrived(axis, there) for axis, there in rest.items() if axis in self._walks})
 
@@ -125,10 +123,7 @@ class FirstBlock:
         return abs(change_a) * self._models[axis].K > CHANGED_SHARE * 0.5 * (held.high - held.low)
 
     def _solved(self, name: str, rest: AtRest) -> _Found:
-        """Find the offsets of one axis' first rows: those that were checked, and what another begin makes of them.
-
-        What was checked may be more than the model's own rows, where passes have taught it.
-        """
+        """Compute the offsets of one axis' first rows: the checked ones plus the change for another initial state."""
         walk, axis, path_mm = self._walks[name], self._config.axis[name], self._path[name]
         loop, state = walk.loop, rest_state(rest, float(path_mm[0]), self._models[name], axis)
         if name not in self._own:
@@ -151,7 +146,6 @@ class FirstBlock:
         return _Found(new[:rows], old_mm, new_mm, allowed)
 
     def _block(self, name: str, state: State) -> Float:
-        """Return the model's own offsets of an axis' first block that begins in a state."""
         walk, path_mm = self._walks[name], self._path[name]
         block, ahead = block_rows(self._period_s)
         ends = path_mm.size <= block + ahead
@@ -171,7 +165,6 @@ class FirstBlock:
 
 
 def _first_rows(program: Path, config: MachineConfig, sha256: str | None) -> dict[str, Float]:
-    """Return the path's first block, what is looked at behind it, and a row that tells whether it goes on."""
     block, ahead = block_rows(config.machine.sync_period_s)
     pieces: list[Mapping[str, Float]] = []
     rows = 0
@@ -184,7 +177,7 @@ def _first_rows(program: Path, config: MachineConfig, sha256: str | None) -> dic
 
 
 def rest_state(rest: AtRest, start_mm: float, parameters: Parameters, axis: Axis) -> State:
-    """Return the state of an axis that stands at a program's start, as far off it as it stands off its demand."""
+    """Return the state of an axis at a program's start, with the following error that it has at standstill."""
     off_mm = rest.position_mm - rest.demand_mm
     if abs(off_mm) * axis.scaling.increments_per_mm < 1.0:  # the drive itself sees none
         off_mm = 0.0
@@ -192,6 +185,6 @@ def rest_state(rest: AtRest, start_mm: float, parameters: Parameters, axis: Axis
 
 
 def _share(rows: int, period_s: float) -> Float:
-    """Return (rows,) the share of the rows found anew: 1, then smoothly down to 0."""
+    """Return (rows,) the share of the recomputed rows: 1, then smoothly down to 0."""
     gone = np.clip((np.arange(rows) * period_s - ALONE_S) / (JOINED_S - ALONE_S), 0.0, 1.0)
     return np.asarray(1.0 - gone**3 * (10 - 15 * gone + 6 * gone**2))

@@ -1,7 +1,7 @@
-"""Talks to the guard over its control socket. Blocking and small; ``alive`` never blocks.
+"""Connects to the guard's control socket. Calls block for a short time; ``alive`` never blocks.
 
-Call ``alive`` at least every 0.2 s from the loop turn that checks the daemon's own health, not from a thread of its
-own: a daemon that hangs must look dead. The connection that armed is the one whose end ramps the offset down.
+Call ``alive`` at least every 0.2 s from the loop that checks the daemon's own health, not from a thread of its own: a
+daemon that hangs must look dead. When the connection that armed ends, the guard ramps to zero.
 """
 
 import os
@@ -21,15 +21,15 @@ ANSWER_S = 13.0  # the guard answers a request at a SYNC, or when it has missed 
 
 
 class GuardLost(DeviceError):
-    """The guard closed the connection: it has stopped, after ramping to zero where it could."""
+    """The guard closed the connection: it has stopped, after ramping to zero if it could."""
 
 
 class GuardClient:
-    """A connection to the guard of a run directory; ConnectError when none listens there.
+    """A connection to the guard of a run directory. Raises ConnectError if no guard listens there.
 
     Answers are the guard's JSON documents: {"ok": true, ...}, or {"ok": false, "code", "axis", "text", "advice",
-    "refused": [...]}: a refusal is a value, not an exception. GuardLost when the connection ends, DeviceTimeout when
-    no answer comes. Safe to use from two threads: ``alive`` may be called while another waits for an answer.
+    "refused": [...]}; a refusal is a value, not an exception. Raises GuardLost when the connection ends, DeviceTimeout
+    when no answer comes. Two threads may use it: ``alive`` may be called while another waits for an answer.
     """
 
     def __init__(self, run_directory: Path, timeout_s: float = ANSWER_S, clock: Clock = SYSTEM_CLOCK) -> None:
@@ -48,7 +48,6 @@ class GuardClient:
             raise ConnectError.of_socket(str(path), error, absent) from None
 
     def status(self) -> dict[str, Any]:
-        """Return the guard's status document."""
         return self.ask({"request": "status"})
 
     def load(
@@ -61,11 +60,11 @@ class GuardClient:
         final: bool = True,
         renew: bool = False,
     ) -> dict[str, Any]:
-        """Hand a table over (or with ``first`` and ``final`` a piece of a streamed one); have it checked and loaded.
+        """Load a table, or with ``first`` and ``final`` a piece of a streamed one, into the guard, which checks it.
 
-        ``renew``: they take the place of the first rows of what is armed and has not begun.
-        Rows per axis: demand and offset in drive increments (sequences of int or numpy integer arrays). StoreError when
-        it is too long or there is no memory for it, ValueError when a value is no 32 bit integer.
+        ``renew``: replace the first rows of an armed table that has not begun. Rows per axis: demand and offset in
+        drive increments (sequences of int or numpy integer arrays). Raises StoreError if the table is too long or
+        memory is short, ValueError if a value does not fit into 32 bits.
         """
         body = table.encode(axes, demand, offset, program_digest, first, final)
         descriptor = table.seal(body)
@@ -79,7 +78,7 @@ class GuardClient:
     ) -> dict[str, Any]:
         """Arm the loaded table; ``facts`` as in ``interlocks.FACTS``.
 
-        ``disarms``: as many as the status said before all this was prepared; the guard refuses when there was another.
+        ``disarms``: the count in the status before preparation began; the guard refuses if it was disarmed since.
         """
         request = {"request": "arm", "token": token, "program_digest": program_digest, "facts": dict(facts)}
         return self.ask(_as_of(disarms, request))
@@ -91,10 +90,7 @@ class GuardClient:
         facts: Mapping[str, bool],
         disarms: int | None = None,
     ) -> dict[str, Any]:
-        """Switch the on-line feed-forward on; ``laws`` per axis as in ``feedforward.Law``, facts as its interlocks.
-
-        ``disarms`` as for ``arm``.
-        """
+        """Enable the on-line feed-forward; ``laws`` per axis as in ``feedforward.Law``, facts as its interlocks."""
         laws = {axis: dict(law) for axis, law in laws.items()}
         request = {"request": "feedforward", "token": token, "laws": laws, "facts": dict(facts)}
         return self.ask(_as_of(disarms, request))
@@ -104,23 +100,23 @@ class GuardClient:
         return self.ask({"request": "disarm"})
 
     def adopt(self, token: str) -> dict[str, Any]:
-        """Take over what the drives hold and ramp it to zero (after FROZEN, or a stale offset)."""
+        """Take over the offsets that the drives hold and ramp them to zero (after FROZEN, or a residual offset)."""
         return self.ask({"request": "adopt", "token": token})
 
     def touched(self, token: str) -> dict[str, int]:
-        """Return how often each drive was touched up to now: to be asked before drives are compared."""
-        self.compared(token, {}, {})  # without SYNC it counts what it heard only when something is asked for
+        """Return how often each drive was written to so far; call it before comparing drives with their records."""
+        self.compared(token, {}, {})  # without SYNC the guard updates its counts only on a request
         return dict(self.status().get("touched", {}))
 
     def compared(self, token: str, axes: Mapping[str, str], touched: Mapping[str, int]) -> dict[str, Any]:
-        """Tell which drives were compared with their records; a fingerprint that is not the record's voids it.
+        """Report which drives were compared with their records; another fingerprint voids the record.
 
-        ``touched`` as it was before they were compared: one that was touched since is refused.
+        ``touched`` are the counts before the comparison: a drive that was written to since is refused.
         """
         return self.ask({"request": "compared", "token": token, "axes": dict(axes), "touched": dict(touched)})
 
     def alive(self, facts: Mapping[str, bool] | None = None) -> None:
-        """Say that the daemon is well, and what it still vouches for; GuardLost when the guard is gone."""
+        """Report that the daemon is well, and the facts that still hold. Raises GuardLost if the guard is gone."""
         message: dict[str, Any] = {"request": "alive"}
         if facts is not None:
             message["facts"] = dict(facts)
@@ -129,7 +125,7 @@ class GuardClient:
     def ask(
         self, request: Mapping[str, Any], timeout_s: float | None = None, descriptor: int | None = None
     ) -> dict[str, Any]:
-        """Send one request, and with it a descriptor, and wait for the answer."""
+        """Send one request, optionally with a file descriptor, and wait for the answer."""
         with self._asking:
             self._number += 1
             number = self._number
@@ -154,7 +150,7 @@ class GuardClient:
         while b"\n" not in self._inbox:
             try:
                 if not self._clock.wait_readable(self._socket, max(0.0, deadline_s - self._clock.now_s())):
-                    raise DeviceTimeout("guard", "gave no answer; look at its journal, then restart it")
+                    raise DeviceTimeout("guard", "did not answer; check its journal, then restart it")
                 chunk = self._socket.recv(1 << 16)
             except OSError as error:
                 raise self._lost(error.strerror or str(error)) from None
@@ -166,10 +162,10 @@ class GuardClient:
 
     @staticmethod
     def _lost(why: str) -> GuardLost:
-        return GuardLost("guard", f"is gone ({why}); look at its journal, then start it again")
+        return GuardLost("guard", f"is gone ({why}); check its journal, then start it again")
 
     def close(self) -> None:
-        """Close the connection: an armed correction is ramped down (MainLost)."""
+        """Close the connection: an armed correction is ramped to zero (MainLost)."""
         self._socket.close()
 
     def __enter__(self) -> Self:
@@ -180,5 +176,5 @@ class GuardClient:
 
 
 def _as_of(disarms: int | None, request: dict[str, Any]) -> dict[str, Any]:
-    """Return a request that holds only until the next disarm."""
+    """Add the condition that there was no other disarm since."""
     return request if disarms is None else {**request, "disarms": disarms}

@@ -1,4 +1,4 @@
-"""Links the daemon to the guard process: finds it, tells it that the daemon lives, asks it to arm."""
+"""Links the daemon to the guard process: connects, sends its sign of life, and asks it to arm."""
 
 import contextlib
 import threading
@@ -26,10 +26,10 @@ VOIDING = {RECORD_VOID, "NodeRebooted"}
 
 
 class GuardLink:
-    """At most one connection, safe from several threads.
+    """Keeps at most one connection to the guard; safe from several threads.
 
-    ``state`` is the guard's; without one ``absent`` when nothing can be applied, ``lost`` when something may: also by
-    what a daemon before this one left in the store.
+    ``state`` is the guard's; without a connection it is ``absent`` if nothing can be applied, ``lost`` if something may
+    be, also by what an earlier daemon left in the store.
     """
 
     def __init__(self, run_directory: Path, store_directory: Path, clock: Clock = SYSTEM_CLOCK) -> None:
@@ -39,34 +39,32 @@ class GuardLink:
         self._mark = StandingMark(store_directory)
         self._status: Mapping[str, Any] = self._mark.left or ABSENT
         self._missed = self._mark.left is None
-        self._heard_s: float | None = None
-        self._untold: list[Notice] = []
+        self._status_s: float | None = None
+        self._unreported: list[Notice] = []
         self._ended = False
 
     @property
     def connected(self) -> bool:
-        """Whether there is a connection."""
         return self._client is not None
 
     @property
     def status(self) -> Mapping[str, Any]:
-        """What the guard said last, and how long ago; None: it never did."""
-        age_s = None if self._heard_s is None else round(self._clock.now_s() - self._heard_s, 3)
+        """The guard's last status and its age in s (None if there never was one)."""
+        age_s = None if self._status_s is None else round(self._clock.now_s() - self._status_s, 3)
         return {**self._status, "heard_s_ago": age_s}
 
     @property
     def standing(self) -> Standing:
-        """What may still be applied, by what the guard said last."""
+        """What may still be applied in the drives, by the guard's last status."""
         return standing(self._status)
 
     @property
     def state(self) -> str:
-        """The guard's state when it was asked last."""
         return str(self._status["state"])
 
     @property
     def disarms(self) -> int | None:
-        """How often the guard had been disarmed when it was asked last; None where it does not say."""
+        """How often the guard had been disarmed by its last status; None if it does not report it."""
         return self._status.get("disarms")
 
     @property
@@ -75,31 +73,30 @@ class GuardLink:
         return int(self._status.get("row") or 0)
 
     def look(self) -> Mapping[str, Any]:
-        """Connect where needed, ask for the status and return it (blocking); the next ``refresh`` tells the change."""
+        """Connect if needed, read the status and return it (blocking); the next ``refresh`` reports the changes."""
         with contextlib.suppress(DeviceError), self._asked():
             pass
         return self._status
 
     def refresh(self) -> list[Notice]:
-        """Look at the status (blocking); return what changed since the last call."""
         self.look()
         return self.take_changes()
 
     def take_changes(self) -> list[Notice]:
-        """Return what changed since the last call, as far as it was seen."""
+        """Return the changes since the last call, as far as they were seen."""
         with self._lock:
-            told, self._untold = self._untold, []
-        return told
+            changes, self._unreported = self._unreported, []
+        return changes
 
     @contextlib.contextmanager
     def _asked(self, arming: bool = False) -> Iterator[GuardClient]:
-        """Give the connection, and look at the status afterwards; what changed is told by the next ``refresh``.
+        """Yield the connection, and read the status afterwards; the next ``refresh`` reports the changes.
 
-        A guard that does not answer is let go: what it may have armed it ramps down, and so it ends as it is told.
+        A guard that does not answer is disconnected: what it may have armed it then ramps to zero.
         """
         with self._lock:
             if self._ended:
-                raise ConnectError("guard", "is not asked any more, since the daemon ends; start it again")
+                raise ConnectError("guard", "is disconnected: the daemon is shutting down; start it again")
             before = self._status
             try:
                 if self._client is None:
@@ -107,24 +104,24 @@ class GuardLink:
                 if arming:
                     self._mark.keep(standing(lost(before, arming)))
                 yield self._client
-                self._status, self._heard_s = self._client.status(), self._clock.now_s()
+                self._status, self._status_s = self._client.status(), self._clock.now_s()
                 self._keep()
-                self._untold += _changes(before, self._status)
+                self._unreported += _changes(before, self._status)
             except DeviceError as error:
                 reached = self._client is not None
                 self._drop()
                 self._status = lost(before, arming and reached)
                 if not self._missed or before["state"] not in GONE or self._status["state"] != before["state"]:
-                    self._untold.append(_gone(before, self._status, error))
+                    self._unreported.append(_gone(before, self._status, error))
                 self._missed = True
                 raise
 
     def _keep(self) -> None:
-        stands = standing(self._status)
-        if stands.nothing:
+        residual = standing(self._status)
+        if residual.nothing:
             self._mark.remove()
-        elif stands.known:
-            self._mark.keep(stands)
+        elif residual.known:
+            self._mark.keep(residual)
 
     def _drop(self) -> None:
         if self._client is not None:
@@ -132,7 +129,7 @@ class GuardLink:
         self._client = None
 
     def say_alive(self, facts: Mapping[str, bool] | None) -> None:
-        """Tell the guard that the daemon is well (never blocks); a guard that is gone is found out by ``refresh``."""
+        """Report to the guard that the daemon is well (never blocks); ``refresh`` finds out if the guard is gone."""
         client = self._client
         if client is not None:
             try:
@@ -143,10 +140,10 @@ class GuardLink:
     def arm(
         self, armament: Armament, token: str, given_up: Callable[[], bool], disarms: int | None
     ) -> Mapping[str, Any]:
-        """Load the table and arm (blocking), unless it is ``given_up`` by then; return the guard's answer.
+        """Load the table and arm (blocking), unless ``given_up`` by then; return the guard's answer.
 
-        A disarm that was answered while this waited for its turn was the operator's last word; so is one that the guard
-        counted after the first ``disarms``, whoever asked for it. DeviceError when there is no guard.
+        A disarm that was answered in the meantime takes precedence; so does one that the guard counted after the first
+        ``disarms``. Raises DeviceError if there is no guard.
         """
         with self._asked(arming=True) as client:
             if given_up():
@@ -163,19 +160,19 @@ class GuardLink:
         return client.load(armament.stream.axes, piece.demand, piece.offset, digest, piece.first, piece.final, renew)
 
     def extend(self, armament: Armament, piece: Piece) -> Mapping[str, Any]:
-        """Hand on more rows of a running stream (blocking); DeviceError when there is no guard."""
+        """Hand more rows of a running stream to the guard (blocking). Raises DeviceError if there is no guard."""
         with self._asked() as client:
             return self._load(client, armament, piece)
 
     def renew(self, armament: Armament, piece: Piece) -> Mapping[str, Any]:
-        """Put other offsets into the first rows of what has not begun (blocking); DeviceError without a guard."""
+        """Replace the first rows of a program that has not begun (blocking). DeviceError if there is no guard."""
         with self._asked() as client:
             return self._load(client, armament, piece, renew=True)
 
     def feed_forward(
         self, feeding: Feeding, token: str, given_up: Callable[[], bool], disarms: int | None
     ) -> Mapping[str, Any]:
-        """Switch the on-line feed-forward on (blocking), as ``arm`` does. DeviceError without a guard."""
+        """Enable the on-line feed-forward (blocking), like ``arm``. Raises DeviceError if there is no guard."""
         with self._asked(arming=True) as client:
             laws, facts = feeding.laws, feeding.facts
             return self._ask(client, lambda: client.feed_forward(token, laws, facts, disarms), given_up)
@@ -183,20 +180,20 @@ class GuardLink:
     def _ask(
         self, client: GuardClient, arm: Callable[[], Mapping[str, Any]], given_up: Callable[[], bool]
     ) -> Mapping[str, Any]:
-        """Ask until the interlocks have been good for long enough, for a few seconds; any other no is final."""
+        """Repeat the request for a few seconds while the interlocks settle; any other refusal is final."""
         answer: Mapping[str, Any] = ABANDONED
         for _ in range(SETTLING_TRIES):
             if given_up():
                 return ABANDONED
-            client.alive(None)  # planning took its time: the guard must know us as alive when it is asked
+            client.alive(None)  # planning took its time: the guard needs a recent sign of life
             answer = arm()
-            if answer["ok"] or [told["code"] for told in answer.get("refused", [])] != ["NotSettled"]:
+            if answer["ok"] or [reason["code"] for reason in answer.get("refused", [])] != ["NotSettled"]:
                 break
             self._clock.sleep(SETTLING_S)
         return answer
 
     def disarm(self) -> Mapping[str, Any]:
-        """Ask for the ramp to zero and wait for its end (blocking); DeviceError when there is no guard."""
+        """Request the ramp to zero and wait for its end (blocking). Raises DeviceError if there is no guard."""
         with self._asked() as client:
             answer = client.disarm()
             if answer["ok"]:
@@ -204,49 +201,48 @@ class GuardLink:
             return answer
 
     def close(self) -> None:
-        """End the connection for good, and know what was heard last; what still runs is ramped down by the guard."""
+        """End the connection for good; the guard ramps to zero what still runs."""
         with self._lock:
             self._ended = True
             self._drop()
 
 
 def _gone(before: Mapping[str, Any], now: Mapping[str, Any], error: DeviceError) -> Notice:
-    stands = standing(now)
+    residual = standing(now)
     was = "" if before["state"] in GONE else f"it was in state {before['state']}; "
-    text = f"{error}; {was}{stands}"
-    if stands.nothing:
+    text = f"{error}; {was}{residual}"
+    if residual.nothing:
         return Notice("GuardLost", "minor", text)
     return Notice("GuardLost", "MAJOR", f"{text}; {START_AND_ADOPT}")
 
 
-def _severity(state: str, stands: Standing) -> Literal["info", "minor", "MAJOR"]:
-    """A guard that is off and has not read its drives yet is no alarm, what it knows or has left is one."""
-    if state not in AT_REST or stands.nothing:
+def _severity(state: str, residual: Standing) -> Literal["info", "minor", "MAJOR"]:
+    """A guard that is off and has not read its drives yet is no alarm; a known or frozen offset is one."""
+    if state not in AT_REST or residual.nothing:
         return "info"
-    return "MAJOR" if state == "FROZEN" or stands.known else "minor"
+    return "MAJOR" if state == "FROZEN" or residual.known else "minor"
 
 
 def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
-    """Say when the guard came, changed its state, or saw a record void; what something ended is a trip."""
     return [*_voided(before, now), *_moved(before, now)]
 
 
 def _voided(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
-    known = {told["axis"] for told in before.get("not_good", []) if told["code"] == RECORD_VOID}
-    void = [told for told in now.get("not_good", []) if told["code"] == RECORD_VOID and told["axis"] not in known]
-    return [Notice(RECORD_VOID, "MAJOR", f"{told['text']}; {told['advice']}", told["axis"]) for told in void]
+    known = {item["axis"] for item in before.get("not_good", []) if item["code"] == RECORD_VOID}
+    void = [item for item in now.get("not_good", []) if item["code"] == RECORD_VOID and item["axis"] not in known]
+    return [Notice(RECORD_VOID, "MAJOR", f"{item['text']}; {item['advice']}", item["axis"]) for item in void]
 
 
 def _moved(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
     cause = now.get("cause") or {}
     why = f": {cause.get('code', '')}: {cause['text']}" if cause.get("text") else ""
-    stands = standing(now)
-    severity = _severity(now["state"], stands)
-    left = f"; {stands}" if now["state"] in AT_REST else ""
+    residual = standing(now)
+    severity = _severity(now["state"], residual)
+    left = f"; {residual}" if now["state"] in AT_REST else ""
     if before["state"] in GONE:
-        return [Notice("GuardFound", severity, f"the guard runs, in state {now['state']}{why}{left}")]
+        return [Notice("GuardFound", severity, f"the guard is running, in state {now['state']}{why}{left}")]
     if before["state"] == now["state"]:
-        known = not left or standing(before).nothing == stands.nothing
+        known = not left or standing(before).nothing == residual.nothing
         return [] if known else [Notice("GuardState", severity, f"{now['state']}{left}")]
     notice = Notice("GuardState", severity, f"{before['state']} -> {now['state']}{why}{left}", cause.get("axis", ""))
     tripped = before["state"] in CHARGED and now["state"] not in CHARGED and cause.get("code") not in ORDERED

@@ -1,4 +1,4 @@
-"""Tells whether a guard is there: a socket that a killed guard left behind is none, one that is made again is."""
+"""Detects whether a guard is running: the socket of a killed guard does not count, a recreated one does."""
 
 import contextlib
 import math
@@ -9,24 +9,23 @@ from pathlib import Path
 from fdhil.guard.protocol import SOCKET_NAME
 
 ASK_AGAIN_S = 1.0
-RENEWED_S = 3.0  # a guard makes its socket again where the run directory was cleaned
+RENEWED_S = 3.0  # a guard recreates its socket if the run directory was cleaned
 
 
 class GuardPresence:
-    """Whether a guard listens at the socket of a run directory, asked once a second at most; from any thread."""
+    """Detects whether a guard listens at a run directory's socket, at most once a second; from any thread."""
 
     def __init__(self, run_directory: Path) -> None:
         self._path = run_directory / SOCKET_NAME
-        self._asked_s = self._heard_s = -math.inf
+        self._asked_s = self._answered_s = -math.inf
 
     def is_there(self) -> bool:
-        """Return whether a guard listens, or did a moment ago."""
         now_s = time.monotonic()
         if now_s - self._asked_s >= ASK_AGAIN_S:
             self._asked_s = now_s
             if self._listens():
-                self._heard_s = now_s
-        return now_s - self._heard_s < RENEWED_S
+                self._answered_s = now_s
+        return now_s - self._answered_s < RENEWED_S
 
     def _listens(self) -> bool:
         with contextlib.closing(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)) as asking:
@@ -35,6 +34,6 @@ class GuardPresence:
                 asking.connect(str(self._path))
             except (FileNotFoundError, NotADirectoryError, ConnectionRefusedError):
                 return False
-            except OSError:  # it is busy, or talks to others only
+            except OSError:  # it is busy, or accepts other users only
                 return True
         return True

@@ -1,4 +1,4 @@
-"""Makes the settings of the guard's process from the machine's config, its drives' profiles and their records."""
+"""Derives the guard's settings from the machine's configuration, the drive profiles and the commissioning records."""
 
 import contextlib
 import math
@@ -21,12 +21,12 @@ from fdhil.guard.feedforward import FeedforwardLimits
 from fdhil.guard.limits import OffsetLimits
 from fdhil.guard.settings import AxisSettings, Feedforward, Pdo, Settings
 
-SPEED_STEPS = 2.0  # times the motor's power: room for the load's own inertia and for the sensor's noise
+SPEED_STEPS = 2.0  # times the motor's power: margin for the load's own inertia and for sensor noise
 HEARTBEATS_AWAITED = 2.0  # periods of the drive's heartbeat until it counts as lost
 
 
 def with_given_key(machine: MachineConfig) -> MachineConfig:
-    """Take the key of the commissioning records from systemd, where it gives one (LoadCredential)."""
+    """Use the key of the commissioning records from systemd, if it provides one (LoadCredential)."""
     given = given_credential(KEY_NAME)
     if given is None:
         return machine
@@ -34,12 +34,10 @@ def with_given_key(machine: MachineConfig) -> MachineConfig:
 
 
 def corrected_bus(machine: MachineConfig, source: str) -> str:
-    """Return the one bus with axes that may be corrected; ConfigError when there is none, or more than one."""
+    """Return the one bus with corrected axes. Raises ConfigError if there is none, or more than one."""
     buses = {axis.drive.bus for axis in machine.axis.values() if axis.correction is not None}
     if not buses:
-        fault = ConfigFault(
-            "axis.*.correction", "no axis has this section, so that writing is off", "add it to an axis"
-        )
+        fault = ConfigFault("axis.*.correction", "no axis has this section: writing is off", "add it to an axis")
         raise ConfigError(source, [fault])
     if len(buses) > 1:
         fault = ConfigFault("axis.*.drive.bus", f"corrected axes are on {', '.join(sorted(buses))}", "use one bus")
@@ -48,9 +46,9 @@ def corrected_bus(machine: MachineConfig, source: str) -> str:
 
 
 def settings_of(machine: MachineConfig, bus: str, run_directory: Path, token_sha256: str) -> Settings:
-    """Return what the guard needs of the config and the drives' profiles.
+    """Return what the guard needs of the configuration and the drive profiles.
 
-    ConfigError when a profile cannot do it, or when a COB-ID of the guard's is another's on that bus.
+    Raises ConfigError if a profile does not allow it, or if a COB-ID of the guard is used by another device.
     """
     axes = [_axis(machine, name, axis) for name, axis in machine.axis.items() if axis.correction is not None]
     settings = Settings(
@@ -77,12 +75,12 @@ def _user_id(name: str | None) -> int | None:
     try:
         return pwd.getpwnam(name).pw_uid
     except KeyError:
-        fault = ConfigFault("guard.daemon_user", f"there is no user {name!r}", "the user of fdhil.service")
+        fault = ConfigFault("guard.daemon_user", f"the user {name!r} does not exist", "name the user of fdhil.service")
         raise ConfigError("config", [fault]) from None
 
 
 def _known_ids(names: Iterable[str]) -> Iterator[int]:
-    """Yield the users of [access] that this computer has: they may look at the guard and disarm, no more."""
+    """Yield the existing users of [access]: they may read the guard's status and disarm, no more."""
     for name in sorted(set(names)):
         with contextlib.suppress(KeyError):
             yield pwd.getpwnam(name).pw_uid
@@ -133,14 +131,14 @@ def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
 def _writers(
     machine: MachineConfig, name: str, profile: DriveProfile, record: CommissioningRecord | None
 ) -> tuple[int, ...]:
-    """Return the COB-IDs, but the guard's, whose frames may change an offset of the drive.
+    """Return the COB-IDs, except the guard's, whose frames may change an offset of the drive.
 
-    By its record those of all RPDOs that map one, valid or not. Besides what its RPDOs have by default: one of them
-    that did not exist, or was not valid, when the drive was commissioned was set up by another master since.
+    By the record these are those of all RPDOs that map one, valid or not. The default RPDOs are added: one that did not
+    exist, or was invalid, at commissioning was set up by another master since.
     """
-    node, kept = machine.node_id(name), () if record is None else record.rpdos
-    harmless = {identifier_of(cob_id) for cob_id in kept if not cob_id & INVALID_COB_ID}
-    suspect = {identifier_of(cob_id) for cob_id in kept if cob_id & INVALID_COB_ID}
+    node, recorded = machine.node_id(name), () if record is None else record.rpdos
+    harmless = {identifier_of(cob_id) for cob_id in recorded if not cob_id & INVALID_COB_ID}
+    suspect = {identifier_of(cob_id) for cob_id in recorded if cob_id & INVALID_COB_ID}
     suspect |= {base + node for base in COB_RPDO} | {spec.cob_base + node for spec in profile.rpdos}
     same_bus = {n: axis for n, axis in machine.axis.items() if axis.drive.bus == machine.axis[name].drive.bus}
     known = {
@@ -156,7 +154,6 @@ def _writers(
 
 
 def _commissioned(machine: MachineConfig, name: str, record: CommissioningRecord | None) -> dict[str, Any]:
-    """The fingerprint of the drive as it was signed off, and whether something against that was seen since."""
     if record is None or not of_config(record, machine, name):
         return {}
     void = is_void(machine.store.directory, name)
@@ -165,7 +162,7 @@ def _commissioned(machine: MachineConfig, name: str, record: CommissioningRecord
 
 
 def _largest_acceleration_rad_s2(axis: Axis) -> float:
-    """Return what the motor can do at its current limit, or what the NC asks for where that is more."""
+    """Return the motor's acceleration at its current limit, or the NC's demand if that is larger."""
     of_the_motor = axis.regulators.current_limit_a * axis.nominal.K / axis.nominal.Jt
     return max(of_the_motor, axis.max_acceleration_mm_s2 * 2 * math.pi / axis.screw_pitch_mm)
 
@@ -195,10 +192,10 @@ def _feedforward(profile: DriveProfile, machine: MachineConfig, name: str, axis:
 
 
 def heartbeat_timeout_s(machine: MachineConfig, axis: str) -> float:
-    """Return how long the drive's heartbeat may be missing, from the 0x1017 that the axis was commissioned with.
+    """Return how long the drive's heartbeat may be missing, from object 0x1017 at commissioning.
 
-    0, never: without a record that can be read (nothing is armed then), for a drive that sends none, and where time is
-    the count of SYNC, which says nothing about heartbeats of the wall clock.
+    0 means never: without a readable record (nothing is armed then), for a drive without heartbeat, and if time is the
+    count of SYNC, which has no relation to heartbeats by the wall clock.
     """
     record = _record(machine, axis)
     if record is None or machine.guard.clock == "sync":
@@ -207,7 +204,6 @@ def heartbeat_timeout_s(machine: MachineConfig, axis: str) -> float:
 
 
 def _record(machine: MachineConfig, axis: str) -> CommissioningRecord | None:
-    """The axis' commissioning; None without one that can be read."""
     try:
         return load_record(machine.store.directory, axis, machine.store.commissioning_key)
     except StoreError:
@@ -223,6 +219,6 @@ def _rpdo(profile: DriveProfile, key: tuple[int, int], axis: str) -> PdoSpec:
 
 
 def _pdo(spec: PdoSpec, node_id: int) -> Pdo:
-    """A PDO as the guard has it, which knows the objects of a device's second axis by the names of the first's."""
+    """Convert a PDO for the guard, which names the objects of a device's second axis like those of the first."""
     layout = tuple((first_axis_index(entry.index), entry.sub, entry.bits, entry.signed) for entry in spec.entries)
     return Pdo(spec.cob_base + node_id, layout, spec.every_sync)

@@ -1,4 +1,4 @@
-"""Gathers what is known of each axis' model: what the history had, and what the pipelines say since."""
+"""Tracks the model of each axis: from the history at the start, then from the pipelines' outcomes."""
 
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,9 +14,9 @@ SKILL_MOVES = 3  # FAULTS E19: the last three recorded moves
 
 @dataclass(frozen=True, slots=True)
 class AxisKnowledge:
-    """An axis when it is armed, as the daemon knows it: newest published set with its age, last moves' skills.
+    """The model of an axis when it is armed: the newest published set with its age, the skills of the last moves.
 
-    ``loops`` are the newest that were identified, where they explain what the configured ones do not.
+    ``loops`` are the newest identified ones, if they explain what the configured ones do not.
     """
 
     published: ParameterSet | None
@@ -38,21 +38,19 @@ class _Axis:
 
 
 class Knowledge:
-    """The newest of every axis."""
+    """Tracks the newest model of every axis."""
 
     def __init__(self, axes: Iterable[str], clock: Clock = SYSTEM_CLOCK) -> None:
         self._clock = clock
         self._axes = {axis: _Axis() for axis in axes}
 
     def begin(self, newest: Mapping[str, Revision], skills: Sequence[Skill]) -> None:
-        """Start from what the history knows."""
         for name, revision in newest.items():
             axis = self._axes[name]
             axis.published, axis.published_s = revision.set, self._now_s() - revision.stamp.age_s(self._clock)
         self.note(skills)
 
     def note(self, outcomes: Sequence[Outcome | LoopEstimate]) -> None:
-        """Take what the pipelines say."""
         for outcome in outcomes:
             if isinstance(outcome, ParameterSet):
                 axis = self._axes[outcome.axis]
@@ -65,19 +63,16 @@ class Knowledge:
                 self._axes[outcome.axis].load_changed = True
 
     def note_temperature(self, reading: Temperature) -> None:
-        """Take a temperature."""
         self._axes[reading.axis].temperature_c = reading.celsius
 
     @property
     def temperatures(self) -> dict[str, float]:
-        """The newest temperature of each axis that has one."""
         return {name: axis.temperature_c for name, axis in self._axes.items() if axis.temperature_c is not None}
 
     def _now_s(self) -> float:
         return self._clock.since_boot_ns() * 1e-9
 
     def now(self) -> dict[str, AxisKnowledge]:
-        """Return what is known of every axis now."""
         now_s = self._now_s()
         return {
             name: AxisKnowledge(

@@ -1,7 +1,7 @@
-"""Adds to a checked program what earlier passes of it have taught, and learns from the pass that follows.
+"""Adds learned offsets to a checked program (iterative learning control), and learns from the pass that follows.
 
-Off unless ``[correction] learning`` is set. Only whole programs are learned, and only from passes in which the NC
-ordered every row as planned, at its own time: an override, a feed hold or a pass that was ended teaches nothing.
+Off unless ``[correction] learning`` is set. Learns only whole programs, and only from passes in which the NC ordered
+every row as planned and on time; a pass with an override or a feed hold, or one that ended early, is not used.
 """
 
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ TOLERANCE_INCREMENTS = 2.5
 
 @dataclass(frozen=True, slots=True)
 class Pupil:
-    """A program that learns: its planned demand (n,) per axis in mm, what it has learned, and its models."""
+    """A program that learns: its planned demand (n,) per axis in mm, its learned offsets, and its models."""
 
     path: Path
     demand_mm: Mapping[str, Float]
@@ -38,7 +38,7 @@ class Pupil:
     lesson: Lesson
 
     def learn(self, demand_mm: Float, position_mm: Float) -> Lesson | None:
-        """Learn from the rows (n, axes) of a whole pass; None where it was not the plan's. StoreError when not kept."""
+        """Learn from the rows (n, axes) of a whole pass; None if it was not as planned. StoreError if not stored."""
         planned = np.column_stack(list(self.demand_mm.values()))
         axes = [self.config.axis[axis] for axis in self.demand_mm]
         tolerance_mm = np.array([TOLERANCE_INCREMENTS / axis.scaling.increments_per_mm for axis in axes])
@@ -59,30 +59,30 @@ class Pupil:
 
 
 def taught(checked: CheckedProgram, request: ArmRequest, machine: str) -> tuple[CheckedProgram, Pupil | None]:
-    """Return the program with what was learned added, within the limits, and who learns from its pass.
+    """Return the program with the learned offsets added, within the limits, and the learner of its next pass.
 
-    ``machine`` is the digest of the configuration that lessons are kept for. StoreError when rows cannot be read.
+    ``machine`` is the digest of the configuration that the offsets belong to. Raises StoreError if rows cannot be read.
     """
     config = request.config
     if not config.correction.learning or not checked.whole or checked.rows > MOST_ROWS:
         return checked, None
     demand_mm, offset_um = _rows(checked, config)
     path = lesson_path(config.store.directory / "lessons", request.program_digest, machine)
-    known = read_lesson(path)
-    if known is None or any(known.offset_um.get(axis, np.empty(0)).size != checked.rows for axis in demand_mm):
-        known = Lesson(dict.fromkeys(demand_mm, np.zeros(checked.rows)))
-    pupil = Pupil(path, demand_mm, request.models, config, known)
-    if not any(np.any(offset) for offset in known.offset_um.values()):
-        return checked, pupil
-    total = {axis: offset + known.offset_um[axis] for axis, offset in offset_um.items()}
+    learned = read_lesson(path)
+    if learned is None or any(learned.offset_um.get(axis, np.empty(0)).size != checked.rows for axis in demand_mm):
+        learned = Lesson(dict.fromkeys(demand_mm, np.zeros(checked.rows)))
+    learner = Pupil(path, demand_mm, request.models, config, learned)
+    if not any(np.any(offset) for offset in learned.offset_um.values()):
+        return checked, learner
+    total = {axis: offset + learned.offset_um[axis] for axis, offset in offset_um.items()}
     fitting = fit_all(total, config.axis, config.machine.sync_period_s)
-    return _with_offsets(checked, demand_mm, fitting, known, config), pupil
+    return _with_offsets(checked, demand_mm, fitting, learned, config), learner
 
 
 def ahead_of_motors_mm(checked: CheckedProgram, request: ArmRequest) -> Float | None:
-    """Return table less motor (n, axes) along a whole program, as its models have it; None where they have no spring.
+    """Return table less motor position (n, axes) along a whole program by its models; None without compliance.
 
-    StoreError when its rows cannot be read.
+    Raises StoreError if the rows cannot be read.
     """
     sprung = any(model.term("resonance") for model in request.models.values())
     if not sprung or not checked.whole or checked.rows > MOST_ROWS:
@@ -106,13 +106,15 @@ def _with_offsets(
     checked: CheckedProgram,
     demand_mm: Mapping[str, Float],
     offset_um: Mapping[str, Float],
-    known: Lesson,
+    learned: Lesson,
     config: MachineConfig,
 ) -> CheckedProgram:
-    other = in_memory(encoded(demand_mm, offset_um, config), config, checked.errors)
-    text = f"what {len(known.curve_um)} passes taught is added; the last one left {known.curve_um[-1]:.2f} um RMS"
-    other.method, other.half_um = checked.method, checked.half_um
-    other.warnings = (*checked.warnings, Reason("Learned", text, "fdhil status shows each pass"))
+    replaced = in_memory(encoded(demand_mm, offset_um, config), config, checked.errors)
+    text = (
+        f"offsets of {len(learned.curve_um)} passes are added; the last residual was {learned.curve_um[-1]:.2f} um RMS"
+    )
+    replaced.method, replaced.half_um = checked.method, checked.half_um
+    replaced.warnings = (*checked.warnings, Reason("Learned", text, "fdhil status shows each pass"))
     largest_um = max(float(np.abs(offset).max(initial=0.0)) for offset in offset_um.values())
-    other.conclude({**(checked.header or {}), "largest_um": largest_um})
-    return other
+    replaced.conclude({**(checked.header or {}), "largest_um": largest_um})
+    return replaced

@@ -1,6 +1,6 @@
-"""Calls what blocks in a thread of its own.
+"""Runs a blocking call in a thread of its own.
 
-Those of asyncio's pool may all wait for a disk, and a disarm must not wait behind them.
+All threads of asyncio's pool may be waiting for a disk, and a disarm must not wait for them.
 """
 
 import asyncio
@@ -9,12 +9,12 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import ParamSpec, TypeVar
 
-Given = ParamSpec("Given")
-Said = TypeVar("Said")
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 
 
-async def in_own_thread(call: Callable[Given, Said], *given: Given.args, **named: Given.kwargs) -> Said:
-    """Return what a call returns; it goes on where this is cancelled."""
+async def in_own_thread(call: Callable[Arguments, Result], *given: Arguments.args, **named: Arguments.kwargs) -> Result:
+    """Return the result of a call; the call continues if this is cancelled."""
     thread = ThreadPoolExecutor(1, "call")
     try:
         return await asyncio.get_running_loop().run_in_executor(thread, functools.partial(call, *given, **named))

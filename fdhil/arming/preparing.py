@@ -1,6 +1,6 @@
-"""Makes a checked program ready for the guard: its first rows, its promise, and the facts that the daemon vouches for.
+"""Prepares a checked program for the guard: its first rows, its predicted gain, and the facts that the daemon attests.
 
-Pure but for reading the program and the commissioning records; what says no is a value (:class:`Refused`).
+Pure except for reading the program and the commissioning records; a refusal is a value (:class:`Refused`).
 """
 
 import math
@@ -27,18 +27,18 @@ from fdhil.prediction.models import validated_models
 from fdhil.program import program_digest
 from fdhil.records import Parameters, Reason, Skill
 
-MODEL_AGE_S = 8 * 3600.0  # a shift: older parameters are of another state of the machine
+MODEL_AGE_S = 8 * 3600.0  # a shift: older parameters describe another state of the machine
 MODEL_KELVIN = 3.0
-SKILL_SHARE = 0.5  # of the gain that is promised, within which the last moves must be predicted (FAULTS E19)
-AHEAD_S = 60.0  # of a program that must have passed before it is armed ahead of its check
-UNGUARDED_UM = 20.0  # the largest offset that may stay in a drive whose watchdog on us is not proven
+SKILL_SHARE = 0.5  # of the predicted gain, within which the last moves must be predicted (FAULTS E19)
+AHEAD_S = 60.0  # of a program that must have passed before it is armed while its check runs
+UNGUARDED_UM = 20.0  # the largest offset that may remain in a drive whose watchdog on the guard is not proven
 
 
 @dataclass(frozen=True, slots=True)
 class ArmRequest:
-    """A program that may be corrected, and by which models; ``ahead``: its rows are checked ahead of the motion.
+    """A program that may be corrected, and its models; ``ahead``: its rows are checked ahead of the motion.
 
-    ``config`` is the machine's, with the regulators as they were identified.
+    ``config`` is the machine's, with the identified regulators.
     """
 
     program: Path
@@ -51,11 +51,11 @@ class ArmRequest:
 
 @dataclass(frozen=True, slots=True)
 class Armament:
-    """A correction ready for the guard: its first rows, the stream of all that passed and will pass, and the facts.
+    """A correction ready for the guard: its first rows, the stream of rows that passed or will pass, and the facts.
 
-    ``begun_um`` is what the rows promised that were checked when it was armed, ``half_um`` half the 95 % interval of
-    the error that is left, and ``left_um`` the RMS that held-out moves show, None: not known. ``first`` finds the first
-    rows anew where the axes stand otherwise.
+    ``begun_um`` is the gain predicted for the rows that were checked at arming, ``half_um`` half the 95 % interval of
+    the residual error, and ``left_um`` the RMS error in held-out moves (None: unknown). ``first`` recomputes the first
+    rows for the axes' actual standstill.
     """
 
     program: str
@@ -69,27 +69,26 @@ class Armament:
 
     @property
     def rows(self) -> int | None:
-        """How many rows the program has; None until that is known."""
+        """The program's row count; None until it is known."""
         return self.stream.checked.rows if self.stream.checked.whole else None
 
     @property
     def predicted(self) -> Gain:
-        """The predicted gain of the rows that were checked by now, held-out moves included."""
+        """The predicted gain of the rows checked so far, with the error of held-out moves."""
         errors = self.stream.checked.errors
         after_um = with_held_out_um(errors["after"]["rms_um"], self.left_um)
         return Gain(errors["before"]["rms_um"], after_um, self.half_um)
 
     def standing_facts(self, config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> dict[str, bool]:
-        """Return the facts that may be withdrawn while it runs; the gain is the whole's, once that is known."""
+        """Return the facts that may be withdrawn while it runs; the gain is the whole program's once it is known."""
         checked = self.stream.checked
         return standing_facts(self.stream.axes, config, known, checked.gain_um if checked.whole else self.begun_um)
 
     def progress(self) -> dict[str, Any]:
-        """Return what of the summary changes while it is armed."""
         return {"check": self.stream.status()}
 
     def summary(self) -> dict[str, Any]:
-        """Return what the operator is told; errors and rows are those that were checked by now."""
+        """Return the operator's summary; errors and rows are those checked so far."""
         checked, predicted = self.stream.checked, self.predicted
         return {
             "program": self.program,
@@ -108,7 +107,7 @@ class Armament:
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """Why nothing is armed, the weightiest reason first."""
+    """Why nothing is armed, the most important reason first."""
 
     reasons: tuple[Reason, ...]
 
@@ -116,9 +115,9 @@ class Refused:
 def prepare(
     program: Path, method: str | None, config: MachineConfig, known: Mapping[str, AxisKnowledge]
 ) -> ArmRequest | Refused:
-    """Find the newest validated parameters for a program, and whether it is checked ahead of the motion.
+    """Collect the newest validated parameters for a program, and determine whether it is checked ahead of the motion.
 
-    ProgramError, RecordingError or ConfigError when the program cannot be used.
+    Raises ProgramError, RecordingError or ConfigError if the program cannot be used.
     """
     found = models_with_loops(tuple(config.axis), config, known)
     if isinstance(found, Refused):
@@ -132,16 +131,16 @@ def prepare(
 
 
 def largest_um(known: Mapping[str, AxisKnowledge], axes: Iterable[str]) -> float | None:
-    """Return the largest error (um) of some axes together in the last moves; None where an axis has none."""
+    """Return the largest error (um) of several axes together in the last moves; None if an axis has none."""
     return joint_held_out_um(largest_skill_um({axis: known[axis].skills for axis in axes}), tuple(axes))
 
 
 def models_with_loops(
     axes: Sequence[str], config: MachineConfig, known: Mapping[str, AxisKnowledge]
 ) -> tuple[dict[str, Parameters], MachineConfig] | Refused:
-    """Return the newest validated models of some axes, and the configuration with the loops that belong to them.
+    """Return the newest validated models of several axes, and the configuration with the loops that belong to them.
 
-    ConfigError where their loops are not known for this configuration.
+    Raises ConfigError if their loops are unknown for this configuration.
     """
     sets = {}
     for name in axes:
@@ -156,11 +155,10 @@ def models_with_loops(
 
 def _not_validated(axis: str) -> Refused:
     text = f"axis {axis} has no validated parameters yet"
-    return Refused((Reason("ModelNotValidated", text, "let the machine make a few rapids of this axis"),))
+    return Refused((Reason("ModelNotValidated", text, "run a few rapids of this axis"),))
 
 
 def _longer_than_ring(program: Path, config: MachineConfig, sha256: str) -> bool:
-    """Whether a program is longer than what the guard is given at first; no more of it is read than that takes."""
     rows = 0
     for block in reference_blocks(program, config, sha256):
         rows += block.time_s.size
@@ -170,10 +168,10 @@ def _longer_than_ring(program: Path, config: MachineConfig, sha256: str) -> bool
 
 
 def may_begin(checked: CheckedProgram, config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> bool:
-    """Whether a program may be armed while its check goes on: far ahead, and nothing left to learn that forbids it.
+    """Return whether a program may be armed while its check runs: far enough ahead, and no fact can still fail.
 
-    What the rest could still change, the largest offset and the gain, must be good enough already as it is.
-    StoreError for a damaged commissioning record.
+    The largest offset and the gain, which the rest of the check could change, must already suffice. Raises StoreError
+    for a damaged commissioning record.
     """
     if checked.rows * config.machine.sync_period_s < AHEAD_S:
         return False
@@ -189,9 +187,9 @@ def prepare_armament(
     known: Mapping[str, AxisKnowledge],
     rest: Mapping[str, AtRest] | None = None,
 ) -> Armament:
-    """Make a checked program ready with the rows that it is armed with; the first of them begin where axes ``rest``.
+    """Prepare a checked program with the rows that it is armed with; the first begin where the axes ``rest``.
 
-    StoreError when its rows cannot be read.
+    Raises StoreError if the rows cannot be read.
     """
     stream, gain_um = RowStream(checked, request.program_digest, config.machine.sync_period_s), checked.gain_um
     facts = standing_facts(stream.axes, config, known, gain_um)
@@ -215,20 +213,17 @@ class Feeding:
     facts: dict[str, bool]
 
     def standing_facts(self, config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> dict[str, bool]:
-        """Return the facts that may be withdrawn while it runs."""
         return feeding_facts(tuple(self.laws), config, known)
 
     def progress(self) -> dict[str, Any]:
-        """Return what of the summary changes while it is on: nothing."""
         return {}
 
     def summary(self) -> dict[str, Any]:
-        """Return what the operator is told."""
         return {"program": None, "method": "flatness", "axes": list(self.laws), "facts": dict(self.facts)}
 
 
 def prepare_feeding(config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> Feeding | Refused:
-    """Find the on-line law of every axis from its newest validated parameters. StoreError for a damaged record."""
+    """Derive the on-line law of every axis from its newest validated parameters. StoreError for a damaged record."""
     axes = [name for name, axis in config.axis.items() if axis.correction is not None]
     for name in axes:
         if config.axis[name].feedforward is None:
@@ -257,7 +252,6 @@ def feeding_facts(axes: Sequence[str], config: MachineConfig, known: Mapping[str
 
 
 def _feeds(record: CommissioningRecord | None, config: MachineConfig, axis: str) -> bool:
-    """Whether the record shows that the drive's RPDO of speed and torque offset was made valid."""
     profile = load_profile(config.axis[axis].drive)
     found = profile.find_rpdo(profile.speed_offset)
     if record is None or found is None:
@@ -269,7 +263,7 @@ def _feeds(record: CommissioningRecord | None, config: MachineConfig, axis: str)
 def standing_facts(
     axes: Sequence[str], config: MachineConfig, known: Mapping[str, AxisKnowledge], gain_um: float
 ) -> dict[str, bool]:
-    """Return the facts about the models, which also may be withdrawn while a correction runs."""
+    """Return the facts about the models that may be withdrawn while a correction runs."""
     return {
         "model_validated": all(known[axis].published is not None for axis in axes),
         "model_fresh": all(_fresh(known[axis], config) for axis in axes),
@@ -279,7 +273,7 @@ def standing_facts(
 
 
 def _fresh(axis: AxisKnowledge, config: MachineConfig) -> bool:
-    """A model is of this machine as it is now: same configuration, same load, not old, not of another temperature."""
+    """The model belongs to the machine as it is: same configuration and load, recent, at a similar temperature."""
     published = axis.published
     if published is None or published.config_digest != config.digest or axis.load_changed:
         return False
@@ -291,7 +285,7 @@ def _fresh(axis: AxisKnowledge, config: MachineConfig) -> bool:
 
 
 def _skilled(skills: Sequence[Skill], gain_um: float) -> bool:
-    """The last recorded moves were predicted within half of what is promised; without any, nothing is known."""
+    """The last recorded moves were predicted within half of the predicted gain; without moves nothing is known."""
     last = list(skills)[-SKILL_MOVES:]
     return bool(last) and all(skill.rms_um <= SKILL_SHARE * gain_um for skill in last)
 
@@ -300,7 +294,7 @@ def _commissioned(axes: Sequence[str], largest_um: float, config: MachineConfig)
     records = _records(axes, config)
     return {
         "commissioned": all(holds(record, config, axis) for axis, record in records.items()),
-        # the plans assume an offset that the feed-forward sees; another drive would be made worse
+        # the plans assume that the drive's feed-forward includes the offset; others would get worse
         "offset_in_feedforward_known": all(r is not None and r.offset_in_feedforward is True for r in records.values()),
         "watchdog_proven": largest_um <= UNGUARDED_UM or _all_proven(records),
     }
@@ -310,7 +304,7 @@ Records = Mapping[str, CommissioningRecord | None]
 
 
 def _records(axes: Sequence[str], config: MachineConfig) -> Records:
-    """Read the axes' records; a daemon that may not read the key leaves the seal to the guard."""
+    """Read the axes' records; if the daemon may not read the key, the guard verifies the seal."""
     store = config.store
     return {axis: load_record(store.directory, axis, store.commissioning_key, may_lack_key=True) for axis in axes}
 

@@ -1,9 +1,9 @@
 """Checks a whole program: planner, correction and gate, block by block, ahead of the motion.
 
-A process of its own (``python -m fdhil.arming.program_check``, one JSON request on stdin): it may take minutes for an
-hour's program, at low priority, without holding up what the daemon listens to, and can be ended at any moment. Each
-block that passed is on disk, as the guard will get it, before it is told with its digest; what remains in the end is
-the file of all rows, and a header that vouches for it.
+Runs as a child process (``python -m fdhil.arming.program_check``, one JSON request on stdin): an hour's program may
+take minutes, at low priority, without delaying the daemon, and the check can be ended at any moment. Each block that
+passed is on disk in the guard's format before its digest is reported. The result is a file of all rows and a header
+with their digests.
 """
 
 import contextlib
@@ -37,19 +37,19 @@ ROWS = ".rows"
 HEADER = ".json"
 KEPT = 4  # checked programs; an hour of two axes takes 58 MB
 PIECE_ROWS = 2000
-MOST_REFUSED = 20  # places that are listed
-TELL_S = 0.5
+MOST_REFUSED = 20  # listed refusals
+REPORT_S = 0.5
 NICENESS = 10
 INT32_END = 2**31
 
-Tell = Callable[[Mapping[str, Any]], None]
+Report = Callable[[Mapping[str, Any]], None]
 
 
 Opened = Callable[[], list[tuple[Path, str]]]  # which files were opened so far, with their digests
 
 
 def reference_blocks(program: Path, config: MachineConfig, sha256: str | None = None) -> Iterator[Trajectory]:
-    """Return what the NC will order, in blocks; ProgramError, RecordingError or ConfigError where it cannot be used.
+    """Return the NC's demand in blocks. Raises ProgramError, RecordingError or ConfigError if it cannot be used.
 
     ``sha256`` is the program's digest: blocks of another content are a ProgramError.
     """
@@ -64,25 +64,23 @@ def _opened(program: Path, config: MachineConfig, sha256: str | None) -> tuple[I
 
 
 class _Files:
-    """The digests of a program's files as they were read: its subroutines may lie in the same folder."""
+    """The digests of a program's files as they were read, subroutines in the same folder included."""
 
     def __init__(self, program: Path, digest: str) -> None:
         self._digests = {program: digest}
 
     def take(self, files: Sequence[tuple[Path, str]]) -> None:
-        """Note the files that are new; ProgramError when one is opened again with another content."""
         for file, digest in files:
             require_digest(file, digest, self._digests.setdefault(file, digest))
 
     def unchanged(self) -> dict[str, str]:
-        """Return the digest of each subroutine's file by its name; ProgramError when one, or the program, changed."""
         for file, digest in self._digests.items():
             require_digest(file, program_digest(file), digest)
         return {file.name: digest for file, digest in list(self._digests.items())[1:]}
 
 
 class _Path:
-    """The path as it comes, kept until its blocks are planned; after them only the lines that a refusal may name."""
+    """Buffers the path until its blocks are planned; after them only the lines that a refusal may name."""
 
     def __init__(self, source: Iterator[Trajectory]) -> None:
         self._source = source
@@ -90,14 +88,12 @@ class _Path:
         self._end = 0
 
     def pieces(self) -> Iterator[Mapping[str, Float]]:
-        """Yield the positions of each part, mm per axis."""
         for part in self._source:
             self._parts.append((self._end, part))
             self._end += part.time_s.size
             yield part.position_mm
 
     def positions(self, first: int, stop: int) -> dict[str, Float]:
-        """Return the rows from ``first`` to ``stop``, and forget what lies before them."""
         while self._parts and self._parts[0][0] + self._parts[0][1].time_s.size <= first:
             self._parts.popleft()
         found: dict[str, list[Float]] = {axis: [] for axis in self._parts[0][1].axes}
@@ -107,7 +103,6 @@ class _Path:
         return {axis: np.concatenate(parts) for axis, parts in found.items()}
 
     def line(self, row: int) -> int:
-        """Return the source line of a row that is still kept, 0 where there is none."""
         for start, part in self._parts:
             if start <= row < start + part.time_s.size:
                 return int(part.line[row - start])
@@ -116,8 +111,6 @@ class _Path:
 
 @dataclass(slots=True)
 class _Findings:
-    """Sums up the blocks so far."""
-
     rows: int = 0
     before_square: float = 0.0
     after_square: float = 0.0
@@ -128,7 +121,6 @@ class _Findings:
     named: set[tuple[str, ...]] = field(default_factory=set)
 
     def take(self, block: StreamBlock) -> None:
-        """Add a block's errors and offsets."""
         self.rows += block.before_um.size
         self.before_square += float(block.before_um @ block.before_um)
         self.after_square += float(block.after_um @ block.after_um)
@@ -137,9 +129,9 @@ class _Findings:
         self.largest_um = max(self.largest_um, *(float(np.abs(o).max()) for o in block.offset_um.values()))
 
     def refuse(self, block: StreamBlock, path: _Path, dt_s: float) -> list[Reason]:
-        """Add a block's refusals with their line and time, return the new ones; the same in a line is told once."""
+        """Add a block's refusals with line and time, once per line; return the new ones."""
         known = len(self.refused)
-        for row, reason in sorted(zip(block.at, block.refused, strict=True), key=lambda told: told[0]):
+        for row, reason in sorted(zip(block.at, block.refused, strict=True), key=lambda pair: pair[0]):
             line = path.line(row)
             name = (reason.code, *reason.text.split()[:2], str(line or row))
             if name not in self.named:
@@ -149,7 +141,6 @@ class _Findings:
         return self.refused[known:]
 
     def errors(self) -> dict[str, dict[str, float]]:
-        """Return the contour error so far, without and with the correction."""
         then, now = (math.sqrt(square / max(1, self.rows)) for square in (self.before_square, self.after_square))
         return {
             "before": {"rms_um": then, "max_um": self.before_max},
@@ -157,22 +148,21 @@ class _Findings:
         }
 
     def header(self) -> dict[str, Any]:
-        """Return the figures of the whole; what it gains is asked last."""
         errors = self.errors()
         refused = self.refused or list(gate.gains(errors["before"]["rms_um"], errors["after"]["rms_um"]))
-        told = [asdict(reason) for reason in refused[:MOST_REFUSED]]
-        return {"rows": self.rows, **errors, "largest_um": self.largest_um, "refused": told}
+        reasons = [asdict(reason) for reason in refused[:MOST_REFUSED]]
+        return {"rows": self.rows, **errors, "largest_um": self.largest_um, "refused": reasons}
 
 
 def check(
-    program: Path, sha256: str, models: Mapping[str, Parameters], config: MachineConfig, body: BinaryIO, tell: Tell
+    program: Path, sha256: str, models: Mapping[str, Parameters], config: MachineConfig, body: BinaryIO, report: Report
 ) -> dict[str, Any]:
     """Run the whole program through correction and gate; write its rows to ``body``, return the header.
 
-    ``sha256`` is the program's digest, under which its rows will be known. A row is the demand of each axis, then the
-    offset of each, int32 in the guard's increments. ``tell`` hears of each block that passed ({"block": ...}, once its
-    rows are written), of each place that is refused ({"refused": ...}), and now and then how far it is
-    ({"progress": ...}). ProgramError, RecordingError or ConfigError when the program cannot be used.
+    ``sha256`` is the digest under which the rows are stored. A row is the demand of each axis, then the offset of each,
+    int32 in the guard's increments. ``report`` receives each block that passed ({"block": ...}, once its rows are
+    written), each refusal ({"refused": ...}), and progress reports ({"progress": ...}). Raises ProgramError,
+    RecordingError or ConfigError if the program cannot be used.
     """
     source, opened = _opened(program, config, sha256)
     path, findings, files = _Path(source), _Findings(), _Files(program, sha256)
@@ -182,7 +172,7 @@ def check(
         files.take(opened())
         findings.take(block)
         for reason in findings.refuse(block, path, config.machine.sync_period_s):
-            tell({"refused": asdict(reason)})
+            report({"refused": asdict(reason)})
         if len(findings.refused) >= MOST_REFUSED:
             break
         if not findings.refused:
@@ -190,34 +180,32 @@ def check(
             body.write(rows)
             body.flush()
             blocks.append([findings.rows, hashlib.sha256(rows).hexdigest()])
-            tell({"block": blocks[-1], "last": block.final, "errors": findings.errors()})
-        pace.tell(tell, findings, path)
+            report({"block": blocks[-1], "last": block.final, "errors": findings.errors()})
+        pace.tell(report, findings, path)
     of = {"schema": SCHEMA, "axes": list(config.axis), "code": code, "blocks": blocks, "files": files.unchanged()}
     return of | findings.header()
 
 
 class _Pace:
-    """Tells now and then how far the check is and how fast."""
-
     def __init__(self, dt_s: float) -> None:
-        self._dt_s, self._begun_s, self._told_s = dt_s, time.monotonic(), -math.inf
+        self._dt_s, self._begun_s, self._reported_s = dt_s, time.monotonic(), -math.inf
 
-    def tell(self, tell: Tell, findings: _Findings, path: _Path) -> None:
+    def tell(self, report: Report, findings: _Findings, path: _Path) -> None:
         now_s = time.monotonic()
-        if now_s - self._told_s < TELL_S:
+        if now_s - self._reported_s < REPORT_S:
             return
-        self._told_s, checked_s = now_s, findings.rows * self._dt_s
+        self._reported_s, checked_s = now_s, findings.rows * self._dt_s
         progress = {
             "checked_s": round(checked_s, 3),
             "line": path.line(findings.rows - 1),
             "times_real_time": round(checked_s / max(1e-3, now_s - self._begun_s), 1),
             "refused": len(findings.refused),
         }
-        tell({"progress": progress})
+        report({"progress": progress})
 
 
 def encoded(demand_mm: Mapping[str, Float], offset_um: Mapping[str, Float], config: MachineConfig) -> bytes:
-    """Return rows of demand and offset in increments, in the drives' own sign. ProgramError where one is no int32."""
+    """Return rows of demand and offset in increments, in the drives' own sign. Raises ProgramError beyond int32."""
     columns = []
     for values, per_mm in ((demand_mm, 1.0), (offset_um, 1e-3)):
         for axis, settings in config.axis.items():
@@ -225,31 +213,29 @@ def encoded(demand_mm: Mapping[str, Float], offset_um: Mapping[str, Float], conf
             columns.append(np.rint(values[axis] * scale))
     rows = np.column_stack(columns)
     if not np.all(np.abs(rows) < INT32_END):
-        raise ProgramError(0, "", "a row is not finite, or too large for the guard's table; give another program")
+        raise ProgramError(0, "", "a row is not finite, or too large for the guard's table; use another program")
     return rows.astype("<i4").tobytes()
 
 
 def header_digest(header: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a header's meaning."""
     return hashlib.sha256(json.dumps(header, sort_keys=True).encode()).hexdigest()
 
 
 def part_file(folder: Path, key: str) -> Path:
-    """Return where rows are while they are written."""
     return folder / f".{key}.part"
 
 
 def keep(folder: Path, key: str, request: Callable[[BinaryIO], dict[str, Any]]) -> dict[str, Any]:
-    """Have the rows written, then make them and their header durable under ``key``; the oldest programs go.
+    """Have the rows written, then store them and their header durably under ``key``; the oldest programs are removed.
 
-    StoreError when that fails. A refused program leaves nothing.
+    Raises StoreError if that fails. A refused program leaves nothing.
     """
     part = part_file(folder, key)
     try:
         make_folder(folder)
-        for left in folder.glob(".*.part"):  # by a check that was ended
-            if left != part:
-                left.unlink()
+        for leftover in folder.glob(".*.part"):  # left by a check that was ended
+            if leftover != part:
+                leftover.unlink()
         with part.open("wb") as body:
             header = request(body)
             body.flush()
@@ -273,27 +259,27 @@ def keep(folder: Path, key: str, request: Callable[[BinaryIO], dict[str, Any]]) 
 
 
 def main() -> None:
-    """Answer the one request; each line that is written is a JSON object, the last one is the answer."""
+    """Answer one request; each output line is a JSON object, the last one is the answer."""
     limit_process(NICENESS, {})
     answer_request(receive_request(), report)
 
 
-def answer_request(request: Mapping[str, Any], say: Tell) -> None:
-    """Check what is asked for, and report progress, blocks and the answer to ``say``."""
+def answer_request(request: Mapping[str, Any], report: Report) -> None:
+    """Check the requested program, and pass progress, blocks and the answer to ``say``."""
     config = MachineConfig.model_validate(request["config"])
     models = {axis: Parameters.of(values) for axis, values in request["models"].items()}
 
     def run(body: BinaryIO) -> dict[str, Any]:
-        return check(Path(request["program"]), request["program_digest"], models, config, body, say)
+        return check(Path(request["program"]), request["program_digest"], models, config, body, report)
 
     try:
         header = keep(Path(request["folder"]), request["key"], run)
-        say({"header": {name: value for name, value in header.items() if name != "blocks"}})  # they were told
+        report({"header": {name: value for name, value in header.items() if name != "blocks"}})  # which were reported
     except StoreError as error:
-        say({"error": {"code": error.code, "text": str(error), "advice": "free the disk, then arm again"}})
+        report({"error": {"code": error.code, "text": str(error), "advice": "free disk space, then arm again"}})
     except FdhilError as error:
-        advice = "mend the program, then arm again"
-        say({"error": {"code": type(error).__name__, "text": str(error), "advice": advice}})
+        advice = "correct the program, then arm again"
+        report({"error": {"code": type(error).__name__, "text": str(error), "advice": advice}})
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Knows what may still be applied in the drives by what the guard said last, and says it to the operator."""
+"""Determines what offset may still be applied in the drives, by the guard's last status."""
 
 import contextlib
 import math
@@ -22,7 +22,7 @@ START_AND_ADOPT = "hold the feed, start fdhil-guard, then run fdhil adopt"
 class Standing:
     """``offset_um`` of each axis in its own direction (None: unknown), ``fed``: axes with speed or torque offsets.
 
-    ``heard`` is False when there never was a guard, so that nothing was sent.
+    ``heard`` is False if there never was a guard, so that nothing was sent.
     """
 
     offset_um: Mapping[str, float | None]
@@ -31,12 +31,12 @@ class Standing:
 
     @property
     def nothing(self) -> bool:
-        """Whether it is known that no offset is applied; what is unknown is not nothing."""
+        """Whether it is certain that no offset is applied; an unknown offset is not certain."""
         return not self.heard or (bool(self.offset_um) and not self.fed and not any(um != 0.0 for um in self._values()))
 
     @property
     def known(self) -> bool:
-        """Whether it is known that something is applied."""
+        """Whether it is certain that an offset is applied."""
         return bool(self.fed) or any(self._values())
 
     def _values(self) -> list[float | None]:
@@ -44,7 +44,7 @@ class Standing:
 
     def __str__(self) -> str:
         if not self.heard:
-            return "no guard was heard, nothing was sent"
+            return "there was no guard, nothing was sent"
         if self.nothing:
             return "offset 0"
         parts = [f"{um:+.3g} um on axis {axis}" for axis, um in self.offset_um.items() if um]
@@ -57,15 +57,15 @@ class Standing:
 
 
 def standing(status: Mapping[str, Any]) -> Standing:
-    """Return what may stand by a status document of the guard; what it does not say is unknown.
+    """Return what may be applied by a status document of the guard; what it does not report is unknown.
 
-    A zero of a guard that is not at rest is unknown too: the next SYNC may change it.
+    A zero of a guard that is not idle is unknown too: the next SYNC may change it.
     """
-    told = status.get("may_stand_um")
-    if status["state"] == "absent" and told is None:
+    offsets = status.get("may_stand_um")
+    if status["state"] == "absent" and offsets is None:
         return Standing({}, heard=False)
     moving = status["state"] not in (*AT_REST, "absent")
-    known = {str(axis): _number(value) for axis, value in told.items()} if isinstance(told, Mapping) else {}
+    known = {str(axis): _number(value) for axis, value in offsets.items()} if isinstance(offsets, Mapping) else {}
     offset_um = {axis: None if moving and um == 0.0 else um for axis, um in known.items()}
     return Standing(offset_um, _fed(status.get("feedforward")))
 
@@ -78,29 +78,33 @@ def _number(value: Any) -> float | None:
     return None
 
 
-def _fed(told: Any) -> tuple[str, ...]:
-    """Return the axes whose speed or torque offset is on, or never went to zero for certain."""
-    if not isinstance(told, Mapping):
+def _fed(feedforward: Any) -> tuple[str, ...]:
+    """Return the axes whose speed or torque offset is on, or was not confirmed as zero."""
+    if not isinstance(feedforward, Mapping):
         return ()
-    applied = told.get("applied") or {}
-    on = told.get("state", "OFF") != "OFF" or told.get("confirmed") is False
+    applied = feedforward.get("applied") or {}
+    on = feedforward.get("state", "OFF") != "OFF" or feedforward.get("confirmed") is False
     return tuple(axis for axis, pair in applied.items() if on or any(pair))
 
 
 def lost(before: Mapping[str, Any], arming: bool) -> Mapping[str, Any]:
-    """Return what is known of a guard that is gone: what it told last, or nothing of what may have moved since.
+    """Return the status of a guard that is gone: its last one, with what may have moved since as unknown.
 
     ``arming``: it went while it was asked to arm, so that it may have armed.
     """
     if before["state"] in GONE and not arming:
         return before
     last = {**before, "state": "lost" if arming or before["state"] not in AT_REST else before["state"]}
-    stands = standing(last)
-    kept = {"may_stand_um": stands.offset_um, "feedforward": before.get("feedforward"), "last_state": before["state"]}
-    if stands.nothing:
-        text = "the guard is gone; it had nothing applied when it was heard last"
-        return {"state": "absent", "text": text, **kept}
-    return {"state": "lost", "text": f"the guard is gone; {stands}; {START_AND_ADOPT}", **kept}
+    residual = standing(last)
+    known = {
+        "may_stand_um": residual.offset_um,
+        "feedforward": before.get("feedforward"),
+        "last_state": before["state"],
+    }
+    if residual.nothing:
+        text = "the guard is gone; by its last status nothing was applied"
+        return {"state": "absent", "text": text, **known}
+    return {"state": "lost", "text": f"the guard is gone; {residual}; {START_AND_ADOPT}", **known}
 
 
 def landed(
@@ -109,9 +113,9 @@ def landed(
     landing: Set[str] | None = None,
     clock: Clock = SYSTEM_CLOCK,
 ) -> Mapping[str, Any]:
-    """Wait until the guard is at rest, or gone, as long as SYNC moves it on, and return its status (blocking).
+    """Wait until the guard is idle or gone, as long as SYNC advances, and return its status (blocking).
 
-    ``look`` gives the status; in states that are no ``landing`` its SYNC does not count. What ``look`` raises goes on.
+    ``look`` reads the status; in states outside ``landing`` its SYNC does not count. Errors of ``look`` pass through.
     """
     status, tick, moved_s = look(), None, clock.now_s()
     while status["state"] not in REST and clock.now_s() - moved_s < patience_s:
@@ -123,12 +127,12 @@ def landed(
 
 
 def verdict(status: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the answer to who asked for zero: ok only when the guard is off and knows that nothing is applied."""
-    stands, state = standing(status), status["state"]
-    told = {"state": state, "may_stand_um": dict(stands.offset_um)}
-    if state == "OFF" and stands.nothing:
-        return {"ok": True, "text": f"guard: OFF, {stands}", **told}
+    """Return the answer to a request for zero: ok only if the guard is off and certain that nothing is applied."""
+    residual, state = standing(status), status["state"]
+    report = {"state": state, "may_stand_um": dict(residual.offset_um)}
+    if state == "OFF" and residual.nothing:
+        return {"ok": True, "text": f"guard: OFF, {residual}", **report}
     cause = (status.get("cause") or {}).get("text")
-    text = f"the guard is {state}" + (f" ({cause})" if cause else "") + f": {stands}"
-    advice = ADOPT if state in AT_REST else f"look at fdhil status; where it does not end, {ADOPT}"
-    return {"ok": False, "code": "OffsetStands", "text": text, "advice": advice, **told}
+    text = f"the guard is {state}" + (f" ({cause})" if cause else "") + f": {residual}"
+    advice = ADOPT if state in AT_REST else f"check fdhil status; if it does not end, {ADOPT}"
+    return {"ok": False, "code": "OffsetStands", "text": text, "advice": advice, **report}

@@ -1,4 +1,4 @@
-"""Keeps in the store that an offset may stand in the drives: the next daemon knows it, also without a guard."""
+"""Records in the store that an offset may be applied in the drives, so that the next daemon knows without a guard."""
 
 import json
 import os
@@ -16,7 +16,7 @@ MOST_BYTES = 64 * 1024
 
 
 class StandingMark:
-    """``left``: what the daemon before this one left, as the status of a guard that is lost; None: nothing."""
+    """``left``: what the previous daemon left, as the status of a lost guard; None: nothing."""
 
     def __init__(self, store_directory: Path) -> None:
         self._path = store_directory / FILE_NAME
@@ -26,27 +26,26 @@ class StandingMark:
     def _read(self) -> Mapping[str, Any] | None:
         try:
             with open(self._path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
-                told = json.loads(file.read(MOST_BYTES) or b"")  # None: a pipe in its place that nobody writes to
+                offsets = json.loads(file.read(MOST_BYTES) or b"")  # None: a pipe in its place without a writer
         except FileNotFoundError:
             return None
         except (OSError, ValueError, RecursionError):
-            told = None  # that there is one is enough: what stands is unknown
-        left = {"state": "lost", "may_stand_um": told if isinstance(told, dict) else {}}
-        return {**left, "text": f"no guard was heard since; {standing(left)}; {START_AND_ADOPT}"}
+            offsets = None  # the file exists, so the offset is unknown
+        left = {"state": "lost", "may_stand_um": offsets if isinstance(offsets, dict) else {}}
+        return {**left, "text": f"no guard has run since; {standing(left)}; {START_AND_ADOPT}"}
 
-    def keep(self, stands: Standing) -> None:
-        """Keep what may stand: before it is sent, or as soon as it is heard.
+    def keep(self, residual: Standing) -> None:
+        """Record what may be applied: before it is sent, or as soon as it is reported.
 
-        A store that cannot be written tells so itself, and nothing can be armed then.
+        A store that cannot be written reports that itself, and nothing can be armed then.
         """
         if not self._kept:
-            offset_um = {**stands.offset_um, **dict.fromkeys(stands.fed)}
+            offset_um = {**residual.offset_um, **dict.fromkeys(residual.fed)}
             with suppress(StoreError):
                 write_file(self._path, json.dumps(offset_um).encode())
                 self._kept = True
 
     def remove(self) -> None:
-        """Forget it: a guard knows that nothing stands."""
         if self._kept:
             with suppress(OSError):
                 self._path.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""Hears at what current each axis stands still: that is what its regulators hold when a program starts."""
+"""Tracks the holding current of each axis at standstill: the state in which its regulators start a program."""
 
 from collections import deque
 from collections.abc import Mapping
@@ -9,13 +9,13 @@ import numpy as np
 from fdhil.config import MachineConfig
 from fdhil.records import AxisSamples, Float
 
-WATCHED_S = 0.06  # for which it must have stood
-RECENT_S = 0.02  # of which the current is taken: on a remaining error it goes on
+WATCHED_S = 0.06  # of standstill that is required
+RECENT_S = 0.02  # over which the current is averaged: with a residual error it drifts
 STILL_INCREMENTS = 1.5
 
 
 class AtRest(NamedTuple):
-    """An axis that stands still: what it is told, where it is, and the mean of its current."""
+    """An axis at standstill: its demand, its position, and the mean of its current."""
 
     demand_mm: float
     position_mm: float
@@ -23,25 +23,24 @@ class AtRest(NamedTuple):
 
 
 class Standstill:
-    """The last samples of each axis."""
+    """Keeps the last samples of each axis."""
 
     def __init__(self, config: MachineConfig) -> None:
         self._axes, self._period_s = config.axis, config.machine.sync_period_s
         self._blocks: Mapping[str, deque[AxisSamples]] = {axis: deque() for axis in config.axis}
 
     def take(self, samples: AxisSamples) -> None:
-        """Take a block of one axis."""
         blocks = self._blocks[samples.axis]
         if samples.tick.size == 0:
             return
-        if blocks and blocks[-1].tick[-1] >= samples.tick[0]:  # the SYNC count began anew
+        if blocks and blocks[-1].tick[-1] >= samples.tick[0]:  # the SYNC count restarted
             blocks.clear()
         blocks.append(samples)
         while samples.tick[-1] - blocks[0].tick[-1] > WATCHED_S / self._period_s:
             blocks.popleft()
 
     def now(self) -> dict[str, AtRest]:
-        """Return the axes that stand still, without an offset."""
+        """Return the axes at standstill without an offset."""
         found = {axis: self._at_rest(axis, tuple(blocks)) for axis, blocks in self._blocks.items() if blocks}
         return {axis: rest for axis, rest in found.items() if rest is not None}
 

@@ -1,4 +1,4 @@
-"""Feeds checked rows to the guard as their program runs, and tells what the check found of the rest."""
+"""Feeds checked rows to the guard as their program runs, and reports the check's refusals."""
 
 import contextlib
 from pathlib import Path
@@ -11,7 +11,7 @@ from fdhil.errors import DeviceError, StoreError
 from fdhil.guard.protocol import RESERVE_S
 from fdhil.records import Notice
 
-SCARCE_S = 5.0  # half the ring: a check that lets it fall so far is told before the guard ends the correction
+SCARCE_S = 5.0  # half the ring: a late check is reported before the guard ends the correction
 
 
 class StreamFeeder:
@@ -20,11 +20,11 @@ class StreamFeeder:
     def __init__(self, armed: Armament, guard: GuardLink, standstill: Standstill) -> None:
         self._armed, self._guard, self._standstill = armed, guard, standstill
         self._name = Path(armed.program).name
-        self._told = 0
+        self._reported = 0
         self._scarce = self._broken = False
 
     def go_on(self) -> list[Notice]:
-        """Hand on what the guard lacks, as far as it passed; return what is to be told."""
+        """Hand the guard the rows that it lacks, as far as they passed; return notices."""
         notices, stream = self._guard.refresh(), self._armed.stream
         if self._guard.state in REST:
             return notices
@@ -38,7 +38,7 @@ class StreamFeeder:
         return notices + (self._extend() if stream.ready else self._missing())
 
     def _begin_from_rest(self) -> None:
-        """Put the rows in force that begin where the axes stand now; what has begun meanwhile goes on as it is."""
+        """Replace the first rows by those that begin where the axes stand; a program that has begun continues."""
         first = self._armed.first
         if first is None or self._guard.state != "ARMED":
             return
@@ -50,19 +50,18 @@ class StreamFeeder:
                 first.take(rows)
 
     def _found(self) -> list[Notice]:
-        """Tell what the check refuses; a program that has not begun is disarmed, one that runs goes on to there."""
-        refused, told = self._armed.stream.checked.refused, self._told
-        self._told = len(refused)
-        notices = [Notice(reason.code, "minor", f"{reason.text}; {reason.advice}") for reason in refused[told:]]
-        if told or not refused:
+        refused, reported = self._armed.stream.checked.refused, self._reported
+        self._reported = len(refused)
+        notices = [Notice(reason.code, "minor", f"{reason.text}; {reason.advice}") for reason in refused[reported:]]
+        if reported or not refused:
             return notices
         if self._guard.state == "ARMED":
             self._broken = True
-            with contextlib.suppress(DeviceError):  # a guard that is gone holds nothing
+            with contextlib.suppress(DeviceError):  # a guard that is gone ramps down on its own
                 self._guard.disarm()
-            then = "it had not begun and is disarmed"
+            then = "the program had not begun and was disarmed"
         else:
-            then = f"it is corrected for another {self.left_s():.1f} s, then ramped to zero before that place"
+            then = f"it is corrected for another {self.left_s():.1f} s, then ramped to zero before that line"
         text = f"{notices[0].text}; {self._name} was armed ahead of its check: {then}"
         return [Notice(notices[0].code, "MAJOR", text), *notices[1:]]
 
@@ -80,14 +79,13 @@ class StreamFeeder:
         return [Notice(code, "MAJOR", f"{text}; the correction ends before these rows")]
 
     def _missing(self) -> list[Notice]:
-        """Tell when rows become scarce because the check is not there yet; where it catches up they go on."""
         if self._scarce or self._armed.stream.checked.refused or self.left_s() > SCARCE_S:
             return []
         self._scarce = True
         text = f"the check of {self._name} is only {self.left_s() + RESERVE_S:.1f} s ahead of the motion"
-        advice = "ease the host or arm with --whole; where it does not catch up, the correction is ramped to zero"
+        advice = "reduce the PC's load or arm with --whole; if the check stays behind, the correction ramps to zero"
         return [Notice("CheckBehind", "MAJOR", f"{text}; {advice}")]
 
     def left_s(self) -> float:
-        """Return for how long the machine is corrected yet by what has passed, seconds of the program."""
+        """Return how many seconds of the program remain that can be corrected by the rows that passed."""
         return max(0.0, self._armed.stream.reach_s - self._guard.row * self._armed.stream.period_s - RESERVE_S)

@@ -1,4 +1,4 @@
-"""Keeps the operator's token: who can read it (mode 0600, in the run directory) may arm. It is never logged."""
+"""Keeps the operator's token: whoever can read it (mode 0600, in the run directory) may arm. It is never logged."""
 
 import os
 import secrets
@@ -15,9 +15,9 @@ MAX_BYTES = 256
 
 
 def operator_token(run_directory: Path) -> str:
-    """Return the token that arming needs, made at the first start of guard or daemon. DeviceError.
+    """Return the token that arming needs, created at the first start of guard or daemon. Raises DeviceError.
 
-    Under a user of its own the guard is given it by systemd (LoadCredential=token:...).
+    A guard with a user of its own gets it from systemd (LoadCredential=token:...).
     """
     given = given_credential(TOKEN_NAME)
     if given is not None:
@@ -27,35 +27,35 @@ def operator_token(run_directory: Path) -> str:
 
 
 def given_credential(name: str) -> Path | None:
-    """Return the credential of that name, None where systemd gives none."""
+    """Return the path of a systemd credential, None if systemd provides none of that name."""
     folder = os.environ.get("CREDENTIALS_DIRECTORY")
     return Path(folder) / name if folder and (Path(folder) / name).exists() else None
 
 
 def make_directory(run_directory: Path) -> None:
-    """Make a run directory (mode 0700) where there is none; DeviceError when that fails, or anybody may write there."""
+    """Create a missing run directory (mode 0700). Raises DeviceError on failure, or if everybody may write there."""
     try:
         run_directory.mkdir(parents=True, exist_ok=True, mode=0o700)
     except OSError as error:
-        text = f"cannot be made ({error.strerror}), and nothing is sent; check run_directory and its rights"
+        text = f"cannot be created ({error.strerror}), nothing is sent; check run_directory and its permissions"
         raise DeviceError(str(run_directory), text) from None
     check_rights(run_directory)
 
 
 def check_rights(run_directory: Path) -> None:
-    """Raise DeviceError when anybody may write in a run directory: commands would reach whoever put a socket there."""
+    """Raise DeviceError if everybody may write in a run directory: a foreign socket there would receive commands."""
     with suppress(FileNotFoundError):
         mode = stat.S_IMODE(run_directory.stat().st_mode)
         if mode & 0o002:
-            text = f"RunDirectoryOpen: it has mode {mode:04o}, anybody may put a socket of his own there; chmod 0700 it"
+            text = f"RunDirectoryOpen: it has mode {mode:04o}, any user may put a socket there; chmod 0700 it"
             raise DeviceError(str(run_directory), text)
 
 
 def ensure_token(run_directory: Path, lost: str = "") -> str:
-    """Return the token of a run directory; make one where there is none. DeviceError when it cannot be kept secret.
+    """Return the token of a run directory, created if there is none. Raises DeviceError if it cannot be kept secret.
 
-    ``lost`` is the token that was there, which the guard knows: it is written again.
-    It is there whole or not at all, whatever ends this process; of two who make one at once the first one's is taken.
+    ``lost`` is the earlier token, which the guard has: it is written again. The file is complete or absent whenever
+    this process ends; of two processes that create one at once, the first one's is used.
     """
     path = run_directory / TOKEN_NAME
     try:
@@ -83,7 +83,7 @@ def _make_token(path: Path, token: str) -> None:
 
 
 def read_token(run_directory: Path) -> str:
-    """Return the token. ConnectError when there is none, DeviceError when others can read it."""
+    """Return the token. Raises ConnectError if there is none, DeviceError if others can read it."""
     path = run_directory / TOKEN_NAME
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
@@ -97,7 +97,7 @@ def read_token(run_directory: Path) -> str:
         mode = stat.S_IMODE(os.fstat(descriptor).st_mode)
         if mode & 0o077:
             raise DeviceError(
-                str(path), f"has mode {mode:04o}, others can read it; delete it and start the daemon again"
+                str(path), f"has mode {mode:04o}, other users can read it; delete it and restart the daemon"
             )
         token = os.read(descriptor, MAX_BYTES).decode("ascii", "replace").strip()
         if not token:

@@ -1,4 +1,4 @@
-"""Plans a program at once, which is short or whose method needs all of it; what passes are checked rows in memory."""
+"""Plans a program at once, if it is short or its method needs all of it; the checked rows stay in memory."""
 
 import hashlib
 import os
@@ -23,7 +23,7 @@ BLOCK_S = 2.0
 def plan_whole(request: ArmRequest, known: Mapping[str, AxisKnowledge]) -> CheckedProgram | Refused:
     """Return the rows of the planned correction, or why there is none.
 
-    ProgramError, RecordingError or ConfigError when the program cannot be used; StoreError when memory is short.
+    Raises ProgramError, RecordingError or ConfigError if the program cannot be used, StoreError if memory is short.
     """
     config = request.config
     reference = load_trajectory(request.program, config, request.program_digest)
@@ -41,7 +41,7 @@ def plan_whole(request: ArmRequest, known: Mapping[str, AxisKnowledge]) -> Check
 
 
 def in_memory(rows: bytes, config: MachineConfig, errors: Mapping[str, Mapping[str, float]]) -> CheckedProgram:
-    """Return encoded rows that passed as a checked program; ``errors`` without and with their offsets."""
+    """Return encoded rows as a checked program; ``errors`` without and with their offsets."""
     checked = CheckedProgram(_in_memory(rows), tuple(config.axis))
     size = 8 * len(config.axis)
     total, block_rows = len(rows) // size, round(BLOCK_S / config.machine.sync_period_s)
@@ -73,7 +73,7 @@ def _in_memory(rows: bytes) -> int:
     try:
         descriptor = os.memfd_create("fdhil-rows")
     except OSError as error:
-        raise StoreError(f"the planned rows cannot be kept ({error.strerror}); free memory, then arm again") from None
+        raise StoreError(f"the planned rows cannot be stored ({error.strerror}); free memory, then arm again") from None
     with os.fdopen(os.dup(descriptor), "wb") as file:
         file.write(rows)
     return descriptor

@@ -1,4 +1,4 @@
-"""Recordings, windows and the history on disk."""
+"""Stores recordings, windows and the history on disk."""
 
-WINDOWS_FOLDER = "windows"  # in the folder of the store
+WINDOWS_FOLDER = "windows"  # in the store's folder
 HISTORY_FILE = "history.sqlite"

@@ -1,4 +1,4 @@
-"""Writing a file so that a reader sees all of it or nothing, also after a power cut."""
+"""Writes files atomically: a reader sees the whole file or nothing, also after a power cut."""
 
 import contextlib
 import errno
@@ -9,7 +9,7 @@ from pathlib import Path
 
 from fdhil.errors import StoreError
 
-PAGE_BYTES = 64 * 1024  # what the history takes when it is opened
+PAGE_BYTES = 64 * 1024  # allocated by the history when it is opened
 _CODES = {
     errno.ENOSPC: "DiskFull",
     errno.EDQUOT: "DiskFull",
@@ -18,12 +18,12 @@ _CODES = {
 }
 CAUSES = {
     "DiskFull": "the disk is full; free space or lower keep_windows in [store]",
-    "ReadOnlyStore": "it may not be written; check the rights and the mount of [store] directory",
+    "ReadOnlyStore": "it is read-only; check the permissions and the mount of [store] directory",
 }
 
 
 def is_full(path: Path) -> bool:
-    """Whether there is no room for one more page on the disk of a file."""
+    """Return whether the disk of a file has no room for one more page."""
     try:
         room = os.statvfs(path.parent)
     except OSError:
@@ -32,19 +32,19 @@ def is_full(path: Path) -> bool:
 
 
 def store_error(path: Path, error: OSError) -> StoreError:
-    """Say what an operating system's refusal means for the store; ``code`` is DiskFull, ReadOnlyStore or StoreFault."""
+    """Translate an operating system's error into a StoreError (``code``: DiskFull, ReadOnlyStore, StoreFault)."""
     code = _CODES.get(error.errno or 0, "StoreFault")
-    cause = CAUSES.get(code, f"{error.strerror}; check the disk, the file is not tried again")
+    cause = CAUSES.get(code, f"{error.strerror}; check the disk, there is no retry")
     return StoreError(f"{path} could not be written: {cause}", code)
 
 
 def write_file(path: Path, content: bytes, like: os.stat_result | None = None, part: Path | None = None) -> None:
-    """Write ``content`` under a temporary name, fsync, rename, fsync the folder. StoreError when any step fails.
+    """Write ``content`` under a temporary name, fsync, rename, fsync the folder. Raises StoreError.
 
-    ``like``: with the mode and the owner of another file.
+    ``like``: take over the mode and owner of another file.
 
-    The temporary name is fixed (``.NAME.part``), so that what a power cut leaves behind is overwritten, never piled up;
-    ``part`` is another one, where several may write the same file at once.
+    The temporary name is fixed (``.NAME.part``), so that leftovers of a power cut are overwritten and do not
+    accumulate; ``part`` is another one if several processes may write the same file at once.
     """
     part = part or path.with_name(f".{path.name}.part")
     try:
@@ -66,14 +66,14 @@ def write_file(path: Path, content: bytes, like: os.stat_result | None = None, p
 
 
 def write_all(descriptor: int, content: bytes) -> None:
-    """Write all of ``content``; OSError."""
+    """Write all of ``content``. Raises OSError."""
     view = memoryview(content)
     while view:  # a write may be short
         view = view[os.write(descriptor, view) :]
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder, and those above it that are missing, so that they survive a power cut; OSError."""
+    """Create a folder and its missing parents so that they survive a power cut. Raises OSError."""
     if not folder.is_dir():
         make_folder(folder.parent)
         folder.mkdir(exist_ok=True)
@@ -81,9 +81,9 @@ def make_folder(folder: Path) -> None:
 
 
 def keep_newest(path: Path, others: Iterable[Path], most: int) -> None:
-    """Remove the oldest of ``others`` until there are ``most`` files with ``path``, the newest of them; OSError.
+    """Remove the oldest of ``others`` until ``most`` files remain with ``path``, the newest. Raises OSError.
 
-    Their order is that of their times, which no clock that was set back turns round: ``path`` gets a later one.
+    The order is that of the modification times; ``path`` gets a later one if the clock was set back.
     """
     newest = sorted(others, key=lambda file: file.stat().st_mtime_ns, reverse=True)
     last_ns = newest[0].stat().st_mtime_ns if newest else 0
@@ -94,7 +94,7 @@ def keep_newest(path: Path, others: Iterable[Path], most: int) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make renames and unlinks in ``folder`` survive a power cut."""
+    """Make renames and removals in ``folder`` survive a power cut."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(descriptor)

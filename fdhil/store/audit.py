@@ -1,8 +1,8 @@
-"""Keeps the audit: who asked the machine for what, and what he was answered; one line each, chained, never changed.
+"""Keeps the audit log: each request to the machine with its client and answer, one chained line each, append only.
 
-``audit.jsonl`` in the store: each line carries the SHA-256 of itself and of the line before it, so that a line that was
-changed, left out or put elsewhere is seen. That the newest lines were cut off, or all of them written anew, is not: the
-daemon's journal has each answer too, and may be sent on; ``chattr +a`` guards the file itself.
+``audit.jsonl`` in the store: each line carries the SHA-256 of itself and of the line before it, so that changed,
+missing and moved lines are detected. Removal of the newest lines, or a complete rewrite, is not: the daemon's journal
+has each answer too and may be forwarded; ``chattr +a`` protects the file itself.
 """
 
 import errno
@@ -24,23 +24,23 @@ from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 FILE_NAME = "audit.jsonl"
 TAIL_BYTES = 16 * 1024
-LOCKED_S, LOOK_S = 10.0, 0.01  # how long another writer is waited for; whoever may read the file may lock it, too
-BEGIN = "0" * 64  # what stands before the first line
-BROKEN = "is no line of the audit, or not the one that stood here: it was changed, left out or moved"
+LOCKED_S, LOOK_S = 10.0, 0.01  # wait for another writer; every reader of the file can lock it, too
+BEGIN = "0" * 64  # the seal before the first line
+BROKEN = "is not an intact audit line: it was changed, removed or moved"
 
 
 def append(folder: Path, entry: Mapping[str, Any], clock: Clock = SYSTEM_CLOCK) -> None:
-    """Write one entry at the end and wait until it is on the disk. StoreError.
+    """Append one entry and wait until it is on the disk. Raises StoreError.
 
-    A line that a power cut left half is closed first: it stays and is told by ``entries``.
+    A line that a power cut left incomplete is terminated first; ``entries`` reports it.
     """
     path = folder / FILE_NAME
     try:
         with _opened(path) as descriptor:
             before, whole = _last_seal(descriptor)
             stamp = Stamp.now(clock)
-            told = datetime.fromtimestamp(stamp.wall_s, UTC).isoformat(timespec="milliseconds")
-            body = {"time": told, "boot": stamp.boot, "monotonic_ns": stamp.monotonic_ns, **entry}
+            time_utc = datetime.fromtimestamp(stamp.wall_s, UTC).isoformat(timespec="milliseconds")
+            body = {"time": time_utc, "boot": stamp.boot, "monotonic_ns": stamp.monotonic_ns, **entry}
             line = json.dumps({**body, "seal": _seal(before, body)}).encode() + b"\n"
             write_all(descriptor, line if whole else b"\n" + line)
             os.fsync(descriptor)
@@ -52,7 +52,7 @@ def append(folder: Path, entry: Mapping[str, Any], clock: Clock = SYSTEM_CLOCK) 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[int]:
-    """Open the file for one writer at a time; one that root begins belongs to the owner of the folder."""
+    """Open the file for one writer at a time; a file created by root gets the folder's owner."""
     flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
     descriptor = os.open(path, flags, 0o640)
     try:
@@ -66,19 +66,18 @@ def _opened(path: Path) -> Iterator[int]:
 
 
 def _lock(descriptor: int) -> None:
-    """Wait for the file's lock, but not for ever. OSError."""
     until_s = time.monotonic() + LOCKED_S
     while True:
         try:
             return fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             if time.monotonic() > until_s:
-                raise OSError(errno.EBUSY, "another process has kept it locked") from None
+                raise OSError(errno.EBUSY, "another process holds its lock") from None
             time.sleep(LOOK_S)
 
 
 def _last_seal(descriptor: int) -> tuple[str, bool]:
-    """Return what the next line is chained to, and whether the file ends with a whole line."""
+    """Return the seal that the next line is chained to, and whether the file ends with a complete line."""
     size = start = os.fstat(descriptor).st_size
     tail = last = b""
     while start and len(last) == len(tail.removesuffix(b"\n")):  # its beginning is not read yet
@@ -89,7 +88,7 @@ def _last_seal(descriptor: int) -> tuple[str, bool]:
 
 
 def _seal_of(line: bytes) -> str:
-    """Return a line's own seal; of one that has none, its SHA-256, so that the chain goes on and shows the damage."""
+    """Return a line's own seal; without one its SHA-256, so that the chain continues and shows the damage."""
     try:
         seal = json.loads(line)["seal"]
     except (ValueError, KeyError, TypeError, RecursionError):
@@ -102,7 +101,7 @@ def _seal(before: str, body: Mapping[str, Any]) -> str:
 
 
 def entries(folder: Path) -> Iterator[tuple[dict[str, Any], str | None]]:
-    """Yield each entry, oldest first, and what is wrong with it, None where it is as it was written. StoreError."""
+    """Yield each entry, oldest first, and its defect, None if it is intact. Raises StoreError."""
     path = folder / FILE_NAME
     try:
         with path.open("rb") as file:
@@ -113,7 +112,7 @@ def entries(folder: Path) -> Iterator[tuple[dict[str, Any], str | None]]:
     except FileNotFoundError:
         return
     except OSError as error:
-        text = f"{path} could not be read: {error.strerror}; check its rights"
+        text = f"{path} could not be read: {error.strerror}; check its permissions"
         raise StoreError(text) from None
 
 

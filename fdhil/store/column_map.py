@@ -1,7 +1,7 @@
-"""A column map (TOML) says which column of another program's file is which signal, in which unit, and of which axis.
+"""Maps another program's file to a recording: a column map (TOML) names signal, unit and axis of each column.
 
-Without a speed, it is the difference of positions or angles; a torque stands in for a current. A part of a heading is
-enough to name a column, where one column alone has it.
+Without a speed, it is derived from positions or angles; a torque can replace a current. A part of a heading is enough
+to name a column, if only one column has it.
 """
 
 import math
@@ -35,7 +35,7 @@ from fdhil.store.sample_times import even_times, usual_step
 from fdhil.store.trace_text import TraceText
 
 SHOWN_NAMES = 12
-LEAST_PART = 3  # letters of a heading that name its column
+LEAST_PART = 3  # letters of a heading that suffice to name its column
 SHORTEST_S = 0.01  # of a recording
 PER_REVOLUTION = {"mm/s": 1e-3, "mm/min": 1e-3 / 60, "m/min": 1 / 60, "m/s": 1.0}  # of the table: by pitch to rad/s
 FACTORS: Mapping[str, Mapping[str, float]] = {
@@ -51,14 +51,14 @@ FACTORS: Mapping[str, Mapping[str, float]] = {
     "table_mm": {"mm": 1.0, "m": 1e3, "um": 1e-3},
     "table_m_s2": {"m/s2": 1.0, "mm/s2": 1e-3, "g": 9.80665},
 }  # fmt: skip
-COUNTED = ("time_s", "angle_rad", "position_m", "demand_m")  # what a counter may count
+COUNTED = ("time_s", "angle_rad", "position_m", "demand_m")  # signals that may come from a counter
 SYNONYMS = {"sec": "s", "msec": "ms", "U/min": "rpm", "r/min": "rpm", "min-1": "rpm", "m/s^2": "m/s2", "m/s²": "m/s2"}
 _MICRO = str.maketrans({"\u00b5": "u", "\u03bc": "u"})
 # a unit at the end of a name: in brackets, "Current / mA", "Current, mA", "C1 in A", "Current mA", "current_mA"
 _IN_NAME = (
     re.compile(r"[\[(]([^\[\]()]+)[\])]$"),
     re.compile(r"(?:/|,|\sin\s)\s*(\S+)$"),
-    re.compile(r"[\s_](\S{2,})$"),  # one letter may as well be a channel's, or stand for the motor
+    re.compile(r"[\s_](\S{2,})$"),  # a single letter may also name a channel or the motor
 )
 Signal = Literal[
     "time_s", "voltage_V", "current_A", "torque_Nm", "speed_rad_per_s", "angle_rad", "position_m", "demand_m",
@@ -69,7 +69,7 @@ Signal = Literal[
 class Column(Section):
     """A column of the file: value = (number * factor + offset) in ``unit``."""
 
-    name: str = Field(min_length=1, description="as it stands above the column, or #1, #2 ... from the left")
+    name: str = Field(min_length=1, description="the heading above the column, or #1, #2 ... from the left")
     unit: str = Field(description="unit of the number after factor and offset")
     factor: Finite = 1.0
     offset: Finite = 0.0
@@ -83,73 +83,79 @@ Columns = Annotated[Column | tuple[Column, ...], AfterValidator(_as_tuple)]
 
 
 class ColumnMap(Section):
-    """A whole map: ``columns`` of which several are added (a position and its following error make a demand)."""
+    """A complete map; several ``columns`` of a signal are added (position and following error make a demand)."""
 
-    headers: dict[str, str | float] = Field(default_factory=dict, description="what the file does not say")
+    headers: dict[str, str | float] = Field(default_factory=dict, description="headers that the file lacks")
     columns: dict[Signal, Columns]
     text: TraceText = TraceText()
 
 
 def read_column_map(path: Path) -> ColumnMap:
-    """Read a map; ConfigError with every fault of it."""
+    """Read a map. Raises ConfigError with all its faults."""
     return check_map(read_toml(path, "a column map"), str(path))
 
 
 def check_map(document: Mapping[str, Any], source: str) -> ColumnMap:
-    """Return the map that a document is; ConfigError with every fault of it."""
+    """Return the map of a document. Raises ConfigError with all its faults."""
     try:
-        told = ColumnMap.model_validate(document)
+        column_map = ColumnMap.model_validate(document)
     except ValidationError as error:
         items = error.errors(include_url=False)
         faults = [ConfigFault(".".join(map(str, e["loc"])), e["msg"], "see the how-to on recordings") for e in items]
         raise ConfigError(source, faults) from None
-    if faults := [*_faults(told)]:
+    if faults := [*_faults(column_map)]:
         raise ConfigError(source, faults)
-    return told
+    return column_map
 
 
-def _faults(told: ColumnMap) -> list[ConfigFault]:
+def _faults(column_map: ColumnMap) -> list[ConfigFault]:
     needed = {"current_A": (TORQUE,), "speed_rad_per_s": (ANGLE, "position_m")}
     faults = [
-        ConfigFault(f"columns.{signal}", "is missing", f"say which column it is, or give {' or '.join(instead)}")
+        ConfigFault(f"columns.{signal}", "is missing", f"name its column, or that of {' or '.join(instead)}")
         for signal, instead in needed.items()
-        if not told.columns.keys() & {signal, *instead}
+        if not column_map.columns.keys() & {signal, *instead}
     ]
-    for signal, columns in told.columns.items():
+    for signal, columns in column_map.columns.items():
         units = {**FACTORS[signal], **(PER_REVOLUTION if signal == "speed_rad_per_s" else {})}
         faults += [
-            ConfigFault(f"columns.{signal}.unit", f"{shown(c.unit)} is no unit of it", f"one of {', '.join(units)}")
+            ConfigFault(
+                f"columns.{signal}.unit", f"{shown(c.unit)} is not a unit of it", f"use one of {', '.join(units)}"
+            )
             for c in _as_tuple(columns)
             if c.unit not in units
         ]
-    per_revolution = [c.unit for c in _as_tuple(told.columns.get("speed_rad_per_s", ())) if c.unit in PER_REVOLUTION]
-    wanted = ["axis", *([PITCH] if per_revolution or told.columns.keys() & {*PATH} else [])]
-    wanted += [SAMPLING] if VOLTAGE in told.columns else []
-    missing = [key for key in wanted if key not in told.headers]
-    return faults + [ConfigFault(f"headers.{key}", "is missing", "the file does not say it") for key in missing]
+    per_revolution = [
+        c.unit for c in _as_tuple(column_map.columns.get("speed_rad_per_s", ())) if c.unit in PER_REVOLUTION
+    ]
+    wanted = ["axis", *([PITCH] if per_revolution or column_map.columns.keys() & {*PATH} else [])]
+    wanted += [SAMPLING] if VOLTAGE in column_map.columns else []
+    missing = [key for key in wanted if key not in column_map.headers]
+    return faults + [
+        ConfigFault(f"headers.{key}", "is missing", "add it: the file does not contain it") for key in missing
+    ]
 
 
-def mapped(raw: RecordingTable, told: ColumnMap, source: str) -> RecordingTable:
-    """Return the recording that a file is by its map; rows that lack a value are left out, which makes a gap.
+def mapped(raw: RecordingTable, column_map: ColumnMap, source: str) -> RecordingTable:
+    """Return the recording that a file contains by its map; rows that lack a value are left out, which makes a gap.
 
-    What was done to the numbers is in its header ``import_notes``. RecordingError when a column is not in the file, or
-    the rest is wrong.
+    Conversions of the numbers are listed in the header ``import_notes``. Raises RecordingError if a column is missing
+    or the rest is wrong.
     """
-    headers = {"format": FORMAT, **raw.headers, **{key: _text(value) for key, value in told.headers.items()}}
+    headers = {"format": FORMAT, **raw.headers, **{key: _text(value) for key, value in column_map.headers.items()}}
     pitch_m = math.nan
     if PITCH in headers:
         pitch_m = _positive(headers[PITCH], PITCH, "a length above 0, in m", source)
     rate_hz = None
     if "sample_rate_hz" in headers:
         rate_hz = _positive(headers["sample_rate_hz"], "sample_rate_hz", "a number above 0", source)
-    told = _with_whole_names(raw, told, source)
-    raw = _sampled_together(raw, told, source)
-    columns, notes = _signals(raw, told, pitch_m, source)
+    column_map = _with_whole_names(raw, column_map, source)
+    raw = _sampled_together(raw, column_map, source)
+    columns, notes = _signals(raw, column_map, pitch_m, source)
     if "time_s" not in columns:
         columns = {"time_s": _time(raw, rate_hz, len(next(iter(columns.values()))), source), **columns}
     columns = _whole_rows(columns, source)
     if 0 < (lasts_s := np.ptp(columns["time_s"])) < SHORTEST_S:
-        lasts = f"lasts {lasts_s:.3g} s by its times, in which no axis moves"
+        lasts = f"lasts only {lasts_s:.3g} s by its times, too short for a move"
         raise RecordingError(f"{source} {lasts}: correct the unit of time_s, or sample_rate_hz")
     time_s, note = even_times(np.round(columns["time_s"] - columns["time_s"][0], 9), rate_hz, source)
     columns["time_s"] = np.round(time_s, 9)
@@ -166,38 +172,35 @@ def mapped(raw: RecordingTable, told: ColumnMap, source: str) -> RecordingTable:
 
 
 def _whole_rows(columns: Mapping[str, Float], source: str) -> dict[str, Float]:
-    """Return the rows in which all but the sensors at the table have a value."""
     _check_lengths(columns, source)
-    whole = np.isfinite(np.column_stack([columns[name] for name in columns if not name.startswith("table_")])).all(1)
-    if np.count_nonzero(whole) < 2:
-        raise RecordingError(f"{source} has no row in which every mapped column has a number: correct the column map")
-    return {name: values[whole] for name, values in columns.items()}
+    complete = np.isfinite(np.column_stack([columns[name] for name in columns if not name.startswith("table_")])).all(1)
+    if np.count_nonzero(complete) < 2:
+        raise RecordingError(f"{source} has no row with a number in every mapped column: correct the column map")
+    return {name: values[complete] for name, values in columns.items()}
 
 
 def whole_heading(raw: RecordingTable, name: str, source: str) -> str:
-    """Return the heading that has ``name`` or is it, else ``name`` itself; RecordingError where several have it."""
+    """Return the heading that contains ``name``, else ``name`` itself. RecordingError if several contain it."""
     names = list(dict.fromkeys(n for table in (raw, *raw.others) for n in (*table.columns, *table.doubts)))
     if name in names or name.startswith("#") or len(name) < LEAST_PART:
         return name
     found = [each for each in names if name.lower() in each.lower()]
     if len(found) > 1:
         listed = " and ".join(map(shown, found[:SHOWN_NAMES]))
-        raise RecordingError(f"{source}: {shown(name)} is a part of {listed}: write more of the one that is meant")
+        raise RecordingError(f"{source}: {shown(name)} is a part of {listed}: write more of the intended heading")
     return found[0] if found else name
 
 
-def _with_whole_names(raw: RecordingTable, told: ColumnMap, source: str) -> ColumnMap:
-    """Return the map with the whole heading where it has a part of one; RecordingError where several have that part."""
+def _with_whole_names(raw: RecordingTable, column_map: ColumnMap, source: str) -> ColumnMap:
     columns = {
         signal: tuple(c.model_copy(update={"name": whole_heading(raw, c.name, source)}) for c in _as_tuple(of))
-        for signal, of in told.columns.items()
+        for signal, of in column_map.columns.items()
     }
-    return told.model_copy(update={"columns": columns})
+    return column_map.model_copy(update={"columns": columns})
 
 
-def _sampled_together(raw: RecordingTable, told: ColumnMap, source: str) -> RecordingTable:
-    """Return those columns of a file that have one time and all that the map names."""
-    names = dict.fromkeys(column.name for columns in told.columns.values() for column in _as_tuple(columns))
+def _sampled_together(raw: RecordingTable, column_map: ColumnMap, source: str) -> RecordingTable:
+    names = dict.fromkeys(column.name for columns in column_map.columns.values() for column in _as_tuple(columns))
     tables = [raw, *raw.others]
     having = [table for table in tables if all(name in table.columns or name in table.doubts for name in names)]
     if len(having) == 1:
@@ -210,21 +213,22 @@ def _sampled_together(raw: RecordingTable, told: ColumnMap, source: str) -> Reco
     listed = ", ".join(map(shown, names))
     if not having:
         raise RecordingError(
-            f"{source} has no group with all of {listed}: they are sampled at other times; record or export them with "
+            f"{source} has no group with all of {listed}: they have different sample times; record or export them with "
             "one sample time"
         )
     sizes = " and ".join(f"{table.columns['time_s'].size} rows" for table in having)
     raise RecordingError(
-        f"{source} has {listed} in {len(having)} groups of samples ({sizes}): export the one that is meant alone"
+        f"{source} has {listed} in {len(having)} groups of samples ({sizes}): export only the intended one"
     )
 
 
-def _signals(raw: RecordingTable, told: ColumnMap, pitch_m: float, source: str) -> tuple[dict[str, Float], list[str]]:
-    """Return the signals that the map gives, and what was done to them."""
+def _signals(
+    raw: RecordingTable, column_map: ColumnMap, pitch_m: float, source: str
+) -> tuple[dict[str, Float], list[str]]:
     signals: dict[str, Float] = {}
     notes: dict[str, None] = {}  # in order, each once
-    _check_places(raw, told, source)
-    for signal, of in told.columns.items():
+    _check_places(raw, column_map, source)
+    for signal, of in column_map.columns.items():
         parts: dict[str, Float] = {}
         for k, column in enumerate(_as_tuple(of)):
             values = _column(raw, column.name, source)
@@ -234,12 +238,12 @@ def _signals(raw: RecordingTable, told: ColumnMap, pitch_m: float, source: str) 
             if signal in ("position_m", "demand_m") and bits is None:
                 values, is_turn = _over_turns(values, column, pitch_m / FACTORS[signal][column.unit], source)
                 if is_turn:
-                    notes[f"{column.name} begins again each turn of the screw, and was unwrapped"] = None
+                    notes[f"{column.name} wraps at each turn of the screw and was unwrapped"] = None
             if bits is not None:
-                notes[f"{column.name} jumps by 2^{bits} as a counter of {bits} bits does, and was unwrapped"] = None
+                notes[f"{column.name} wraps like a counter of {bits} bits and was unwrapped"] = None
             is_clock = column.name in raw.clocks
             if is_clock and signal != "time_s":
-                raise RecordingError(f"{source}: {shown(column.name)} is a time, no {signal}: correct the column map")
+                raise RecordingError(f"{source}: {shown(column.name)} is a time, not {signal}: correct the column map")
             factor = 1.0 if is_clock else _factor(signal, column.unit, pitch_m)
             _check_unit(raw, signal, column, source)
             parts[f"{column.name} ({k + 1})"] = (values * column.factor + column.offset) * factor
@@ -249,74 +253,72 @@ def _signals(raw: RecordingTable, told: ColumnMap, pitch_m: float, source: str) 
 
 
 def _over_turns(values: Float, column: Column, pitch: float, source: str) -> tuple[Float, bool]:
-    """Return a reading within one turn as one over all turns, and whether it was one; ``pitch`` in the map's unit.
+    """Return a position within one turn unwrapped over all turns, and whether it was one; ``pitch`` in the map's unit.
 
-    RecordingError for one that begins again at another length than the pitch.
+    Raises RecordingError for a position that wraps at another length than the pitch.
     """
     turn = pitch / abs(column.factor or 1.0)
     values, is_turn = unwrap_turns(values, turn)
     jump = None if is_turn else jump_of_reading(values)
     if jump is not None:
         raise RecordingError(
-            f"{source}: {shown(column.name)} jumps by {jump:g} and goes on, as a reading within one turn that begins "
-            f"again, but one turn is {turn:g} by the column map: correct pitch_m_per_rev, unit and factor, or export a "
+            f"{source}: {shown(column.name)} jumps by {jump:g}, like a position within one turn, "
+            f"but one turn is {turn:g} by the column map: correct pitch_m_per_rev, unit and factor, or export a "
             "position over all turns"
         )
     return values, is_turn
 
 
-def _check_places(raw: RecordingTable, told: ColumnMap, source: str) -> None:
-    """Refuse two names of one column: a head that lists its signals one a line."""
+def _check_places(raw: RecordingTable, column_map: ColumnMap, source: str) -> None:
+    """Refuse two names of one column, as of a head that lists its signals one a line."""
     found: dict[int, str] = {}
-    for column in (column for columns in told.columns.values() for column in _as_tuple(columns)):
+    for column in (column for columns in column_map.columns.values() for column in _as_tuple(columns)):
         if column.name.startswith("#") or column.name not in raw.columns:
             continue
         other = found.setdefault(id(raw.columns[column.name]), column.name)
         if other != column.name:
             raise RecordingError(
-                f"{source} has {shown(other)} and {shown(column.name)} above one column: its head lists signals one a "
-                "line; say by #1, #2 ... from the left which column each is"
+                f"{source} has {shown(other)} and {shown(column.name)} above one column: its head lists one signal a "
+                "line; name the columns #1, #2 ... from the left instead"
             )
 
 
 def _check_unit(raw: RecordingTable, signal: str, column: Column, source: str) -> None:
-    """Refuse a unit that is not the one that stands above the column, where the map scales nothing itself."""
+    """Refuse a unit that differs from the one above the column, unless the map itself scales it."""
     known = {**FACTORS[signal], **(PER_REVOLUTION if signal == "speed_rad_per_s" else {})}
     units = [unit for unit in units_of_heading(raw, column.name) if unit in known]
     wrong = units and not any(math.isclose(known[unit], known[column.unit]) for unit in units)
     if wrong and "factor" not in column.model_fields_set and column.name not in raw.clocks:
         raise RecordingError(
-            f"{source} has {shown(column.name)} in {units[0]}, the column map says {column.unit}: correct unit in the "
-            "map, or give factor = 1 where the file is wrong"
+            f"{source} has {shown(column.name)} in {units[0]}, the column map has {column.unit}: correct unit in the "
+            "map, or set factor = 1 if the file is wrong"
         )
 
 
 def units_of_heading(raw: RecordingTable, heading: str) -> list[str]:
-    """Return what may be the unit of a column: texts of the file about it, and ends of its heading."""
+    """Return the possible units of a column: the file's texts about it, and the ends of its heading."""
     names = [heading.strip(), *raw.texts.get(heading, ())]
     ends = (found[1] for name in names for form in _IN_NAME if (found := form.search(name.strip())))
     return [_unit(text) for text in (*names, *ends)]
 
 
 def _unit(text: str) -> str:
-    """Return a text as a unit of the map, where it is one."""
     unit = text.strip("[]() ").translate(_MICRO)
     return SYNONYMS.get(unit, unit)
 
 
 def _time(raw: RecordingTable, rate_hz: float | None, rows: int, source: str) -> Float:
-    """Return the file's own time, else the rows' numbers by their rate."""
     is_doubtful = "time_s" in raw.doubts
     if ("time_s" in raw.columns and not is_doubtful) or (is_doubtful and rate_hz is None):
         return _column(raw, "time_s", source)
     if rate_hz is None:
         raise RecordingError(
-            f"{source} has no column 'time_s'; it has {_what_it_has(raw)}: say in the column map which is "
-            "time_s, or give sample_rate_hz under [headers] where the rows have no time"
+            f"{source} has no column 'time_s'; it has {_what_it_has(raw)}: name the column of "
+            "time_s in the column map, or give sample_rate_hz under [headers] if there is none"
         )
     if raw.interruption:
         raise RecordingError(
-            f"{source}: {raw.interruption}, and without times it is unknown how many samples are lost there: export it "
+            f"{source}: {raw.interruption}, and without times the number of lost samples is unknown: export it "
             "with a time"
         )
     return np.arange(rows) / rate_hz
@@ -329,8 +331,8 @@ def _check_rising(time_s: Float, source: str) -> None:
     at_s = time_s[1 + int(np.argmax(steps <= 0))]
     todo = "sort or record it again"
     if not (steps < 0).any() and 2 * np.count_nonzero(steps) < steps.size:
-        todo = "its digits are too few; leave time_s out of the map and give sample_rate_hz"
-    raise RecordingError(f"{source}: time stands still or runs back at {at_s:g} s: {todo}")
+        todo = "its resolution is too low; remove time_s from the map and give sample_rate_hz"
+    raise RecordingError(f"{source}: time does not rise at {at_s:g} s: {todo}")
 
 
 def _check_lengths(columns: Mapping[str, Float], source: str) -> None:
@@ -366,10 +368,9 @@ def _column(raw: RecordingTable, name: str, source: str) -> Float:
 
 
 def _what_it_has(*tables: RecordingTable) -> str:
-    """Return what a map may name; never nothing."""
-    every = dict.fromkeys(name for table in tables for name in (*table.columns, *table.doubts))
-    names = [shown(name) for name in every if not name.startswith("#")]
-    places = [name for name in every if name.startswith("#")]
+    names_of_all = dict.fromkeys(name for table in tables for name in (*table.columns, *table.doubts))
+    names = [shown(name) for name in names_of_all if not name.startswith("#")]
+    places = [name for name in names_of_all if name.startswith("#")]
     listed = [", ".join(names[:SHOWN_NAMES])] if names else []
     if places:
         listed.append(f"{places[0]} to {places[-1]}" if len(places) > 1 else places[0])

@@ -1,7 +1,7 @@
-"""Proposes a column map for another program's file: by headings, units, sizes, and the physics that signals obey.
+"""Proposes a column map for another program's file: by headings, units, sizes, and the physics of the signals.
 
-Voltage, current and speed obey u = R i + L di/dt + K w with positive R, L and K, and torque moves an inertia: of the
-columns that headings and units leave open, those are proposed that obey both best.
+Voltage, current and speed obey u = R i + L di/dt + K w with positive R, L and K, and torque accelerates an inertia: of
+the columns that headings and units leave open, those that fit both equations best are proposed.
 """
 
 from __future__ import annotations
@@ -34,16 +34,15 @@ HEADINGS: Mapping[str, str] = {  # in this order: a "position demand" is a deman
     "position_m": r"pos|lage|weg|encoder|angle|winkel|theta",
     "voltage_V": r"volt|spannung|tension|^u$|^u[_ ]|_u$|^v$",
 }
-KEPT_ROWS = 4000  # that the physics is asked about
-LEVELS = 20  # that a signal has at least: with fewer it is a state
-EXPLAINED = 0.5  # of both equations, from which three columns are taken for u, i and w
-RPM_FROM = 700.0  # a speed beyond that without a unit is hardly in rad/s
-ANGLE_UNITS = ("rad", "deg", "rev")
+KEPT_ROWS = 4000  # tested against the equations
+LEVELS = 20  # distinct values of a signal; a column with fewer is a state
+EXPLAINED = 0.5  # least product of both equations' shares for columns to be taken as u, i and w
+RPM_FROM = 700.0  # a larger speed without a unit is assumed to be in rpm
 
 
 @dataclass(frozen=True)
 class Proposed:
-    """One signal's column: its heading, the unit of its numbers, and why."""
+    """One signal's column: its heading, the unit of its numbers, and the reason."""
 
     signal: str
     heading: str
@@ -53,9 +52,9 @@ class Proposed:
 
 @dataclass(frozen=True)
 class Proposal:
-    """A column map to be checked: its columns, headers, the ``faults`` that keep it from being used.
+    """A proposed column map: its columns, headers, and the ``faults`` that prevent its use.
 
-    ``aside`` are columns that need a pitch, which no file says.
+    ``aside`` are columns that need a pitch, which no file contains.
     """
 
     columns: Sequence[Proposed]
@@ -65,11 +64,10 @@ class Proposal:
 
     @property
     def toml(self) -> str:
-        """The map as TOML."""
         lines = ["# proposed by fdhil: check every line", "[headers]"]
         lines += [f"{key} = {json.dumps(value)}" for key, value in self.headers.items()]
         if self.aside:
-            lines.append("# pitch_m_per_rev = 0.01  # with it the columns below that are commented out can be used")
+            lines.append("# pitch_m_per_rev = 0.01  # required by the columns that are commented out below")
         lines += ["", "[columns]"]
         for mark, each in [*(("", c) for c in self.columns), *(("# ", c) for c in self.aside)]:
             name, unit = json.dumps(each.heading), json.dumps(each.unit)
@@ -77,13 +75,12 @@ class Proposal:
         return "\n".join(lines) + "\n"
 
     def lines(self) -> Iterator[str]:
-        """Yield a line per column, for people."""
         for each in (*self.columns, *self.aside):
             yield f"  {each.signal:16} {each.heading!r} in {each.unit}: {each.why}"
 
 
 def propose_columns(path: Path) -> Proposal:
-    """Return the column map that a file suggests. RecordingError where it cannot be read."""
+    """Return the column map that a file suggests. Raises RecordingError if it cannot be read."""
     return propose(read_raw(path))
 
 
@@ -92,7 +89,7 @@ def propose(
 ) -> Proposal:
     """Return the column map that the columns of a file suggest.
 
-    Of ``given`` signals a heading, a part of one, or heading and unit are known; then no others are looked for.
+    ``given`` maps signals to a heading, a part of one, or heading and unit; then no other signals are searched.
     """
     if given:
         return _from_given(raw, given, source)
@@ -111,11 +108,11 @@ def propose(
         headers["voltage_sampling"] = _sampling(columns, found)
     faults = []
     if "time_s" not in found:
-        faults.append("no column rises evenly as a time does: give sample_rate_hz under [headers]")
+        faults.append("no column rises evenly like a time: give sample_rate_hz under [headers]")
     if not found.keys() & {"current_A", "torque_Nm"}:
-        faults.append("no current was recognised")
+        faults.append("no current recognised")
     if not found.keys() & {"speed_rad_per_s", "angle_rad"}:
-        faults.append("no speed was recognised")
+        faults.append("no speed recognised")
     if "current_A" in found:
         found.pop("torque_Nm", None)
     proposed = [_with_unit(signal, *found[signal], columns, raw) for signal in FACTORS if signal in found]
@@ -125,10 +122,10 @@ def propose(
 
 def _from_given(raw: RecordingTable, given: Mapping[str, str | Sequence[str]], source: str) -> Proposal:
     proposed, found = [], {}
-    for signal, told in given.items():
+    for signal, name_and_unit in given.items():
         if signal not in FACTORS:
-            raise RecordingError(f"{source}: {signal!r} is not a signal; signals are {', '.join(FACTORS)}")
-        part, *unit = (told,) if isinstance(told, str) else told
+            raise RecordingError(f"{source}: unknown signal {signal!r}; signals are {', '.join(FACTORS)}")
+        part, *unit = (name_and_unit,) if isinstance(name_and_unit, str) else name_and_unit
         heading = whole_heading(raw, part, source)
         if heading not in raw.columns:
             listed = ", ".join(map(shown, _distinct(raw)))
@@ -143,7 +140,6 @@ def _from_given(raw: RecordingTable, given: Mapping[str, str | Sequence[str]], s
 
 
 def _distinct(raw: RecordingTable) -> dict[str, Float]:
-    """Return the columns by heading, each once: one without a heading by its place."""
     found: dict[int, str] = {}
     for name, values in raw.columns.items():
         known = found.get(id(values))
@@ -155,7 +151,6 @@ def _distinct(raw: RecordingTable) -> dict[str, Float]:
 
 
 def _named(heading: str, raw: RecordingTable) -> str | None:
-    """Return the signal that a heading or its unit names."""
     text = heading.strip().lower()
     if any("%" in unit for unit in units_of_heading(raw, heading)):
         return None
@@ -171,7 +166,6 @@ def _unit(heading: str, raw: RecordingTable, signal: str) -> str | None:
 
 
 def _time(columns: Mapping[str, Float]) -> tuple[str, str] | None:
-    """Return the column that rises evenly, if there is one."""
     for heading, values in columns.items():
         steps = np.diff(values)
         if steps.size and np.isfinite(steps).all() and (steps > 0).all() and np.ptp(steps) < 0.1 * np.median(steps):
@@ -182,7 +176,6 @@ def _time(columns: Mapping[str, Float]) -> tuple[str, str] | None:
 def _by_physics(
     columns: Mapping[str, Float], found: dict[str, tuple[str, str]], by_name: Mapping[str, Sequence[str]]
 ) -> None:
-    """Enter the columns for voltage, current and speed that obey the equations best, where headings leave them open."""
     wanted = ("voltage_V", "current_A", "speed_rad_per_s")
     if all(signal in found for signal in wanted):
         return
@@ -197,17 +190,16 @@ def _by_physics(
             choices.append((obeys(*(columns[h][:KEPT_ROWS] for h in triple)), triple))
     if choices and (best := max(choices))[0] > EXPLAINED:
         for signal, heading in zip(wanted, best[1], strict=True):
-            found.setdefault(signal, (heading, f"by the equations, which explain {best[0]:.0%}"))
+            found.setdefault(signal, (heading, f"fits the equations by {best[0]:.0%}"))
 
 
 def _is_of_another_unit(heading: str, signal: str) -> bool:
-    """Return whether a heading ends in a unit in brackets that is none of the signal's."""
     found = re.search(r"[\[(]([^\[\]():,]*[^\[\]():,\d\s][^\[\]():,]*)[\])]$", heading.strip())
     return found is not None and found[1] not in FACTORS[signal]
 
 
 def obeys(voltage: Float, current: Float, speed: Float) -> float:
-    """Return the share of [1] and [2] that voltage, current and speed (n,) explain; 0 for parameters below 0."""
+    """Return the share of [1] and [2] that voltage, current and speed (n,) explain; 0 for negative parameters."""
     middle = [(v[1:] + v[:-1]) / 2 for v in (current, speed)]
     electrical = _share(voltage[:-1], [middle[0], np.diff(current), middle[1]])
     mechanical = _share(middle[0], [np.diff(speed), middle[1], np.sign(middle[1])])
@@ -217,7 +209,6 @@ def obeys(voltage: Float, current: Float, speed: Float) -> float:
 
 
 def _sampling(columns: Mapping[str, Float], found: Mapping[str, tuple[str, str]]) -> str:
-    """Return whether the voltage explains the current better as the mean over each sample or as its value there."""
     if not found.keys() >= {"current_A", "speed_rad_per_s"}:
         return "instant"
     u, i, w = (columns[found[s][0]][:KEPT_ROWS] for s in ("voltage_V", "current_A", "speed_rad_per_s"))
@@ -226,7 +217,6 @@ def _sampling(columns: Mapping[str, Float], found: Mapping[str, tuple[str, str]]
 
 
 def _share(values: Float, regressors: Sequence[Float]) -> tuple[float, Float] | None:
-    """Return the explained share of the variance and the coefficients, of regressors of unit size."""
     table = np.column_stack([*regressors, np.ones(values.size)])
     size = np.abs(table).max(axis=0)
     variance = float(np.var(values))
@@ -237,7 +227,6 @@ def _share(values: Float, regressors: Sequence[Float]) -> tuple[float, Float] | 
 
 
 def _with_unit(signal: str, heading: str, why: str, columns: Mapping[str, Float], raw: RecordingTable) -> Proposed:
-    """Return the column with its unit: the heading's, else the likeliest by size."""
     if (unit := _unit(heading, raw, signal)) is not None:
         return Proposed(signal, heading, unit, why)
     values = columns[heading]
@@ -248,4 +237,4 @@ def _with_unit(signal: str, heading: str, why: str, columns: Mapping[str, Float]
         unit = "rpm"
     elif signal in ("position_m", "demand_m") and float(np.ptp(values)) > math.tau:
         unit = "mm"
-    return Proposed(signal, heading, unit, f"{why}; the unit is a guess by size")
+    return Proposed(signal, heading, unit, f"{why}; unit guessed by size")

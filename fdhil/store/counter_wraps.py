@@ -1,4 +1,4 @@
-"""Counters that pass the end of the range of their bits, unwrapped where nothing else explains the jump."""
+"""Unwraps counters that overflow the range of their bits, if nothing else explains the jump."""
 
 import numpy as np
 
@@ -10,10 +10,10 @@ MOST_COUNTS = 2.0**32
 
 
 def unwrap_counter(values: Float) -> tuple[Float, int | None]:
-    """Return the values (n,) without the jumps of a counter that begins again, and its bits; None where it does not.
+    """Return the values (n,) without the jumps of an overflowing counter, and its bits; None without overflow.
 
-    It must count in whole numbers, or in a decimal fraction of them, within the range of its bits, signed or not, come
-    within a step of that range's end where it jumps, and go on after the jump as before it. Lost ones may be ``nan``.
+    The counter must count in whole numbers or a decimal fraction of them, within the range of its bits (signed or not),
+    jump within a step of the end of that range, and continue after the jump as before. Lost samples may be ``nan``.
     """
     known = np.flatnonzero(np.isfinite(values))
     scale = _scale(values[known])
@@ -28,16 +28,16 @@ def unwrap_counter(values: Float) -> tuple[Float, int | None]:
 
 
 def unwrap_turns(values: Float, turn: float) -> tuple[Float, bool]:
-    """Return the values (n,) of a reading that begins again each ``turn``, without those jumps; and whether it does."""
+    """Return the values (n,) of a position within one ``turn``, unwrapped, and whether there were such jumps."""
     known = np.flatnonzero(np.isfinite(values))
     whole = _without_jumps(values[known], turn, 1e-3 * turn) if known.size > 2 else None
     return (values, False) if whole is None else (_placed(values, known, whole), True)
 
 
 def jump_of_reading(values: Float) -> float | None:
-    """Return by how much a moving reading jumps, from one end of its range to the other, and goes on; or None.
+    """Return the jump of a moving position from one end of its range to the other; None without one.
 
-    One that stands still there is the end of a recording and the beginning of the next.
+    A position at standstill there is the end of a recording and the beginning of the next.
     """
     known = values[np.isfinite(values)]
     steps = np.diff(known)
@@ -53,7 +53,6 @@ def jump_of_reading(values: Float) -> float | None:
 
 
 def _without_jumps(counts: Float, period: float, resolution: float) -> Float | None:
-    """Return the counts without jumps of a period; None where none, or something else, explains them."""
     jumps = np.abs(np.diff(counts))
     low = -period / 2 if counts.min() < 0 else 0.0
     if counts.min() < low or counts.max() >= low + period or jumps.max() <= period / 2:
@@ -73,7 +72,6 @@ def _placed(values: Float, known: Int, whole: Float) -> Float:
 
 
 def _scale(values: Float) -> float | None:
-    """Return the power of ten that makes whole numbers of all values; None without one."""
     if not (np.abs(values) < MOST_COUNTS).all():
         return None
     for decimals in range(MOST_DECIMALS + 1):
@@ -84,7 +82,6 @@ def _scale(values: Float) -> float | None:
 
 
 def _nearby(steps: Float, reach: int = 3) -> Float:
-    """Return the greatest of the steps (n,) about each one."""
     padded = np.pad(steps, reach)
     greatest: Float = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1).max(axis=1)
     return greatest

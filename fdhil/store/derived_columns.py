@@ -1,4 +1,4 @@
-"""Makes columns of a recording from what was recorded instead: a speed from an angle, a current from a torque."""
+"""Derives missing columns of a recording: speed from an angle, current from a torque."""
 
 import math
 
@@ -10,7 +10,7 @@ from fdhil.store.recording_table import ANGLE, NOTES, SAMPLING, VOLTAGE
 
 TORQUE = "torque_Nm"
 CONSTANT = "torque_constant_nm_per_a"
-LARGEST = {  # beyond what drives have -> what the numbers may be
+LARGEST = {  # limit of real drives -> likely unit beyond it
     "voltage_V": (3e3, "mV (multiply by 1e-3)"),
     "current_A": (3e3, "mA (multiply by 1e-3)"),
     "speed_rad_per_s": (6e3, "1/min (multiply by 2 pi / 60) or degrees per second (by pi / 180)"),
@@ -19,10 +19,10 @@ LONGEST_STEP_S = 0.2
 
 
 def derive_columns(headers: dict[str, str], columns: dict[str, Float]) -> None:
-    """Put a speed in the place of an angle (rad), and a current in the place of a torque (N.m), of rows (n,).
+    """Replace an angle (rad) by its speed, and a torque (N.m) by its current, in columns (n,).
 
-    A torque is divided by the header's torque constant. Without one it is the current of a motor with a constant of 1,
-    and a voltage, which belongs to the real constant, is left out with a note.
+    A torque is divided by the header's torque constant. Without one it counts as the current of a motor with a constant
+    of 1; a voltage, which belongs to the real constant, is then dropped with a note.
     """
     angle, torque = columns.get(ANGLE), columns.pop(TORQUE, None)
     if angle is not None and "speed_rad_per_s" not in columns:
@@ -36,26 +36,26 @@ def derive_columns(headers: dict[str, str], columns: dict[str, Float]) -> None:
     columns["current_A"], headers[CONSTANT] = torque, "1"
     if columns.pop(VOLTAGE, None) is not None:
         headers.pop(SAMPLING, None)
-        note = f"the voltage was left out: beside a torque it tells nothing without {CONSTANT}"
+        note = f"the voltage was dropped: with a torque it needs {CONSTANT}"
         headers[NOTES] = "; ".join(filter(None, [headers.get(NOTES, ""), note]))
 
 
 def difference(positions: Float, time_s: Float) -> Float:
-    """Return the mean rate (n,) of positions (n,) over the row before each; 0 in the first."""
+    """Return the mean rate (n,) of positions (n,) over the interval before each sample; 0 in the first."""
     return np.concatenate([[0.0], np.diff(positions) / np.diff(time_s)])
 
 
 def check_sizes(columns: dict[str, Float], source: str) -> None:
-    """Refuse numbers that no drive has, with the unit that they may be in."""
+    """Refuse numbers beyond those of drives, naming the unit that they may be in."""
     for name, (largest, meant) in LARGEST.items():
         top = float(np.abs(columns[name]).max()) if name in columns and columns[name].size else 0.0
         if math.isfinite(top) and top > largest:
             raise RecordingError(
-                f"{source}: {name} reaches {top:.4g}, more than any drive has ({largest:g}): is it in {meant}?"
+                f"{source}: {name} reaches {top:.4g}, above the {largest:g} of any drive: is it in {meant}?"
             )
     step = float(np.median(np.diff(columns["time_s"]))) if columns["time_s"].size > 1 else 0.0
     if step >= LONGEST_STEP_S:
         raise RecordingError(
-            f"{source}: samples are {step:.4g} s apart, too far to follow how a drive accelerates: is time in ms "
-            "(multiply by 1e-3)? else record at 1000 Hz or faster"
+            f"{source}: samples are {step:.4g} s apart, too far for a drive's acceleration: is time in ms "
+            "(multiply by 1e-3)? Otherwise record at 1000 Hz or faster"
         )

@@ -1,4 +1,4 @@
-"""A stored window as a recording, which ``fdhil identify`` and other programs read, in every file format there is."""
+"""Exports a stored window as a recording, for ``fdhil identify`` and other programs, in every recording format."""
 
 import math
 from pathlib import Path
@@ -15,9 +15,9 @@ from fdhil.store.recording_table import FORMAT, SAMPLING, TABLE, VOLTAGE, Record
 def table_of(window: Window) -> RecordingTable:
     """Return a window as a recording; a lost sample is a missing row, which readers see as a gap.
 
-    The samples of a voltage sensor slower than the rows stand in headers, on their own grid and to the last bit; their
-    column holds the sample under way, for programs that know no other. Without a voltage there is no such column, nor
-    without sensors at the table; a row that these did not tell has ``nan`` there.
+    The samples of a voltage sensor slower than the rows are in headers, exactly and on their own grid; their column
+    holds the latest sample, for programs without support for them. Without a voltage or sensors at the table there are
+    no such columns; a lost sample of the latter is ``nan``.
     """
     slow = window.slow_voltage
     voltage = _held(window, slow) if slow is not None else window.voltage_v
@@ -38,16 +38,16 @@ def table_of(window: Window) -> RecordingTable:
 
 def _headers(window: Window) -> dict[str, str]:
     slow, rapid_m_s = window.slow_voltage, window.rapid_speed_rad_s / (2 * math.pi) * window.pitch_mm / 1000
-    deaf = window.voltage_v is None and slow is None
+    has_no_voltage = window.voltage_v is None and slow is None
     headers = {
         "format": FORMAT,
         "sample_rate_hz": f"{1 / window.dt_s:.12g}",
-        SAMPLING: None if deaf else window.voltage_sampling,
+        SAMPLING: None if has_no_voltage else window.voltage_sampling,
         "axis": window.axis,
         "pitch_m_per_rev": f"{window.pitch_mm / 1000:.12g}",
         "rapid_speed_m_per_s": f"{rapid_m_s:.12g}",
         "temperature_C": _number(window.temperature_c),
-        "voltage_delay_s": None if deaf or window.voltage_delay_s is None else repr(window.voltage_delay_s),
+        "voltage_delay_s": None if has_no_voltage or window.voltage_delay_s is None else repr(window.voltage_delay_s),
         "torque_constant_nm_per_a": _number(window.torque_constant_nm_per_a),
         "start_tick": str(window.start_tick),
         "source": window.source or None,
@@ -60,7 +60,7 @@ def _number(value: float | None) -> str | None:
 
 
 def _samples(slow: SlowVoltage) -> dict[str, str]:
-    """Return the headers that hold a slow sensor's samples; times are those of the rows, the first at 0 s."""
+    """Return the headers with a slow sensor's samples; times are relative to the first row."""
     late = {} if slow.late_s is None else {"voltage_late_s": " ".join(map(repr, slow.late_s.tolist()))}
     return late | {
         "voltage_begin_s": repr(slow.begin_s),
@@ -71,10 +71,9 @@ def _samples(slow: SlowVoltage) -> dict[str, str]:
 
 
 def _held(window: Window, slow: SlowVoltage) -> Float:
-    """Return the sample (n,) under way at each row, the nearest known one where there is none."""
     known = np.flatnonzero(np.isfinite(slow.voltage_v))
     if known.size == 0:
-        raise RecordingError("every voltage sample of this window is lost; see why the sensor gave none")
+        raise RecordingError("every voltage sample of this window is lost; check the sensor")
     running = np.floor((np.arange(window.n) * window.dt_s - slow.begin_s) / slow.period_s)
     at = np.searchsorted(known, running, side="right") - 1
     held: Float = slow.voltage_v[known[np.maximum(at, 0)]]
@@ -82,9 +81,9 @@ def _held(window: Window, slow: SlowVoltage) -> Float:
 
 
 def export_table(table: RecordingTable, path: Path, format_name: str = "csv") -> None:
-    """Write a recording in one of ``tables.RECORDING_FORMATS``, whole or not at all.
+    """Write a recording in one of ``tables.RECORDING_FORMATS``, completely or not at all.
 
-    OutputError when it cannot be written, FdhilError where the format's library is not installed.
+    Raises OutputError if it cannot be written, FdhilError if the format's library is not installed.
     """
     content: bytes = tables.load(tables.RECORDING_FORMATS, format_name).encode(table)
     with open_output(path) as file:

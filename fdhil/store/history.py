@@ -1,8 +1,7 @@
-"""The history: revisions of the parameters, analysed windows, skills and notices, in SQLite.
+"""The history database (SQLite): parameter revisions, analysed windows, skills and notices.
 
-Rows are ordered by their running number, never by the wall clock; the time is kept beside it with the boot it belongs
-to. One writer (the daemon), any number of readers. A row that is not what was written is left out and told of, never
-believed (:mod:`fdhil.store.schema`).
+Rows are ordered by their running number, never by the wall clock; the time is stored with the boot it belongs to. One
+writer (the daemon), any number of readers. A damaged row is left out and reported (:mod:`fdhil.store.schema`).
 """
 
 from __future__ import annotations
@@ -27,27 +26,27 @@ from fdhil.store.rows import DECODED, Acknowledgement, Comparison, Revision, Sta
 from fdhil.store.schema import Also, stamp_of, told
 
 FILE_NAME = HISTORY_FILE
-CHECKED = 5_000  # newest rows of a table that are looked at whatever they say: a start must not last longer every year
+CHECKED = 5_000  # newest rows of a table that are always verified: start-up time must not grow with the history
 KEEP_NOTICES = 100_000
-RECENT_NOTICES = 5_000  # the newest that ask to be acknowledged: an older one asks nobody any more
+RECENT_NOTICES = 5_000  # the newest ones to be acknowledged; older ones no longer are
 KEEP_COMPARISONS = 10_000
 KEEP_ACKNOWLEDGEMENTS = 10_000
-Tell = Callable[[str], object]
+Warn = Callable[[str], object]
 
 Begin = Callable[[sqlite3.Connection], None]
-"""Does once what is to be done in a file that was opened."""
+"""Prepares a newly opened file."""
 
 
 class History:
-    """The history of one store directory. Every method raises StoreError when the database refuses."""
+    """The history of one store directory. Every method raises StoreError if the database refuses."""
 
     def __init__(
-        self, db: sqlite3.Connection, path: Path, version: int, tell: Tell | None = None, also: Also | None = None
+        self, db: sqlite3.Connection, path: Path, version: int, warn: Warn | None = None, also: Also | None = None
     ) -> None:
         self._db = db
         self._path = path
         self.version = version
-        self._tell = tell
+        self._warn = warn
         self._damaged: dict[tuple[str, int], dict[str, Any]] = {}
         self._also = also
         self._wal = path.with_name(path.name + "-wal")
@@ -61,7 +60,7 @@ class History:
             try:
                 make_folder(directory)
             except OSError as error:
-                text = f"{directory} cannot be made: {error.strerror}; check [store] directory"
+                text = f"{directory} cannot be created: {error.strerror}; check [store] directory"
                 raise StoreError(text, "ReadOnlyStore") from None
             db = sqlite3.connect(path, timeout=5.0, isolation_level=None, check_same_thread=False)
             try:
@@ -77,40 +76,40 @@ class History:
         return cls(db, path, schema.SCHEMA_VERSION, also=also)
 
     @classmethod
-    def read(cls, directory: Path, tell: Tell | None = None, checked: set[tuple[int, int]] | None = None) -> History:
-        """Open for reading only, also from a read-only disk. StoreError when there is none or it is unusable.
+    def read(cls, directory: Path, warn: Warn | None = None, checked: set[tuple[int, int]] | None = None) -> History:
+        """Open for reading only, also from a read-only disk. Raises StoreError if there is none or it is unusable.
 
-        ``tell`` hears, when it is closed, of the rows that were damaged and left out. Who opens it again and again
-        keeps in ``checked`` which files were whole (device and inode): of those each row that is read tells its damage.
+        ``warn`` receives the damaged rows that were left out, at close. A caller that reopens it often keeps in
+        ``checked`` the files whose structure was intact (device and inode); rows are still verified one by one.
         """
         path = directory / FILE_NAME
         db, version = schema.open_to_read(path, checked)
-        return cls(db, path, version, tell)
+        return cls(db, path, version, warn)
 
     def checkpoint(self) -> None:
-        """Bring what was written from the log into the file, whose state is noted; what cannot be stays in the log."""
+        """Move the write-ahead log into the file as far as possible, and note the file's state."""
         with suppress(sqlite3.Error):
             self._db.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
         self._stamp = self._stamp[:2] + stamp_of(self._path)[2:]
 
     def is_in_place(self) -> bool:
-        """Whether the file of that name is the one that was opened, and nobody else has written to it."""
+        """Return whether the file of that name is the opened one, and no other process has written to it."""
         return self._stamp == stamp_of(self._path)
 
     def abandon(self) -> None:
-        """Close a file that has lost its name or its content; its log must not become that of another file."""
+        """Close a file that was replaced or changed; its log must not become that of another file."""
         with suppress(sqlite3.Error):
             self._db.close()
-        if self._log and stamp_of(self._wal)[:2] == self._log:  # others were reading
+        if self._log and stamp_of(self._wal)[:2] == self._log:  # another process was reading
             for log in (self._wal, self._wal.with_name(f"{self._path.name}-shm")):
                 log.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Close the database; tell what was left out."""
+        """Close the database; report the rows that were left out."""
         self._db.close()
-        if self._damaged and self._tell is not None:
+        if self._damaged and self._warn is not None:
             places = schema.named(self._damaged)
-            self._tell(f"{self._path}: {places} damaged and left out; start the daemon, which puts them aside")
+            self._warn(f"{self._path}: {places} damaged and left out; start the daemon, which quarantines them")
             self._damaged.clear()
 
     def __enter__(self) -> History:
@@ -127,17 +126,17 @@ class History:
     def _read(
         self, table: str, only: Mapping[str, Any], limit: int | None = None, *, oldest: bool = False
     ) -> list[Any]:
-        """Return what the newest rows (or the ``oldest``) hold, oldest first; damaged ones are noted and left out.
+        """Return the records of the newest (or ``oldest``) rows, oldest first; damaged rows are noted and left out.
 
-        ``only`` is compared after a row was checked, so that damage of the very value compared is seen too; of the rows
-        before the newest ``CHECKED`` the database hands over those alone that say to be such ones.
+        ``only`` is compared after a row was verified, so that damage of the compared value is seen too; before the
+        newest ``CHECKED`` rows the database itself selects the matching ones.
         """
         rows = self._rows(table, only, oldest=oldest)
         found = list(islice((it for row in rows if (it := self._believed(table, row, only)) is not None), limit))
         return found if oldest else found[::-1]
 
     def _rows(self, table: str, only: Mapping[str, Any], *, oldest: bool = False) -> Iterator[dict[str, Any]]:
-        """Yield rows as they are, one at a time: the newest ``CHECKED``, and of those before them that match."""
+        """Yield rows one at a time: the newest ``CHECKED``, and matching ones before them."""
         newest = f"id > (SELECT max(id) - {CHECKED} FROM {table})"
         match = " AND ".join(f"{name} = :{name}" for name in only) or "1"
         query = f"SELECT * FROM {table} WHERE {newest} OR ({match}) ORDER BY id{'' if oldest else ' DESC'}"
@@ -146,7 +145,6 @@ class History:
             yield from map(dict, cursor.execute(query, only))
 
     def _believed(self, table: str, row: dict[str, Any], only: Mapping[str, Any] = MappingProxyType({})) -> Any | None:
-        """Return what a sound row holds, if it is one of ``only``; a damaged one is noted."""
         try:
             if self.version < schema.WITH_DIGESTS or row.get("digest") == schema.digest_of(table, row):
                 return DECODED[table](row) if all(row[name] == value for name, value in only.items()) else None
@@ -156,9 +154,9 @@ class History:
         return None
 
     def put_damaged_aside(self) -> str:
-        """Move damaged rows to the table ``quarantine``, and name them; empty: all are sound.
+        """Move damaged rows to the table ``quarantine``, and return their names; empty if all are sound.
 
-        The newest ``CHECKED`` rows of each table are looked at; one before them is seen, and left out, when it is read.
+        Only the newest ``CHECKED`` rows of each table are examined; older damage is detected when the row is read.
         """
         for table in schema.TABLES:
             for row in islice(self._rows(table, {}), CHECKED):
@@ -171,7 +169,7 @@ class History:
         return places
 
     def add_window(self, outcome: WindowOutcome, file: str, stamp: Stamp) -> int:
-        """Store an analysed window and return its number; ``file`` is its Parquet file's name, empty when not kept."""
+        """Store an analysed window and return its number; ``file`` is its Parquet file's name, empty if not stored."""
         window, estimate, verdict = outcome.window, outcome.estimate, outcome.verdict
         row = {
             "axis": window.axis,
@@ -212,7 +210,6 @@ class History:
         return self._insert("revisions", row, stamp)
 
     def add_loops(self, found: LoopEstimate, stamp: Stamp) -> int:
-        """Store what rapids showed of the drive's own loops."""
         verdict = found.verdict
         row = {
             "axis": found.axis,
@@ -227,16 +224,15 @@ class History:
         return self._insert("loops", row, stamp)
 
     def loops(self, axis: str | None = None, limit: int | None = None) -> list[tuple[Stamp, LoopEstimate]]:
-        """Return what was found of the drives' own loops, oldest first."""
+        """Return the identified regulators of the drives, oldest first."""
         return [] if self.version < schema.WITH_TERMS else self._read("loops", _of(axis), limit)
 
     def add_skill(self, skill: Skill, stamp: Stamp) -> int:
-        """Store how well a move was predicted."""
         names = ("axis", "tick", "rms_um", "max_um", "delay_ms", "measured_rms_um")
         return self._insert("skills", {name: getattr(skill, name) for name in names}, stamp)
 
     def add_notice(self, notice: Notice, stamp: Stamp) -> int:
-        """Store a notice; the oldest beyond ``KEEP_NOTICES`` go."""
+        """Store a notice; notices beyond the newest ``KEEP_NOTICES`` are deleted."""
         names = ("axis", "code", "severity", "text", "tick")
         number = self._insert("notices", {name: getattr(notice, name) for name in names}, stamp)
         if number % 1000 == 0:
@@ -245,7 +241,7 @@ class History:
         return number
 
     def add_acknowledgement(self, given: Acknowledgement) -> int:
-        """Store who has acknowledged which notices; the oldest beyond ``KEEP_ACKNOWLEDGEMENTS`` go."""
+        """Store an acknowledgement; those beyond the newest ``KEEP_ACKNOWLEDGEMENTS`` are deleted."""
         row = {"notices": json.dumps(given.notices), "who": given.who, "note": given.note}
         number = self._insert("acknowledgements", row, given.stamp)
         with told(self._path):
@@ -253,7 +249,7 @@ class History:
         return number
 
     def add_comparison(self, found: Comparison, stamp: Stamp) -> int:
-        """Store what was predicted of a program; the oldest beyond ``KEEP_COMPARISONS`` go."""
+        """Store the prediction of a program; those beyond the newest ``KEEP_COMPARISONS`` are deleted."""
         used = {
             axis: {"revision": u.revision, **u.parameters.as_dict(), **dict(u.parameters.terms)}
             for axis, u in found.used.items()
@@ -272,17 +268,17 @@ class History:
         return number
 
     def comparisons(self, program: str, limit: int) -> list[tuple[Stamp, Comparison]]:
-        """Return what was predicted of a program (its digest), newest first."""
+        """Return the predictions of a program (by its digest), newest first."""
         if self.version < schema.WITH_COMPARISONS:
-            return []  # a reader does not bring an older store up
+            return []  # a reader does not upgrade an older store
         return self._read("comparisons", {"program": program}, limit)[::-1]
 
     def revisions(self, axis: str | None = None, limit: int | None = None) -> list[Revision]:
-        """Return the published parameter sets, oldest first; with ``limit`` the newest so many."""
+        """Return the published parameter sets, oldest first; with ``limit`` only the newest."""
         return self._read("revisions", _of(axis), limit)
 
     def first_windows(self, axis: str) -> dict[int, StoredWindow]:
-        """Return the first window of an axis that was ever accepted in either direction, by direction."""
+        """Return the first accepted window of an axis in each direction, by direction."""
         found = {}
         for direction in (1, -1):
             only = {"axis": axis, "direction": direction, "accepted": 1}
@@ -292,15 +288,15 @@ class History:
         return found
 
     def first_revision(self, axis: str) -> Revision | None:
-        """Return the first parameter set that was ever published of an axis."""
+        """Return the first published parameter set of an axis."""
         return next(iter(self._read("revisions", {"axis": axis}, 1, oldest=True)), None)
 
     def windows(self, axis: str | None = None, limit: int | None = None) -> list[StoredWindow]:
-        """Return the analysed windows, oldest first; with ``limit`` the newest so many."""
+        """Return the analysed windows, oldest first; with ``limit`` only the newest."""
         return self._read("windows", _of(axis), limit)
 
     def chosen_windows(self, condition: str, values: Mapping[str, Any], limit: int) -> list[StoredWindow]:
-        """Return the first ``limit`` sound windows that an SQL condition, order included, chooses."""
+        """Return the first ``limit`` sound windows that match an SQL condition, in its order."""
         return self._chosen("windows", condition, values, limit)
 
     def _chosen(self, table: str, condition: str, values: Mapping[str, Any], limit: int | None) -> list[Any]:
@@ -310,18 +306,18 @@ class History:
             return list(islice((it for row in rows if (it := self._believed(table, row)) is not None), limit))
 
     def figures(self, query: str, values: Mapping[str, Any] | Sequence[Any]) -> list[tuple[Any, ...]]:
-        """Return what an SQL query counts; it is a figure for people, and damaged rows are in it."""
+        """Return the counts of an SQL query; they are informative only and include damaged rows."""
         with told(self._path):
             return self._db.execute(query, values).fetchall()
 
     def skills(self, axis: str | None = None, limit: int | None = None) -> list[Skill]:
-        """Return the skills of recorded moves, oldest first."""
         return self._read("skills", _of(axis), limit)
 
     def notices(self, limit: int | None = None) -> list[StoredNotice]:
         """Return the notices, each with its newest acknowledgement, oldest first.
 
-        With ``limit`` the newest so many that ask to be acknowledged, and as many others: mere news displaces none.
+        With ``limit`` the newest ones that require acknowledgement, and as many others, so that information displaces
+        none.
         """
         kinds = (f"severity {kind} 'info' ORDER BY id DESC" for kind in ("IS NOT", "IS"))
         found: list[StoredNotice] = [each for kind in kinds for each in self._chosen("notices", kind, {}, limit)]
@@ -330,16 +326,15 @@ class History:
         return [replace(notice, acknowledged=given.get(notice.number)) for notice in found]
 
     def acknowledgements(self, limit: int | None = None) -> list[Acknowledgement]:
-        """Return who has acknowledged what, oldest first."""
         return [] if self.version < schema.WITH_ACKNOWLEDGEMENTS else self._read("acknowledgements", {}, limit)
 
     def counts(self, axis: str) -> tuple[int, int]:
-        """Return how many windows of an axis were accepted and refused; a figure for people, damaged rows are in it."""
+        """Return the counts of accepted and refused windows of an axis; informative only, damaged rows included."""
         found = dict(self.figures("SELECT accepted, count(*) FROM windows WHERE axis = ? GROUP BY accepted", (axis,)))
         return found.get(1, 0), found.get(0, 0)
 
     def newest_rows(self) -> tuple[int, ...]:
-        """Return the number of each table's newest row: as long as they are the same, nothing was added."""
+        """Return the number of each table's newest row: while they are unchanged, nothing was added."""
         acknowledged = ("acknowledgements",) if self.version >= schema.WITH_ACKNOWLEDGEMENTS else ()
         tables = ("windows", "revisions", "notices", *acknowledged)
         with told(self._path):
@@ -347,7 +342,7 @@ class History:
             return tuple(number or 0 for number in found)
 
     def last_window_number(self) -> int:
-        """Return the largest number a stored window file may have had, 0 when there was none."""
+        """Return the largest number that a stored window file may have had, 0 without one."""
         with told(self._path):
             row = self._db.execute("SELECT file FROM windows WHERE file != '' ORDER BY id DESC LIMIT 1").fetchone()
         digits = "".join(c for c in str(row[0]).partition("-")[0] if c in "0123456789") if row else ""
@@ -363,31 +358,30 @@ def _dumped(reasons: Sequence[Reason]) -> str:
 
 
 def _told(outcome: WindowOutcome) -> str | None:
-    """Return what an accepted window tells a pool, as its row has it."""
     if not outcome.verdict.accepted or outcome.estimate is None:
         return None
-    told = member(outcome.window, outcome.estimate)
-    arrays = {"values": told.values.tolist(), "own": told.own.tolist(), "shared": told.shared.tolist()}
-    return json.dumps({"names": told.names, **arrays})
+    entry = member(outcome.window, outcome.estimate)
+    arrays = {"values": entry.values.tolist(), "own": entry.own.tolist(), "shared": entry.shared.tolist()}
+    return json.dumps({"names": entry.names, **arrays})
 
 
 def friction_of(outcome: WindowOutcome) -> dict[str, float] | None:
-    """Return a window's friction torque at the rapid speed as JSON has it; None where it is not known."""
+    """Return a window's friction torque at the rapid speed for JSON; None if unknown."""
     speed = outcome.window.rapid_speed_rad_s
     known = friction_at(outcome.estimate, speed) if outcome.estimate is not None else None
     return None if known is None else {"value": known[0], "std": known[1], "speed_rad_s": speed}
 
 
 def described(outcome: WindowOutcome) -> dict[str, dict[str, Any]]:
-    """Return a window's parameters as JSON has them: value and std, or null and the reason."""
+    """Return a window's parameters for JSON: value and std, or null and the reason."""
     estimate = outcome.estimate
     if estimate is None:
         return {}
-    told: dict[str, dict[str, Any]] = {}
+    document: dict[str, dict[str, Any]] = {}
     for name in estimate.names:
         value, std = estimate.value(name), estimate.std(name)
         if math.isfinite(value):
-            told[name] = {"value": value, "std": std if math.isfinite(std) else None}
+            document[name] = {"value": value, "std": std if math.isfinite(std) else None}
         else:
-            told[name] = {"value": None, "reason": str(estimate.missing.get(name, estimate.result.value))}
-    return told
+            document[name] = {"value": None, "reason": str(estimate.missing.get(name, estimate.result.value))}
+    return document

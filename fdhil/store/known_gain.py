@@ -1,4 +1,4 @@
-"""What a correction is predicted to gain, with the uncertainty that the history knows."""
+"""Predicts the gain of a correction, with the uncertainty recorded in the history."""
 
 from collections.abc import Mapping
 
@@ -19,7 +19,7 @@ def known_gain(
 ) -> Gain:
     """Return the predicted gain; ``from_history`` uses the newest parameters' covariance and skill. StoreError.
 
-    ``held_out_um`` is what models that come from elsewhere leave of moves that they were not identified on.
+    ``held_out_um`` is the error of externally given models in moves that they were not identified on.
     """
     if not from_history:
         return gain(planned, models, config, {}, held_out_um or {})
@@ -30,6 +30,5 @@ def known_gain(
 
 
 def recent_skills(config: MachineConfig) -> dict[str, list[Skill]]:
-    """Return the skills of each axis' last moves. StoreError."""
     with History.read(config.store.directory) as history:
         return {axis: history.skills(axis, limit=RECENT_MOVES) for axis in config.axis}

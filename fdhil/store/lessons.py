@@ -1,4 +1,4 @@
-"""Keeps what the passes of a program have taught: one file for each program and configuration."""
+"""Stores learned offsets (iterative learning control): one file for each program and configuration."""
 
 import io
 import zipfile
@@ -11,49 +11,49 @@ from fdhil.store.atomic import keep_newest, make_folder, store_error, write_file
 from fdhil.store.recording_table import UNREADABLE
 
 SCHEMA = "fdhil-lesson-1"
-MOST_PROGRAMS = 50  # the oldest lessons go
+MOST_PROGRAMS = 50  # the oldest files are removed
 MOST_PASSES = 200  # of a curve
 
 
 def lesson_path(folder: Path, program_digest: str, config_digest: str) -> Path:
-    """Return where the lesson of a program on this very machine is."""
+    """Return the file of a program's learned offsets on this machine."""
     return folder / f"{program_digest[:32]}-{config_digest}.npz"
 
 
 def kept_lessons(folder: Path, config_digest: str) -> list[tuple[float, str, Lesson]]:
-    """Return the lessons for one configuration, newest first, each with when it was written (s since 1970) and of what.
+    """Return the learned offsets for one configuration, newest first, each with its time (Unix, s) and program.
 
-    A program is told by the first 32 digits of its digest. What cannot be read is left out.
+    The program is given by the first 32 digits of its digest. Unreadable files are left out.
     """
     found = []
     for path in folder.glob(f"*-{config_digest}.npz"):
         try:
             written_s = path.stat().st_mtime
-        except FileNotFoundError:  # the daemon let it go meanwhile
+        except FileNotFoundError:  # the daemon removed it in the meantime
             continue
-        lesson = read_lesson(path)
-        if lesson is not None:
-            found.append((written_s, path.name.partition("-")[0], lesson))
-    return sorted(found, key=lambda kept: -kept[0])
+        learned = read_lesson(path)
+        if learned is not None:
+            found.append((written_s, path.name.partition("-")[0], learned))
+    return sorted(found, key=lambda entry: -entry[0])
 
 
 def read_lesson(path: Path) -> Lesson | None:
-    """Return the lesson; None where there is none, or what is there cannot be one: it is learned anew."""
+    """Return the learned offsets; None if there are none or the file is invalid: learning then starts again."""
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as found:
             if str(found["schema"]) != SCHEMA:
                 return None
             offsets = {str(axis): np.asarray(found[f"offset_{axis}_um"], np.float64) for axis in found["axes"]}
             curve = tuple(float(value) for value in found["curve_um"])
-            lesson = Lesson(offsets, float(found["without_um"]), float(found["gain"]), curve)
+            learned = Lesson(offsets, float(found["without_um"]), float(found["gain"]), curve)
     except (zipfile.BadZipFile, *UNREADABLE):
         return None
     finite = all(u.ndim == 1 and np.isfinite(u).all() for u in offsets.values())
-    return lesson if offsets and finite and np.isfinite([lesson.without_um, lesson.gain]).all() else None
+    return learned if offsets and finite and np.isfinite([learned.without_um, learned.gain]).all() else None
 
 
 def write_lesson(path: Path, lesson: Lesson) -> None:
-    """Make a lesson durable; the oldest of other programs go. StoreError when it cannot be written."""
+    """Store learned offsets durably; the oldest of other programs are removed. Raises StoreError."""
     content = io.BytesIO()
     np.savez_compressed(
         content,

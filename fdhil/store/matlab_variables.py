@@ -1,4 +1,4 @@
-"""Variables of MATLAB as columns, under the names that MATLAB gives them: ``meas.t``, ``data(:,2)``, ``s(3).t``."""
+"""Converts MATLAB variables to columns, under their MATLAB names: ``meas.t``, ``data(:,2)``, ``s(3).t``."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -12,15 +12,15 @@ from fdhil.store.recording_table import RecordingTable, check_size
 
 MOST_COLUMNS = 1000
 MOST_DEPTH = 8
-NO_NUMBERS = "is no vector of real numbers: save it as one, of type double"
+NO_NUMBERS = "is not a vector of real numbers: save it as one, of type double"
 OBJECT = "is an object that only MATLAB can read (timeseries, table, Dataset): save it as a structure or an array"
 
 
 def matlab_table(variables: Mapping[str, Any], headers: Mapping[str, str], source: str) -> RecordingTable:
-    """Return the vectors within variables: scalar structures as mappings, cells and arrays of structures as lists.
+    """Return the vectors within variables: scalar structures as mappings, cells and structure arrays as lists.
 
-    A field has also its last name alone, and a signal of a Simulink scope its label, where no other has it. The one
-    ``time`` of a scope is ``time_s`` too.
+    A field can also be named by its last part alone, and a signal of a Simulink scope by its label, if they are unique.
+    The only ``time`` of a scope is also ``time_s``.
     """
     columns: dict[str, Float] = {}
     doubts: dict[str, str] = {}
@@ -28,7 +28,7 @@ def matlab_table(variables: Mapping[str, Any], headers: Mapping[str, str], sourc
     for name, alias, value in _leaves("", "", variables, 0):
         if len(columns) + len(doubts) > MOST_COLUMNS:
             raise RecordingError(
-                f"{source} has more than {MOST_COLUMNS} variables, which no recording has: save a part"
+                f"{source} has more than {MOST_COLUMNS} variables, too many for a recording: save a part"
             )
         if isinstance(value, np.ndarray):
             columns[name] = value
@@ -53,7 +53,7 @@ def matlab_table(variables: Mapping[str, Any], headers: Mapping[str, str], sourc
 
 
 def texts(headers: Any) -> dict[str, str]:
-    """Return the texts and numbers of a structure; of any other value nothing."""
+    """Return the texts and numbers of a structure; nothing for any other value."""
     if not isinstance(headers, dict):
         return {}
     numbers = {key: repr(v.item()) for key, v in headers.items() if isinstance(v, np.ndarray) and v.size == 1}
@@ -61,7 +61,7 @@ def texts(headers: Any) -> dict[str, str]:
 
 
 def _leaves(name: str, alias: str, value: Any, depth: int) -> Iterator[tuple[str, str, Float | str]]:
-    """Yield name, short name, and the vector or why there is none."""
+    """Yield name, short name, and the vector or the reason why there is none."""
     if depth > MOST_DEPTH:
         return
     if isinstance(value, Mapping):
@@ -79,7 +79,6 @@ def _leaves(name: str, alias: str, value: Any, depth: int) -> Iterator[tuple[str
 
 
 def _vectors(name: str, alias: str, values: np.ndarray[Any, Any]) -> Iterator[tuple[str, str, Float | str]]:
-    """Yield a vector, or the longer ones of a matrix; a scope has those of a signal that is a vector in the third."""
     values = values.squeeze() if values.ndim > 2 else values
     if values.size == max(values.shape, default=1):
         if values.size > 1:

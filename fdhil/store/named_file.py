@@ -1,4 +1,4 @@
-"""Opens a file by a name that came from outside: never anything but a regular file of that one folder."""
+"""Opens a file by a name from outside: only a regular file of one given folder."""
 
 import errno
 import os
@@ -10,23 +10,23 @@ from pathlib import Path
 
 from fdhil.errors import StoreError
 
-_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}")  # what begins with a dot is being written
-_NEXT = "take a name from the list"
+_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,63}")  # files being written begin with a dot
+_NEXT = "use a name from the list"
 
 
 def open_named(folder: Path, name: str) -> BufferedReader:
     """Open the regular file ``name`` of ``folder`` for reading.
 
-    A path, a link, a device or a pipe is StoreError BadName, before anything of it is read; NotKept when there is no
-    such file (any more), StoreFault when it cannot be read. Whoever puts a link in its place meanwhile gains nothing:
-    the folder is held open, and what was opened is asked what it is.
+    A path, link, device or pipe raises StoreError BadName before any of it is read; NotKept if there is no such file
+    (any more), StoreFault if it cannot be read. The folder is held open and the opened file is examined, so that
+    replacing it by a link in between has no effect.
     """
     if not _NAME.fullmatch(name):
-        raise _bad(f"{name[:80]!a} is no name of a file of fdhil")
+        raise _bad(f"{name[:80]!a} is not a file name of fdhil")
     try:
         held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
-            # without O_NONBLOCK a pipe would keep whoever opens it waiting
+            # without O_NONBLOCK opening a pipe would block
             descriptor = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, dir_fd=held)
         finally:
             os.close(held)
@@ -35,7 +35,7 @@ def open_named(folder: Path, name: str) -> BufferedReader:
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         with suppress(OSError):
             os.close(descriptor)
-        raise _bad(f"{name} is no regular file")
+        raise _bad(f"{name} is not a regular file")
     return os.fdopen(descriptor, "rb")
 
 
@@ -45,8 +45,8 @@ def _bad(what: str) -> StoreError:
 
 def _refused(name: str, error: OSError) -> StoreError:
     if error.errno in (errno.ENOENT, errno.ENOTDIR):
-        text = f"{name} is not kept (any more): the newest recordings push the oldest out"
+        text = f"{name} is not stored (any more): the newest recordings displace the oldest"
         return StoreError(f"{text}; raise keep_windows in [store] to keep more", "NotKept")
     if error.errno in (errno.ELOOP, errno.ENXIO):  # a link; a socket
-        return _bad(f"{name} is no regular file")
-    return StoreError(f"{name} cannot be read: {error.strerror}; check the rights of the store")
+        return _bad(f"{name} is not a regular file")
+    return StoreError(f"{name} cannot be read: {error.strerror}; check the permissions of the store")

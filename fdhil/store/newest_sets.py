@@ -1,4 +1,4 @@
-"""Finds the newest published parameter set of each axis, and the loops that the drive's newest rapids show."""
+"""Finds the newest published parameter set of each axis, and its newest identified regulators."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -11,15 +11,15 @@ from fdhil.store.rows import Revision
 
 
 def read_newest_sets(
-    store_directory: Path, axes: Iterable[str], tell: Callable[[str], object] | None = None
+    store_directory: Path, axes: Iterable[str], warn: Callable[[str], object] | None = None
 ) -> dict[str, Revision]:
-    """Return the newest published parameter set of each axis; empty when nothing was recorded yet.
+    """Return the newest published parameter set of each axis; empty if nothing was recorded yet.
 
-    ``tell`` receives which rows are damaged. StoreError when a history exists but cannot be read.
+    ``warn`` receives the damaged rows. Raises StoreError if a history exists but cannot be read.
     """
     if not (store_directory / FILE_NAME).is_file():
         return {}
-    with History.read(store_directory, tell) as history:
+    with History.read(store_directory, warn) as history:
         return newest_sets(history, axes)
 
 
@@ -30,7 +30,7 @@ def newest_sets(history: History, axes: Iterable[str]) -> dict[str, Revision]:
 
 
 def _with_newest_loops(revision: Revision, history: History) -> Revision:
-    """Return a set with loops that were identified after it, or whose use was not recorded with it."""
+    """Add regulators that were identified after the set, or whose use was not recorded with it."""
     loops = history.loops(revision.set.axis, limit=1)
     if not loops or not loops[0][1].verdict.accepted:
         return revision
@@ -41,9 +41,10 @@ def _with_newest_loops(revision: Revision, history: History) -> Revision:
 
 
 def newest_loops(history: History, axis: str, config_digest: str) -> LoopEstimate | None:
-    """Return the newest loops of an axis as far as they were found with this configuration.
+    """Return the newest regulators of an axis if they were identified with this configuration.
 
-    It may have been tuned with the drive. Loops that no set was published with since then are of an earlier one.
+    The configuration may have been tuned with the drive. Regulators without a set published since then belong to an
+    earlier configuration.
     """
     newest = next(iter(history.revisions(axis, limit=1)), None)
     loops = history.loops(axis, limit=1)

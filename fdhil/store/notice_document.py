@@ -1,4 +1,4 @@
-"""A stored notice and its acknowledgement as JSON has them."""
+"""Formats a stored notice and its acknowledgement for JSON."""
 
 from datetime import UTC, datetime
 from typing import Any
@@ -7,7 +7,6 @@ from fdhil.store.rows import Acknowledgement, Stamp, StoredNotice
 
 
 def notice_document(stored: StoredNotice) -> dict[str, Any]:
-    """Return a stored notice as JSON has it."""
     notice = stored.notice
     return {
         "number": stored.number,
@@ -21,10 +20,10 @@ def notice_document(stored: StoredNotice) -> dict[str, Any]:
 
 
 def acknowledgement_document(given: Acknowledgement | None) -> dict[str, Any] | None:
-    """Return who acknowledged a notice, when, and what was remarked, as JSON has it; None where nobody did."""
+    """Return a notice's acknowledgement (who, when, note) for JSON; None without one."""
     return None if given is None else {"who": given.who, "time": date_of(given.stamp), "note": given.note}
 
 
 def date_of(stamp: Stamp) -> str:
-    """Return when a row was stored, in UTC as ISO 8601 has it."""
+    """Return when a row was stored, in UTC by ISO 8601."""
     return datetime.fromtimestamp(stamp.wall_s, UTC).isoformat(timespec="seconds")

@@ -1,8 +1,8 @@
-"""Which offers of a works lie here to be looked at, and what was answered to each so far.
+"""Tracks the configuration changes that were offered to this machine, and the decisions on them.
 
-The offers are in a folder that ``fdhil uplink`` writes, one file each, ``NAME-VERSION.offer``; what stands in them is
-looked at elsewhere. The answers are one file of the store, which the operator's own command alone writes: they say
-which version of each offer was accepted last, so that an older one is known.
+``fdhil uplink`` writes the offers into a folder, one file each, ``NAME-VERSION.offer``; other modules read their
+content. The decisions are in one file of the store, written only by the operator's own command: it records which
+version of each offer was accepted last, so that older versions are recognised.
 """
 
 import json
@@ -24,7 +24,7 @@ _FILE = re.compile(rf"({NAME})-([1-9][0-9]{{0,8}})\.offer")
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What was answered to an offer, by whom and when; ``config_digest``: of the configuration after it."""
+    """The decision on an offer, by whom and when; ``config_digest`` is that of the configuration after it."""
 
     name: str
     version: int
@@ -38,26 +38,24 @@ class Answer:
 
 
 def read_answers(store: Path) -> list[Answer]:
-    """Return all answers, oldest first; StoreError where there is a file that cannot be read: nothing is known then."""
+    """Return all decisions, oldest first. Raises StoreError if the file cannot be read."""
     path = store / ANSWERS_FILE
     try:
         with path.open("rb") as file:
-            told = json.loads(file.read(LARGEST_ANSWERS))
-        if told["schema"] != SCHEMA:
+            document = json.loads(file.read(LARGEST_ANSWERS))
+        if document["schema"] != SCHEMA:
             raise ValueError
-        return [_answer(each) for each in told["answers"]]
+        return [_answer(each) for each in document["answers"]]
     except FileNotFoundError:
         return []
     except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
         cause = (isinstance(error, OSError) and error.strerror) or "it is damaged"
-        text = (
-            f"{path} cannot be read ({cause}), so that an older offer would not be known; bring it back, or remove it"
-        )
+        text = f"{path} cannot be read ({cause}): older offers cannot be recognised; restore or remove it"
         raise StoreError(text) from None
 
 
-def _answer(told: dict[str, Any]) -> Answer:
-    answer = Answer(**told)
+def _answer(document: dict[str, Any]) -> Answer:
+    answer = Answer(**document)
     numbers = type(answer.version) is int and type(answer.stage) is int and isinstance(answer.at_s, float)
     texts = (answer.name, answer.document, answer.by, answer.reason, answer.config_digest)
     if not numbers or not all(isinstance(text, str) for text in texts) or answer.answer not in ("accepted", "rejected"):
@@ -66,38 +64,37 @@ def _answer(told: dict[str, Any]) -> Answer:
 
 
 def add_answer(store: Path, answer: Answer) -> None:
-    """Note an answer, on the disk when it returns; StoreError."""
+    """Record a decision durably. Raises StoreError."""
     answers = [asdict(each) for each in (*read_answers(store), answer)]
     try:
         make_folder(store)
     except OSError as error:
         raise store_error(store, error) from None
     content = json.dumps({"schema": SCHEMA, "answers": answers}).encode()
-    if len(content) > LARGEST_ANSWERS:  # more would not be read again
-        raise StoreError(f"{store / ANSWERS_FILE} has no room for another answer; it was not noted")
+    if len(content) > LARGEST_ANSWERS:  # a larger file would not be read
+        raise StoreError(f"{store / ANSWERS_FILE} has no room for another decision; it was not recorded")
     write_file(store / ANSWERS_FILE, content)
 
 
 def newest_accepted(answers: Sequence[Answer], name: str) -> int:
-    """Return the newest version of an offer that was accepted; 0: none."""
+    """Return the newest accepted version of an offer; 0: none."""
     return max((each.version for each in answers if each.name == name and each.answer == "accepted"), default=0)
 
 
 def file_name(name: str, version: int) -> str:
-    """Return the name of an offer's file."""
     return f"{name}-{version}.offer"
 
 
 def lying(folder: Path) -> dict[Path, tuple[str, int]]:
-    """Return the offers that lie in a folder, name and version of each; none where it cannot be read."""
+    """Return the offers in a folder with name and version; none if it cannot be read."""
     try:
         found = {path: _FILE.fullmatch(path.name) for path in sorted(folder.iterdir())}
     except OSError:
         return {}
-    return {path: (told[1], int(told[2])) for path, told in found.items() if told}
+    return {path: (match[1], int(match[2])) for path, match in found.items() if match}
 
 
 def waiting(folder: Path, store: Path) -> list[str]:
-    """Return the names of the offers that lie there and were not answered; StoreError."""
+    """Return the names of the offers without a decision. Raises StoreError."""
     answered = {(each.name, each.version) for each in read_answers(store)}
     return [f"{name} version {version}" for name, version in lying(folder).values() if (name, version) not in answered]

@@ -1,9 +1,9 @@
-"""The outbox: which rows of the history a works is to be told, in the order in which they were written.
+"""The outbox: the rows of the history that are to be sent to the fleet server, in the order of writing.
 
-An entry is written in the transaction of its row, so that neither is there without the other, and only where the
-configuration has [uplink]; what was recorded before is entered when the daemon first starts with it. Who sends
-(``fdhil uplink``) reads the history and writes its own position beside it; the daemon waits for nobody. An entry goes
-when the position has passed it, or when more than ``keep_unsent`` wait: then the oldest go, and how many is counted.
+An entry is written in the same transaction as its row, and only if the configuration has [uplink]; earlier rows are
+entered when the daemon first starts with it. The sender (``fdhil uplink``) reads the history and writes its own
+position next to it; the daemon never waits. An entry is deleted once it was sent, or when more than ``keep_unsent``
+wait: then the oldest are dropped and counted.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ POSITION_FILE = "position.json"
 LARGEST_POSITION = 4096  # bytes of that file
 PRUNE_EVERY = 1_000  # entries
 PRUNE_AT_MOST = 5_000  # entries at once: a few milliseconds
-# table -> what one of its rows is called where many machines are looked at
+# table -> kind of its rows at the fleet server
 KINDS: Mapping[str, str] = {
     "windows": "window",
     "revisions": "parameters",
@@ -52,7 +52,7 @@ _OF_NO_AXIS = {"acknowledgements": "''"}
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """How far the outbox of ``store`` is sent: the last entry and its message; ``about``: what of the machine."""
+    """How far the outbox of ``store`` is sent: the last entry and its message; ``about``: the machine's description."""
 
     store: str = ""
     entry: int = 0
@@ -60,16 +60,16 @@ class Position:
     about: str = ""
 
     def is_beyond(self, newest: int, store: str) -> bool:
-        """Whether more of a store was sent than it has: it is an older copy, all of which was sent."""
+        """Return whether more was sent than the store has: it is an older copy, all of which was sent."""
         return self.store == store and self.entry > newest
 
 
 def read_position(folder: Path) -> Position:
-    """Return how far the outbox was sent; the beginning where that is not known: all is sent again then."""
+    """Return how far the outbox was sent; the beginning if unknown, so that everything is sent again."""
     try:
         with (folder / POSITION_FILE).open("rb") as file:
-            told = json.loads(file.read(LARGEST_POSITION))
-        position = Position(**told)
+            document = json.loads(file.read(LARGEST_POSITION))
+        position = Position(**document)
     except (OSError, ValueError, TypeError, RecursionError):
         return Position()
     kinds = all(isinstance(getattr(position, name), str) for name in ("store", "message", "about"))
@@ -77,12 +77,11 @@ def read_position(folder: Path) -> Position:
 
 
 def write_position(folder: Path, position: Position) -> None:
-    """Note how far the outbox was sent. StoreError."""
     write_file(folder / POSITION_FILE, json.dumps(asdict(position)).encode())
 
 
 class Outbox:
-    """What the daemon adds to each row of its history (``History.open(directory, also=outbox.enter)``)."""
+    """Adds an outbox entry to each row of the history (``History.open(directory, also=outbox.enter)``)."""
 
     def __init__(self, settings: Uplink, folder: Path) -> None:
         self._settings = settings
@@ -90,7 +89,6 @@ class Outbox:
         self._windows = Counter[str]()
 
     def enter(self, db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
-        """Enter a row that is being written, in its transaction; sqlite3.Error."""
         if table not in KINDS:
             return
         axis = row.get("axis") or ""
@@ -101,7 +99,7 @@ class Outbox:
             self._prune(db, number)
 
     def begin(self, db: sqlite3.Connection) -> None:
-        """Enter what was recorded before there was an [uplink], the newest of it, once; sqlite3.Error.
+        """Add entries once for the newest rows recorded before there was an [uplink]. Raises sqlite3.Error.
 
         An older copy of the history, of which more was sent than it has, gets an identity of its own.
         """
@@ -116,7 +114,7 @@ class Outbox:
             f"{whole if table == 'windows' else 0} AS with_file, {place} AS place, "
             f"max(wall_s) OVER (ORDER BY id) AS at FROM {table} WHERE digest <> ''"
             for place, table in enumerate(KINDS)
-        )  # a clock that was set back turns no table's order round
+        )  # a clock that was set back must not change a table's order
         newest = f"SELECT * FROM ({tables}) ORDER BY at DESC, place DESC, row DESC LIMIT ?"
         db.execute(
             "INSERT INTO outbox (of, row, axis, message, with_file) "
@@ -133,7 +131,7 @@ class Outbox:
         return self._settings.windows == "all" or (self._settings.windows == "refused" and not window["accepted"])
 
     def _prune(self, db: sqlite3.Connection, newest: int) -> None:
-        """Let go what was sent, and the oldest of too many; the last entry that was sent stays, to be known again."""
+        """Delete sent entries and the oldest beyond the limit; the last sent entry stays as a reference."""
         sent = _sent_before(db, read_position(self._folder))
         (oldest,) = db.execute("SELECT min(id) FROM outbox").fetchone()
         until = min(max(sent, newest - self._settings.keep_unsent + 1), oldest + PRUNE_AT_MOST)
@@ -143,7 +141,6 @@ class Outbox:
 
 
 def _sent_before(db: sqlite3.Connection, position: Position) -> int:
-    """Return the entry before which all were sent, 0 where the position is of another file or of an older copy."""
     query = "SELECT 1 FROM outbox, outbox_of WHERE id = ? AND message = ? AND store = ?"
     known = db.execute(query, (position.entry, position.message, position.store)).fetchone()
     return position.entry if known else 0
@@ -151,7 +148,7 @@ def _sent_before(db: sqlite3.Connection, position: Position) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """What is to be sent: ``row`` is what the history has of it, ``left_out`` why there is none."""
+    """An entry to be sent: ``row`` are the history's values, ``left_out`` says why there are none."""
 
     number: int
     kind: str
@@ -166,12 +163,12 @@ class OutboxReader:
     """Reads the outbox of a history that the daemon may be writing; every method raises StoreError."""
 
     def __init__(self, directory: Path, checked: set[tuple[int, int]] | None = None) -> None:
-        """Open the history of a store; ``checked`` as :func:`schema.open_to_read` has it."""
+        """Open the history of a store; ``checked`` as in :func:`schema.open_to_read`."""
         self._path = directory / HISTORY_FILE
         self._db, version = schema.open_to_read(self._path, checked)
         if version < schema.WITH_OUTBOX:
             self._db.close()
-            text = f"{self._path} has no outbox yet: start the daemon of this fdhil, which brings it up to date"
+            text = f"{self._path} has no outbox yet: start the daemon of this version, which upgrades it"
             raise StoreError(text, "SchemaVersion")
         self.store, self.dropped = self._ask("SELECT store, dropped FROM outbox_of", ())[0]
         self._columns: dict[str, list[str]] = {}
@@ -187,14 +184,14 @@ class OutboxReader:
             return self._db.execute(query, values).fetchall()
 
     def start(self, position: Position) -> Position:
-        """Return where to go on: at ``position``, or at the beginning where that is not of this file.
+        """Return where to resume: at ``position``, or at the beginning if it belongs to another file.
 
-        StoreError: the file is an older copy of what was sent.
+        Raises StoreError if the file is an older copy of what was sent.
         """
         newest = self._ask("SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE name = 'outbox'", ())[0][0]
         if position.is_beyond(newest, self.store):
-            text = f"{self._path} is an older copy: {position.entry} records of it were sent, and it has {newest}"
-            raise StoreError(f"{text}; start the daemon again, which gives it an identity of its own", "OlderCopy")
+            text = f"{self._path} is an older copy: {position.entry} records were sent, and it has {newest}"
+            raise StoreError(f"{text}; restart the daemon, which gives it an identity of its own", "OlderCopy")
         query = "SELECT count(*) FROM outbox WHERE id = ? AND message = ?"
         ((known,),) = self._ask(query, (position.entry, position.message))
         if position.store == self.store and known:
@@ -202,11 +199,10 @@ class OutboxReader:
         return Position(self.store, 0, "", position.about)
 
     def waiting(self, after: int) -> int:
-        """Return how many entries wait behind one."""
         return int(self._ask("SELECT count(*) FROM outbox WHERE id > ?", (after,))[0][0])
 
     def entries(self, after: int, limit: int) -> list[Entry]:
-        """Return the next entries behind one, in order."""
+        """Return the next entries after one, in order."""
         query = "SELECT id, of, row, axis, message, with_file FROM outbox WHERE id > ? ORDER BY id LIMIT ?"
         return [self._entry(*row) for row in self._ask(query, (after, limit))]
 

@@ -1,7 +1,7 @@
-"""The file that a command was asked to write: there whole or not at all, and never in place of what is no regular file.
+"""Writes a command's output file: completely or not at all, replacing only regular files.
 
-The null device and what the process has as standard output are written to as they are; the old file is kept where
-writing the new one fails.
+The null device and the process' standard output are written to directly; the old file is kept if writing the new one
+fails.
 """
 
 import contextlib
@@ -24,27 +24,27 @@ _KINDS = (
 
 
 def check_output(path: Path) -> None:
-    """Look whether ``path`` may be written, before the work that it is for; OutputError when it may not."""
+    """Check that ``path`` can be written, before the work is done. Raises OutputError if it cannot."""
     try:
-        told = path.stat()
+        status = path.stat()
     except FileNotFoundError:
         _check_folder(path)
         return
     except (OSError, ValueError) as error:
         raise _not_written(path, error) from None
-    if _is_stream(told):
+    if _is_stream(status):
         return
-    if not stat.S_ISREG(told.st_mode):
-        kind = next((name for is_kind, name in _KINDS if is_kind(told.st_mode)), "no file")
-        raise OutputError(f"{path} is {kind}, which is never replaced, and nothing was written; name a file")
+    if not stat.S_ISREG(status.st_mode):
+        kind = next((name for is_kind, name in _KINDS if is_kind(status.st_mode)), "no file")
+        raise OutputError(f"{path} is {kind}, which is never replaced: nothing was written; name a file")
     if not os.access(path, os.W_OK):
-        raise OutputError(f"{path} may not be written, and it is left as it is; check its rights or name another file")
+        raise OutputError(f"{path} is read-only and was left unchanged; check its permissions or name another file")
     _check_folder(path)
 
 
 @contextlib.contextmanager
 def open_output(path: Path) -> Iterator[IO[bytes]]:
-    """Yield a file to write bytes to, which gets the name ``path`` when all is written. OutputError when it cannot."""
+    """Yield a file for bytes, which gets the name ``path`` when it is complete. Raises OutputError on failure."""
     check_output(path)
     try:
         if path.exists() and _is_stream(path.stat()):
@@ -67,24 +67,22 @@ def open_output(path: Path) -> Iterator[IO[bytes]]:
         raise _not_written(path, error) from None
 
 
-def _is_stream(told: os.stat_result) -> bool:
-    """Whether this is the null device, or what the process writes its answers to."""
-    if stat.S_ISCHR(told.st_mode) and told.st_rdev == Path(os.devnull).stat().st_rdev:
+def _is_stream(status: os.stat_result) -> bool:
+    if stat.S_ISCHR(status.st_mode) and status.st_rdev == Path(os.devnull).stat().st_rdev:
         return True
-    return _descriptor(told) is not None
+    return _descriptor(status) is not None
 
 
-def _descriptor(told: os.stat_result) -> int | None:
-    """Return standard output or standard error where ``told`` is of that very file, pipe or terminal."""
+def _descriptor(status: os.stat_result) -> int | None:
     for descriptor in (1, 2):
         with contextlib.suppress(OSError):
-            if os.path.samestat(told, os.fstat(descriptor)):
+            if os.path.samestat(status, os.fstat(descriptor)):
                 return descriptor
     return None
 
 
 def _open_stream(path: Path) -> IO[bytes]:
-    """Open the null device, or a standard stream where it stands: opened anew, a file behind it would be emptied."""
+    """Open the null device, or a standard stream at its position: reopening would truncate a file behind it."""
     descriptor = _descriptor(path.stat())
     if descriptor is None:
         return path.open("wb")
@@ -95,11 +93,13 @@ def _open_stream(path: Path) -> IO[bytes]:
 def _check_folder(path: Path) -> None:
     folder = path.resolve().parent
     if not folder.is_dir():
-        raise OutputError(f"{path} cannot be written: there is no folder {folder}; make it, or name another file")
+        raise OutputError(
+            f"{path} cannot be written: the folder {folder} does not exist; create it, or name another file"
+        )
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise OutputError(f"{path} cannot be written: the folder {folder} may not be written; name another file")
+        raise OutputError(f"{path} cannot be written: the folder {folder} is read-only; name another file")
 
 
 def _not_written(path: Path, error: OSError | ValueError) -> OutputError:
     reason = getattr(error, "strerror", None) or error
-    return OutputError(f"{path} cannot be written ({reason}), and what was there is kept; name another file")
+    return OutputError(f"{path} cannot be written ({reason}), an existing file is unchanged; name another file")

@@ -1,4 +1,4 @@
-"""The library that reads and writes Parquet files: an extra, which a laboratory can do without."""
+"""Imports the Parquet library, an extra that is not needed in a laboratory."""
 
 from fdhil.errors import FdhilError
 
@@ -8,7 +8,7 @@ try:
     import pyarrow.parquet as pq
 except ImportError:
     raise FdhilError(
-        "Parquet files, in which the rapids of a machine are stored, need the extra 'machine': nothing was started; "
+        "Parquet files, in which a machine's rapids are stored, need the extra 'machine': nothing was started; "
         "pip install 'fdhil[machine]'"
     ) from None
 

@@ -1,7 +1,7 @@
-"""Adds up what the pages of a Parquet file declare to take once read, so that it can be refused before they are.
+"""Sums the declared sizes of a Parquet file's pages, so that an oversized file is refused before it is read.
 
-The library allocates what a page's own header says, whatever the file's footer says: 64 kB can become 2 GB. The header
-is a struct of the Thrift compact protocol; its fields 2 and 3 are the page's size after and before decompression
+The library allocates what a page's own header declares, whatever the file's footer says: 64 kB can become 2 GB. The
+header is a struct of the Thrift compact protocol; its fields 2 and 3 are the page's size after and before decompression
 ([Parquet] PageHeader, [Thrift] compact protocol).
 """
 
@@ -11,7 +11,7 @@ _DEEPEST = 8
 
 
 def uncompressed_bytes(content: bytes, start: int, size: int) -> int:
-    """Return what the pages in ``size`` bytes from ``start`` declare to take; ValueError when they are no pages."""
+    """Return the declared size of the pages in ``size`` bytes from ``start``. ValueError for invalid pages."""
     reader, total, end = _Reader(content, start), 0, start + size
     if start < 0 or end > len(content):
         raise ValueError("a column lies outside of the file")
@@ -28,13 +28,10 @@ def uncompressed_bytes(content: bytes, start: int, size: int) -> int:
 
 
 class _Reader:
-    """A place in bytes of the Thrift compact protocol; ValueError at what is none."""
-
     def __init__(self, content: bytes, at: int) -> None:
         self._content, self.at = content, at
 
     def struct(self, depth: int = 0) -> dict[int, int]:
-        """Pass over a struct and return its integers by their field."""
         if depth > _DEEPEST:
             raise ValueError("a page header is nested too deep")
         found: dict[int, int] = {}
@@ -50,7 +47,7 @@ class _Reader:
 
     def _skip(self, kind: int, depth: int) -> None:
         if kind in (1, 2):
-            return  # a truth value stands in the field's head
+            return  # a boolean is contained in the field's head
         if kind == _BYTE:
             self.at += 1
         elif kind in _INTEGERS:
@@ -62,7 +59,7 @@ class _Reader:
             self.at += length
         elif kind == _STRUCT:
             self.struct(depth + 1)
-        else:  # no page header has lists, sets or maps
+        else:  # page headers have no lists, sets or maps
             raise ValueError(f"a page header holds a field of kind {kind}")
 
     def _byte(self) -> int:

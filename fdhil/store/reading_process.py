@@ -1,8 +1,8 @@
-"""Reads recordings of other programs' formats in a process of its own, which a damaged file may end, hang or fill.
+"""Reads other programs' recording formats in a child process, which a damaged file may crash, block or fill.
 
-The libraries that read them go where a damaged file points, beyond their own memory too: whoever reads a file lives on,
-and is told so in a sentence. ``python -m fdhil.store.reading_process`` has the libraries loaded and forks for each
-file, so that nothing which one file broke is there when the next one is read; it ends when nobody asks any more.
+The format libraries follow offsets in a damaged file, even beyond their own memory: the parent survives and reports an
+error. ``python -m fdhil.store.reading_process`` loads the libraries and forks for each file, so that one file's damage
+does not affect the next; it ends with its parent.
 """
 
 import atexit
@@ -30,33 +30,33 @@ from fdhil.bounded_process import limit_process
 from fdhil.errors import FdhilError, RecordingError
 from fdhil.store.recording_table import RecordingTable, unreadable
 
-LONGEST_S = 120.0  # by the clock; the largest file that is taken at all needs a tenth of it
+LONGEST_S = 120.0  # by the clock; the largest accepted file needs a tenth of it
 MOST_BYTES = 4 << 30
 LONGEST_NAME = 200
 
 
 def most_processor_s(size: int) -> float:
-    """Return how long a file of so many bytes may be read: more than ten times what a slow computer needs."""
+    """Return the processor time for a file of ``size`` bytes: ten times what a slow computer needs."""
     return min(0.8 + 2e-6 * size, LONGEST_S)
 
 
 def most_memory_bytes(size: int) -> int:
-    """Return what reading a file of so many bytes may need; the best that is compressed grows by a factor of 150."""
+    """Return the memory for a file of ``size`` bytes; compression reaches factors of 150."""
     return min((256 << 20) + 256 * size, MOST_BYTES)
 
 
 def read_apart(reader: str, kind: str, content: bytes, source: str) -> RecordingTable:
-    """Return what ``read(content, source)`` of the module ``reader`` does, or raise its FdhilError.
+    """Return the result of ``read(content, source)`` of the module ``reader``, or raise its FdhilError.
 
-    RecordingError where its process did not survive the file, a ``kind`` by its name. The module's ``library`` loads
-    what it reads with.
+    Raises RecordingError if its process did not survive the file, a ``kind`` by its name. The module's ``library``
+    loads what it reads with.
     """
     with _ONE:
         process, answer = _process(source), None
         try:
             answer = process.answer(reader, content, source)
         finally:
-            if answer is None:  # who asks is interrupted: the next file must not get this one's answer
+            if answer is None:  # interrupted: the next file must not get this one's answer
                 process.end()
     if isinstance(answer, FdhilError):
         raise answer
@@ -66,16 +66,16 @@ def read_apart(reader: str, kind: str, content: bytes, source: str) -> Recording
 
 
 class ReadingProcess:
-    """The process that reads, as the one that asks sees it. EOFError, OSError where it cannot be started.
+    """The reading process as seen by its parent. Raises EOFError or OSError if it cannot be started.
 
-    ``ended`` is how the fork that read the last file ended: 0, or by which signal, as a negative number.
+    ``ended`` is the exit code of the fork that read the last file: 0, or a signal as a negative number.
     """
 
     def __init__(self) -> None:
         self.ended = 0
         self._asked, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         command = [sys.executable, "-P", "-m", __name__, str(there.fileno())]
-        # it finds what is found here, and needs no thread for a sum
+        # with this process' import path; its sums need no threads
         given = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OPENBLAS_NUM_THREADS": "1"}
         with contextlib.ExitStack() as failing:
             failing.callback(self._asked.close)
@@ -86,15 +86,15 @@ class ReadingProcess:
                     pass_fds=(there.fileno(),),
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL,  # libraries complain there of what is damaged
-                    start_new_session=True,  # Ctrl-C is for who asks
+                    stderr=subprocess.DEVNULL,  # where libraries report damage
+                    start_new_session=True,  # Ctrl-C is for the parent
                 )
             failing.callback(self.end)
-            self._told()  # it is ready
+            self._told()  # ready
             failing.pop_all()
 
     def answer(self, reader: str, content: bytes, source: str) -> RecordingTable | FdhilError | str:
-        """Return the table, the reader's refusal, or in words what became of the fork that read."""
+        """Return the table, the reader's refusal, or a text about the end of the fork."""
         try:
             answer = self._answer(reader, content, source)
         except (EOFError, OSError, ValueError):
@@ -109,7 +109,7 @@ class ReadingProcess:
             return f"it was not read within {LONGEST_S:g} s"
         if self.ended == -signal.SIGPROF:
             return f"it was not read within {most_processor_s(len(content)):.2g} s of processor time"
-        return "what reads it did not survive it"
+        return "its reader crashed"
 
     def _answer(self, reader: str, content: bytes, source: str) -> RecordingTable | FdhilError:
         here, there = Pipe()
@@ -121,13 +121,13 @@ class ReadingProcess:
             return receive(here)
 
     def _told(self) -> int:
-        told = self._asked.recv(LONGEST_NAME)
-        if not told:
+        exit_code = self._asked.recv(LONGEST_NAME)
+        if not exit_code:
             raise EOFError
-        return int(told)
+        return int(exit_code)
 
     def end(self) -> int:
-        """End it and its fork; return how it ended."""
+        """End the process and its fork; return the exit code."""
         self._asked.close()
         if self.child.poll() is None:
             os.killpg(self.child.pid, signal.SIGKILL)
@@ -135,19 +135,18 @@ class ReadingProcess:
 
 
 _ONE = Lock()
-_PROCESSES: dict[int, ReadingProcess] = {}  # by who asks: a process that was forked has none of its parent's
+_PROCESSES: dict[int, ReadingProcess] = {}  # by process ID: a fork has none of its parent's
 
 
 def _process(source: str) -> ReadingProcess:
-    """Return the process that reads for this one; it is begun with the first file and ends with this one."""
     process = _PROCESSES.get(os.getpid())
     if process is None or process.child.poll() is not None:
         _end()
         try:
             process = _PROCESSES[os.getpid()] = ReadingProcess()
         except (EOFError, OSError) as error:
-            what = f"{source} was not read, the process for it cannot be started ({str(error) or 'it ended at once'})"
-            raise RecordingError(f"{what}: free memory, then read it again") from None
+            what = f"{source} was not read: the reading process cannot be started ({str(error) or 'it ended at once'})"
+            raise RecordingError(f"{what}; free memory, then read it again") from None
     return process
 
 
@@ -159,7 +158,7 @@ def _end() -> None:
 
 
 def main() -> None:
-    """Fork for one file after another, and tell how each fork ended, until nobody asks any more."""
+    """Fork for one file after another and report each fork's exit code, until the parent is gone."""
     limit_process(0, {})
     asked = socket.socket(fileno=int(sys.argv[1]))
     asked.send(b"0")
@@ -169,7 +168,7 @@ def main() -> None:
             if not name:
                 return
             reader = import_module(name.decode())
-            with contextlib.suppress(FdhilError):  # the fork tells what is missing
+            with contextlib.suppress(FdhilError):  # the fork reports what is missing
                 reader.library()
             forked = os.fork()
             if forked == 0:
@@ -180,26 +179,25 @@ def main() -> None:
 
 
 def _read_and_end(reader: Any, descriptor: int) -> None:
-    """Read one file in the fork, within the limits for its size."""
     code = 1
     try:
         asked = Connection(descriptor)
         source, longest_s = json.loads(asked.recv_bytes())
         answer(asked, reader, asked.recv_bytes(), source, longest_s)
         code = 0
-    except BaseException:  # noqa: BLE001 - this process is nobody's but the file's
+    except BaseException:  # noqa: BLE001 - this process exists for this file alone
         traceback.print_exc()
     finally:
         os._exit(code)
 
 
 def answer(asked: Connection, reader: Any, content: bytes, source: str, longest_s: float) -> None:
-    """Read a file in this process, within the limits for its size, and send the table or the refusal."""
+    """Read a file in this process within the limits for its size, and send the table or the refusal."""
     has = int(Path("/proc/self/statm").read_text("ascii").split()[0]) * resource.getpagesize()
     _, most = resource.getrlimit(resource.RLIMIT_AS)
     with contextlib.suppress(OSError, ValueError):  # a sandbox may forbid it
         resource.setrlimit(resource.RLIMIT_AS, (has + most_memory_bytes(len(content)), most))
-    signal.setitimer(signal.ITIMER_REAL, longest_s)  # what these send ends this process, in a library too
+    signal.setitimer(signal.ITIMER_REAL, longest_s)  # these signals end this process, also inside a library
     signal.setitimer(signal.ITIMER_PROF, most_processor_s(len(content)))
     for part in _parts(reader, content, source):
         asked.send_bytes(part)
@@ -213,27 +211,27 @@ def _parts(reader: Any, content: bytes, source: str) -> Iterator[bytes]:
         return
     yield json.dumps({"tables": 1 + len(table.others)}).encode()
     for each in (table, *table.others):
-        told = {"headers": dict(each.headers), "columns": [*each.columns], "clocks": [*each.clocks]}
+        head = {"headers": dict(each.headers), "columns": [*each.columns], "clocks": [*each.clocks]}
         texts = {name: [*found] for name, found in each.texts.items()}
-        yield json.dumps({**told, "doubts": dict(each.doubts), "texts": texts}).encode()
+        yield json.dumps({**head, "doubts": dict(each.doubts), "texts": texts}).encode()
         for values in each.columns.values():
             yield np.asarray(values, dtype=np.float64).tobytes()
 
 
 def receive(asked: Connection) -> RecordingTable | FdhilError:
-    """Return the table or the refusal; EOFError, OSError, ValueError where there is none."""
-    told = json.loads(asked.recv_bytes())
-    if "error" in told:
-        refusal: FdhilError = getattr(errors, told["error"])(told["text"])
+    """Return the table or the refusal. Raises EOFError, OSError or ValueError if there is none."""
+    head = json.loads(asked.recv_bytes())
+    if "error" in head:
+        refusal: FdhilError = getattr(errors, head["error"])(head["text"])
         return refusal
-    first, *others = [_table(asked) for _ in range(told["tables"])]
+    first, *others = [_table(asked) for _ in range(head["tables"])]
     return replace(first, others=tuple(others))
 
 
 def _table(asked: Connection) -> RecordingTable:
-    told = json.loads(asked.recv_bytes())
-    columns = {name: np.frombuffer(asked.recv_bytes()).copy() for name in told["columns"]}
-    return RecordingTable(told["headers"], columns, frozenset(told["clocks"]), told["doubts"], texts=told["texts"])
+    head = json.loads(asked.recv_bytes())
+    columns = {name: np.frombuffer(asked.recv_bytes()).copy() for name in head["columns"]}
+    return RecordingTable(head["headers"], columns, frozenset(head["clocks"]), head["doubts"], texts=head["texts"])
 
 
 if __name__ == "__main__":

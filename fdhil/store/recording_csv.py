@@ -1,4 +1,4 @@
-"""Recordings as CSV text: header lines ``# key: value``, then a line of names, then rows of numbers."""
+"""Reads and writes recordings as CSV: header lines ``# key: value``, a line of names, then rows of numbers."""
 
 import math
 
@@ -11,17 +11,17 @@ from fdhil.store.recording_table import MIN_ROWS, TABLE, RecordingTable, check_h
 
 
 def parse_recording(text: str, source: str = "recording") -> Recording:
-    """Return the recording that a text is; ``source`` names it in errors. RecordingError as :func:`recording_of`."""
+    """Return the recording of a text; ``source`` names it in errors. RecordingError as :func:`recording_of`."""
     return recording_of(parse_table(text, source), source)
 
 
 def decode(content: bytes, source: str) -> RecordingTable:
-    """Return the table of a file's bytes; RecordingError names the line that is wrong."""
+    """Return the table of a file's bytes. Raises RecordingError with the line at fault."""
     return parse_table(text_of(content, source), source)
 
 
 def parse_table(text: str, source: str) -> RecordingTable:
-    """Return the table of a text; RecordingError names the line that is wrong."""
+    """Return the table of a text. Raises RecordingError with the line at fault."""
     if not text.strip():
         raise RecordingError(f"{source} is empty: record it again")
     lines = text.splitlines()
@@ -34,17 +34,17 @@ def parse_table(text: str, source: str) -> RecordingTable:
     for name in names:
         if name and names.count(name) > 1:
             places = " and ".join(f"#{j + 1}" for j, other in enumerate(names) if other == name)
-            raise RecordingError(f"{source} has {shown(name)} above {places} (line {k + 1}): rename or take out one")
+            raise RecordingError(f"{source} has {shown(name)} above {places} (line {k + 1}): rename or remove one")
     if not text.endswith("\n"):
         raise RecordingError(
-            f"{source} is truncated: line {len(lines)} has no end of line, so its last number may be cut; copy it again"
+            f"{source} is truncated: line {len(lines)} is incomplete, its last number may be cut off; copy it again"
         )
     table = _numbers(lines, k + 1, names, source)
     return RecordingTable(headers, {name: table[:, k] for k, name in reversed([*enumerate(names)])})
 
 
 def _headers(lines: list[str], width: int, source: str) -> dict[str, str]:
-    """Return the headers, without the empty cells that a spreadsheet writes behind each."""
+    """Return the headers, without the empty cells that a spreadsheet appends."""
     empty = "," * (width - 1)
     if all(line.endswith(empty) for line in lines):
         lines = [line.removesuffix(empty) for line in lines]
@@ -54,7 +54,7 @@ def _headers(lines: list[str], width: int, source: str) -> dict[str, str]:
         key, value = key.strip(), value.strip()
         if colon and headers.setdefault(key, value) != value:
             both = f"{shown(headers[key])} and again, in line {number}, {shown(value)}"
-            raise RecordingError(f"{source} has header {shown(key)} = {both}: take out the wrong one")
+            raise RecordingError(f"{source} has header {shown(key)} = {both}: remove the wrong one")
     return headers
 
 
@@ -68,10 +68,10 @@ def encode(table: RecordingTable) -> bytes:
 
 
 def _numbers(lines: list[str], first_row: int, names: list[str], source: str) -> Float:
-    """Return the rows (n, k): all finite but what the table tells."""
+    """Return the rows (n, k): all finite except sensors at the table."""
     rows = [line for line in lines[first_row:] if line.strip()]
     if len(rows) < MIN_ROWS:
-        raise RecordingError(f"{source} is truncated: {len(rows)} rows are no recording; record it again")
+        raise RecordingError(f"{source} is truncated: {len(rows)} rows are too few; record it again")
     try:
         table = np.loadtxt(rows, delimiter=",", comments=None, ndmin=2)
     except ValueError:
@@ -82,7 +82,6 @@ def _numbers(lines: list[str], first_row: int, names: list[str], source: str) ->
 
 
 def _bad_row(lines: list[str], first_row: int, names: list[str], source: str) -> RecordingError:
-    """Return the error that names the first row at fault."""
     width = len(names)
     last = max(k for k, line in enumerate(lines) if line.strip())
     for k, line in enumerate(lines[first_row:], start=first_row):
@@ -97,9 +96,9 @@ def _bad_row(lines: list[str], first_row: int, names: list[str], source: str) ->
                 value = float(cell)
             except ValueError:
                 return RecordingError(
-                    f"{source} line {k + 1} has {shown(cell.strip())} where a number belongs: correct it"
+                    f"{source} line {k + 1} has {shown(cell.strip())} instead of a number: correct it"
                 )
             if not (math.isfinite(value) or (math.isnan(value) and name in TABLE)):
                 what = f"{source} line {k + 1} has the non-finite value {shown(cell.strip())}"
-                return RecordingError(f"{what}: leave a lost sample's row out")
-    return RecordingError(f"{source} cannot be read as numbers: export it again")
+                return RecordingError(f"{what}: leave out the row of a lost sample")
+    return RecordingError(f"{source} does not contain numbers: export it again")

@@ -1,4 +1,4 @@
-"""Recordings as HDF5 files: one dataset each with its unit as attribute, the headers as attributes of the file."""
+"""Reads and writes recordings as HDF5: one dataset each with its unit as attribute, the headers as file attributes."""
 
 import io
 from typing import Any
@@ -17,7 +17,7 @@ MOST_DATASETS = 1000
 
 
 def encode(table: RecordingTable) -> bytes:
-    """Return a table as the bytes of an HDF5 file. FdhilError without the extra ``hdf5``."""
+    """Return a table as the bytes of an HDF5 file. Raises FdhilError without the extra ``hdf5``."""
     content = io.BytesIO()
     with library().File(content, "w") as file:
         file.attrs.update(table.headers)
@@ -28,12 +28,12 @@ def encode(table: RecordingTable) -> bytes:
 
 
 def decode(content: bytes, source: str) -> RecordingTable:
-    """Return the table of a file's bytes; datasets in groups by their path. RecordingError when it is no HDF5 file."""
+    """Return the table of a file's bytes; datasets in groups by their path. RecordingError if it is not HDF5."""
     return read_apart(__name__, KIND, content, source)
 
 
 def read(content: bytes, source: str) -> RecordingTable:
-    """Return the table in this process, which a damaged file may end."""
+    """Return the table, read in this process, which a damaged file may crash."""
     h5py = library()
     try:
         with h5py.File(io.BytesIO(content), "r") as file:
@@ -50,12 +50,11 @@ def read(content: bytes, source: str) -> RecordingTable:
 
 
 def _units(stored: Any) -> list[str]:
-    """Return the unit that a dataset's attributes say, whatever the case of their names."""
     return [_text(value) for key, value in stored.attrs.items() if key.lower() in UNIT_KEYS]
 
 
 def read_matlab(content: bytes, source: str) -> RecordingTable:
-    """Return the table of a file of MATLAB 7.3, in this process, which a damaged file may end."""
+    """Return the table of a MATLAB 7.3 file, read in this process, which a damaged file may crash."""
     h5py = library()
     try:
         with h5py.File(io.BytesIO(content), "r") as file:
@@ -68,7 +67,7 @@ def read_matlab(content: bytes, source: str) -> RecordingTable:
 
 
 def _variable(file: Any, item: Any, h5py: Any, sizes: list[int], source: str, depth: int = 0) -> Any:
-    """Return a variable as MATLAB has it; ``sizes`` of what was read so far keep all of it within a recording's."""
+    """Return a variable as in MATLAB; ``sizes`` of those read so far limit the total to a recording's."""
     kind = _text(item.attrs.get("MATLAB_class", b""))
     if depth > MOST_DEPTH or len(sizes) > MOST_DATASETS:
         return None
@@ -89,14 +88,13 @@ def _variable(file: Any, item: Any, h5py: Any, sizes: list[int], source: str, de
 
 
 def _listed(fields: dict[str, Any]) -> Any:
-    """Return a structure; of an array of them, each field of which is a tuple, the list."""
     if not fields or not all(isinstance(part, tuple) for part in fields.values()):
         return fields
     return [dict(zip(fields, parts, strict=True)) for parts in zip(*fields.values(), strict=True)]
 
 
 def _vectors(file: Any, h5py: Any) -> dict[str, tuple[Any, Any]]:
-    """Return the dataset and the part of it of each vector of real numbers, by path, not of links out of the file.
+    """Return dataset and selection of each vector of real numbers by path, excluding external links.
 
     A column of a matrix is ``path[:,0]`` or ``path[0,:]``, a field of a table ``path/field``.
     """
@@ -127,7 +125,6 @@ def _text(value: Any) -> str:
 
 
 def library() -> Any:
-    """Return what reads and writes such files. FdhilError without the extra."""
     try:
         import h5py
     except ImportError:

@@ -1,7 +1,7 @@
-"""Recordings as MATLAB files: one vector each, the headers in a struct ``headers``, the units in a struct ``units``.
+"""Reads and writes recordings as MATLAB files: one vector each, structs ``headers`` and ``units``.
 
-Written in version 5, which MATLAB, Octave and scipy read; version 7.3 is HDF5 and is read as such. A damaged file ends
-scipy's process, so it is read in one of its own.
+Written in version 5, which MATLAB, Octave and scipy read; version 7.3 is HDF5 and read as such. A damaged file may
+crash scipy, so that it is read in a separate process.
 """
 
 import io
@@ -21,7 +21,6 @@ _OBJECTS = {"object", "opaque", "function", "sparse"}
 
 
 def encode(table: RecordingTable) -> bytes:
-    """Return a table as the bytes of a MATLAB file."""
     units = {name: UNITS[name] for name in table.columns if name in UNITS}
     content = io.BytesIO()
     content_of = {"headers": dict(table.headers), "units": units, **table.columns}
@@ -30,32 +29,32 @@ def encode(table: RecordingTable) -> bytes:
 
 
 def decode(content: bytes, source: str) -> RecordingTable:
-    """Return the table of a file's bytes; RecordingError when it is no MATLAB file."""
+    """Return the table of a file's bytes. Raises RecordingError if it is not a MATLAB file."""
     return read_apart(__name__, KIND, content, source)
 
 
 def read(content: bytes, source: str) -> RecordingTable:
-    """Return the table in this process, which a damaged file may end."""
+    """Return the table, read in this process, which a damaged file may crash."""
     if content.startswith(_V73):
         from fdhil.store import recording_hdf5
 
         return recording_hdf5.read_matlab(content, source)
     scipy_io = library()
     try:
-        told = scipy_io.whosmat(io.BytesIO(content))
-        wanted = [(name, shape) for name, shape, kind in told[:MOST_VARIABLES] if kind in _READ]
+        listed = scipy_io.whosmat(io.BytesIO(content))
+        wanted = [(name, shape) for name, shape, kind in listed[:MOST_VARIABLES] if kind in _READ]
         check_size(max((math.prod(shape) for _, shape in wanted), default=0), 1, source)
         names = [name for name, _ in wanted]
         read: dict[str, Any] = scipy_io.loadmat(io.BytesIO(content), variable_names=names, simplify_cells=False)
         variables = {name: _plain(read[name]) for name in names if name in read}
-        variables |= {str(name): None for name, _, kind in told if kind in _OBJECTS}
+        variables |= {str(name): None for name, _, kind in listed if kind in _OBJECTS}
     except (scipy_io.matlab.MatReadError, *UNREADABLE) as error:
         raise unreadable(source, KIND, error) from None
     return matlab_table(variables, texts(variables.pop("headers", None)), source)
 
 
 def _plain(value: Any, depth: int = 0) -> Any:
-    """Return scipy's value with structures as mappings, arrays of structures and cells as lists, and texts as such."""
+    """Convert scipy's value: structures to mappings, structure arrays and cells to lists, texts to str."""
     kind = getattr(getattr(value, "dtype", None), "kind", "")
     if kind == "V" and value.dtype.names and depth < MOST_DEPTH:
         parts = [{name: _plain(part[name], depth + 1) for name in value.dtype.names} for part in value.ravel()]
@@ -68,7 +67,7 @@ def _plain(value: Any, depth: int = 0) -> Any:
 
 
 def library() -> Any:
-    """Return scipy's reader and writer; its stubs know no file in memory."""
+    """Return scipy's reader and writer; its stubs do not support files in memory."""
     from scipy import io as scipy_io  # late: it is slow to import
 
     return scipy_io

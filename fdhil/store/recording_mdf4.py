@@ -1,8 +1,7 @@
-"""Recordings as ASAM MDF 4 files, which measurement programs of the vehicle and machine world open.
+"""Reads and writes recordings as ASAM MDF 4 files, a format of vehicle and machine measurement programs.
 
-The columns are one group of channels over ``time``; the headers stand as JSON in the comment of the file.
-
-A damaged file ends the process that reads it, so they are read in one of their own.
+The columns are one channel group over ``time``; the headers are JSON in the file's comment. A damaged file may crash
+the reading process, so that it is read in a separate one.
 """
 
 import html
@@ -21,13 +20,13 @@ from fdhil.store.reading_process import read_apart
 from fdhil.store.recording_table import COLUMNS, PATH, UNITS, UNREADABLE, RecordingTable, check_size, unreadable
 
 KIND = "MDF 4 file"
-TIME = 1  # what a master channel counts; others are an angle, a distance, an index
-MASTER = (2, 3)  # channel types of MDF 4 that give the time, as recorded or by the number of the sample
+TIME = 1  # sync type of a master channel; others are angle, distance, index
+MASTER = (2, 3)  # MDF 4 channel types of the time: recorded or virtual
 _COMMENT = re.compile(r"<TX>(.*?)</TX>", re.DOTALL)
 
 
 def encode(table: RecordingTable) -> bytes:
-    """Return a table as the bytes of an MDF 4.10 file. FdhilError without the extra ``mdf``."""
+    """Return a table as the bytes of an MDF 4.10 file. Raises FdhilError without the extra ``mdf``."""
     asammdf = library()
     time_s = table.columns["time_s"]
     signals = [
@@ -46,16 +45,16 @@ def encode(table: RecordingTable) -> bytes:
 def decode(content: bytes, source: str) -> RecordingTable:
     """Return the channels of each group, and of those sampled with it; ``time_s`` is the group's own time.
 
-    RecordingError when it is no MDF file.
+    Raises RecordingError if it is not an MDF file.
     """
     return read_apart(__name__, KIND, content, source)
 
 
 def read(content: bytes, source: str) -> RecordingTable:
-    """Return the table in this process, which a damaged file may end."""
+    """Return the table, read in this process, which a damaged file may crash."""
     asammdf = library()
-    if not content.startswith(b"MDF ") or content[64:68] != b"##HD":  # what is older or cut off is none of version 4
-        raise unreadable(source, KIND, ValueError("it does not begin as one"))
+    if not content.startswith(b"MDF ") or content[64:68] != b"##HD":  # older versions and truncated files
+        raise unreadable(source, KIND, ValueError("its beginning is different"))
     try:
         with asammdf.MDF(io.BytesIO(content)) as file:
             rows = [group.channel_group.cycles_nr for group in file.groups]
@@ -66,20 +65,20 @@ def read(content: bytes, source: str) -> RecordingTable:
             }
             groups = _groups(file, rows)
             tables = [RecordingTable(headers, c, frozenset(), doubts, texts=units) for c, doubts in groups]
-    except UnboundLocalError:  # the library's own, where a file says that it is unfinished and has no block to finish
+    except UnboundLocalError:  # a bug of the library with files marked as unfinished
         raise unreadable(source, KIND, ValueError("it is unfinished, or damaged")) from None
     except (asammdf.blocks.utils.MdfException, ExpatError, *UNREADABLE) as error:
         raise unreadable(source, KIND, error) from None
-    # of a recording of fdhil the group that has its columns, of any other the largest
+    # first the group with fdhil's own columns, else the largest
     own = {*COLUMNS, *PATH}
     tables.sort(key=lambda table: (len(own & table.columns.keys()), table.columns["time_s"].size), reverse=True)
     return replace(tables[0], others=tuple(tables[1:])) if tables else RecordingTable({}, {})
 
 
 def _groups(file: Any, rows: list[int]) -> list[tuple[dict[str, Float], dict[str, str]]]:
-    """Return the channels of the groups that were sampled at the same times, ``time_s`` among them, and their doubts.
+    """Merge the channels of groups with equal times; return their columns with ``time_s``, and their doubts.
 
-    What a file marks as invalid is ``nan``.
+    Samples that the file marks as invalid are ``nan``.
     """
     groups: list[tuple[dict[str, Float], dict[str, str]]] = []
     for k, group in enumerate(file.groups):
@@ -90,16 +89,16 @@ def _groups(file: Any, rows: list[int]) -> list[tuple[dict[str, Float], dict[str
         if len(columns) == 1:
             groups.append((columns, doubts))
         if not any(c.channel_type in MASTER and c.sync_type == TIME for c in group.channels):
-            doubts["time_s"] = "is no time in this file, its samples have none: give sample_rate_hz under [headers]"
+            doubts["time_s"] = "is not a time: the samples have none; give sample_rate_hz under [headers]"
         for j, channel in enumerate(group.channels):
             samples, invalid = file.get(group=k, index=j, samples_only=True, ignore_invalidation_bits=True)
             values = np.asarray(samples)
             if values.ndim != 1 or values.dtype.kind not in "fiu":
-                doubts.setdefault(channel.name, "is a channel of texts or arrays: map one of numbers")
+                doubts.setdefault(channel.name, "contains texts or arrays: map a channel of numbers")
                 continue
             is_time = channel.channel_type in MASTER
             if channel.name in columns and not is_time and channel.name != "time_s":
-                doubts[channel.name] = "is the name of two channels with the same times: export the one that is meant"
+                doubts[channel.name] = "names two channels with the same times: export only the intended one"
             values = values.astype(np.float64)
             if invalid is not None:
                 values[np.asarray(invalid, dtype=bool)] = np.nan
@@ -108,17 +107,15 @@ def _groups(file: Any, rows: list[int]) -> list[tuple[dict[str, Float], dict[str
 
 
 def _headers(comment: str) -> dict[str, str]:
-    """Return the headers in a file's comment; none where another program wrote it."""
     found = _COMMENT.search(comment)
     try:
-        told = json.loads(html.unescape(found[1]) if found else comment)
+        headers = json.loads(html.unescape(found[1]) if found else comment)
     except ValueError:
         return {}
-    return {str(key): str(value) for key, value in told.items()} if isinstance(told, dict) else {}
+    return {str(key): str(value) for key, value in headers.items()} if isinstance(headers, dict) else {}
 
 
 def library() -> Any:
-    """Return what reads and writes such files. FdhilError without the extra."""
     try:
         import asammdf
     except ImportError:

@@ -1,4 +1,4 @@
-"""Recordings as Parquet tables: one column each, its unit in the field's metadata, the headers in the schema's."""
+"""Reads and writes recordings as Parquet tables: units in the fields' metadata, headers in the schema's."""
 
 import json
 from collections.abc import Iterable, Iterator
@@ -18,7 +18,6 @@ _META = b"fdhil"
 
 
 def encode(table: RecordingTable) -> bytes:
-    """Return a table as the bytes of a Parquet file."""
     fields = [pa.field(name, pa.float64(), metadata={"unit": UNITS.get(name, "")}) for name in table.columns]
     schema = pa.schema(fields, metadata={_META: json.dumps(dict(table.headers)).encode()})
     sink = pa.BufferOutputStream()
@@ -28,14 +27,14 @@ def encode(table: RecordingTable) -> bytes:
 
 
 def decode(content: bytes, source: str) -> RecordingTable:
-    """Return the table of a file's bytes, also of a stored window's; RecordingError when it is no Parquet file."""
+    """Return the table of a file's bytes, also of a stored window's. Raises RecordingError if it is not Parquet."""
     try:
         file = pq.ParquetFile(pa.BufferReader(content))
         headers = json.loads((file.schema_arrow.metadata or {}).get(_META, b"{}"))
         if headers.get("format") == WINDOW_FORMAT:
             return table_of(decode_window(content, source))
-        told = file.metadata
-        check_size(told.num_rows, told.num_columns, source)
+        metadata = file.metadata
+        check_size(metadata.num_rows, metadata.num_columns, source)
         kinds = [*_kinds(file.schema_arrow)]
         units = {field.name: _units(field) for field in file.schema_arrow}
         read = file.read(columns=[name for name, kind in kinds if _is_number(kind) or pa.types.is_temporal(kind)])
@@ -48,12 +47,14 @@ def decode(content: bytes, source: str) -> RecordingTable:
 
 
 def _units(field: pa.Field) -> list[str]:
-    said = (field.metadata or {}).items()
-    return [value.decode(errors="replace") for key, value in said if key.decode(errors="replace").lower() in UNIT_KEYS]
+    metadata = (field.metadata or {}).items()
+    return [
+        value.decode(errors="replace") for key, value in metadata if key.decode(errors="replace").lower() in UNIT_KEYS
+    ]
 
 
 def _kinds(fields: Iterable[pa.Field], above: str = "") -> Iterator[tuple[str, pa.DataType]]:
-    """Yield name and type of each column, of a field of a structure as ``structure.field``."""
+    """Yield name and type of each column, of a structure's field as ``structure.field``."""
     for field in fields:
         if pa.types.is_struct(field.type):
             yield from _kinds(field.type, f"{above}{field.name}.")
@@ -62,7 +63,7 @@ def _kinds(fields: Iterable[pa.Field], above: str = "") -> Iterator[tuple[str, p
 
 
 def _columns(read: pa.Table) -> tuple[dict[str, Float], frozenset[str], dict[str, str]]:
-    """Return the columns of numbers and times, which of them are times in s, and why a name stands for none."""
+    """Return the columns of numbers and times, which of them are times in s, and unusable names with the reason."""
     while any(pa.types.is_struct(field.type) for field in read.schema):
         read = read.flatten()
     columns: dict[str, Float] = {}
@@ -71,7 +72,7 @@ def _columns(read: pa.Table) -> tuple[dict[str, Float], frozenset[str], dict[str
     for k, field in enumerate(read.schema):
         places = read.schema.get_all_field_indices(field.name)
         if len(places) > 1:
-            doubts[field.name] = f"stands above {len(places)} columns: write them with different names"
+            doubts[field.name] = f"names {len(places)} columns: write them with different names"
         elif pa.types.is_temporal(field.type):
             columns[field.name] = _seconds(read.column(k))
             clocks.add(field.name)
@@ -97,19 +98,19 @@ def _seconds(times: pa.ChunkedArray) -> Float:
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a Parquet file is a recording and not a stored window; False where it cannot be told."""
+    """Return whether a Parquet file is a recording and not a stored window; False if unknown."""
     return _format_of(path) == FORMAT
 
 
 def read_if_window(path: Path) -> Window | None:
-    """Return the window of a Parquet file that is a stored one, else None. RecordingError where it is damaged."""
+    """Return the window of a Parquet file if it is a stored one, else None. RecordingError if it is damaged."""
     return read_window(path) if _format_of(path) == WINDOW_FORMAT else None
 
 
 def _format_of(path: Path) -> object:
     try:
         metadata = pq.read_schema(path).metadata or {}
-        told = json.loads(metadata.get(_META, b"{}"))
+        headers = json.loads(metadata.get(_META, b"{}"))
     except (pa.ArrowException, *UNREADABLE):
         return None
-    return told.get("format") if isinstance(told, dict) else None
+    return headers.get("format") if isinstance(headers, dict) else None

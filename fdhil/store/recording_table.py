@@ -1,7 +1,7 @@
-"""A recording as every file format carries it: headers (texts by key) and columns of numbers by name.
+"""A recording as in every file format: headers (texts by key) and columns of numbers by name.
 
-A step of time off by more than 1 % is a gap. A recording may have no voltage: then it may tell the motor's torque
-constant.
+A time step that differs by more than 1 % is a gap. A recording may lack the voltage; its header may then give the
+motor's torque constant.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from fdhil.records import Float, Recording, SlowVoltage, VoltageSampling, frozen
 
 FORMAT = "fdhil-recording-1"
 COLUMNS = ("time_s", "current_A", "speed_rad_per_s")
-PATH = ("position_m", "demand_m")  # only for what is told in micrometres; they need a pitch
-ANGLE = "angle_rad"  # of the motor, where no position is
+PATH = ("position_m", "demand_m")  # only for results in micrometres; they need a pitch
+ANGLE = "angle_rad"  # of the motor, in place of a position
 VOLTAGE = "voltage_V"
-TABLE = ("table_mm", "table_m_s2")  # sensors at the table, which may have lost rows
+TABLE = ("table_mm", "table_m_s2")  # sensors at the table, which may have lost samples
 REQUIRED = ("format", "sample_rate_hz", "axis")
-PITCH = "pitch_m_per_rev"  # required where there is a position or a demand
-STAND_IN_PITCH_M = 2e-3 * math.pi  # of a motor without a screw: 1 mm in a message stands for 1 rad
-SAMPLING = "voltage_sampling"  # required where there is a voltage
-NOTES = "import_notes"  # header: what was done to another program's numbers as they were read
+PITCH = "pitch_m_per_rev"  # required with a position or a demand
+STAND_IN_PITCH_M = 2e-3 * math.pi  # of a motor without a screw: 1 mm in a message means 1 rad
+SAMPLING = "voltage_sampling"  # required with a voltage
+NOTES = "import_notes"  # header: conversions of another program's numbers
 SOURCES: Mapping[str, tuple[str, ...]] = {
     "speed_source": ("sensor", "difference", "filtered"),
     "voltage_source": ("terminals", "command"),
@@ -45,8 +45,8 @@ UNITS: Mapping[str, str] = {
     "table_m_s2": "m/s2",
 }
 STEP_TOLERANCE = 0.01
-UNIT_KEYS = ("unit", "units")  # under which a file says the unit of a column, in small letters
-# what readers of damaged files raise
+UNIT_KEYS = ("unit", "units")  # keys of a column's unit, in lower case
+# errors of the readers of damaged files
 UNREADABLE = (
     ArithmeticError, AssertionError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError,
     TypeError, ValueError, struct.error, zlib.error,
@@ -56,12 +56,15 @@ MOST_SHOWN = 12  # names in an error
 MAX_VALUES = 64_000_000  # half a gigabyte
 MAX_SAMPLES_CHARS = 16 * 1024 * 1024
 PITCH_M = (1e-5, 0.8)
-PITCH_DEG, RADIUS_M = (1e-3, 360.0), (0.01, 10.0)  # of a rotary axis, and where an angle is weighed as a length
+PITCH_DEG, RADIUS_M = (
+    (1e-3, 360.0),
+    (0.01, 10.0),
+)  # of a rotary axis, and the radius at which an angle counts as a length
 PITCH_OF_ROTARY = "pitch_deg_per_rev"
 ANGLES = {"position_m": "position_deg", "demand_m": "demand_deg"}
 RATE_HZ = (1.0, 1e6)
-SLOW_HZ = 200.0  # below, a drive that accelerates in 0.1 s does so within too few samples
-RECORD_HZ = 1000  # what a rapid is best recorded with
+SLOW_HZ = 200.0  # slower rates give too few samples of an acceleration within 0.1 s
+RECORD_HZ = 1000  # recommended for rapids
 RAPID_M_S = (1e-4, 20.0)
 CONSTANT_NM_A = (1e-3, 100.0)
 
@@ -70,9 +73,9 @@ CONSTANT_NM_A = (1e-3, 100.0)
 class RecordingTable:
     """``headers`` and ``columns`` (n,) of a recording; a lost sample is a missing row.
 
-    Of another program's file further: ``clocks``, the columns that are times in seconds by their kind; ``doubts``, why
-    a column of that name cannot be used; ``interruption``, what keeps the number of a row from being a time; the
-    ``others``, its columns that were sampled at other times; and ``texts``, what the file says of a column.
+    For other programs' files also: ``clocks``, columns that are times in s by their type; ``doubts``, why a column
+    cannot be used; ``interruption``, why row numbers cannot replace times; ``others``, columns sampled at other times;
+    ``texts``, what the file says about a column.
     """
 
     headers: Mapping[str, str]
@@ -85,7 +88,7 @@ class RecordingTable:
 
 
 def recording_of(table: RecordingTable, source: str = "recording") -> Recording:
-    """Return what a table says; RecordingError names what is wrong with it, and what to do about it."""
+    """Return the recording of a table. Raises RecordingError with the fault and its remedy."""
     check_headers(table.headers, table.columns, source)
     table, pitches = _as_lengths(table, source)
     headers = dict(table.headers)
@@ -127,9 +130,9 @@ def recording_of(table: RecordingTable, source: str = "recording") -> Recording:
 
 
 def _travel(speed_rad_s: Float, dt_s: float, source: str | None) -> Float:
-    """Return the angle (n,) that a speed turns, which stands in for a position that was not recorded; lost rows NaN.
+    """Integrate a speed to an angle (n,), in place of a position that was not recorded; lost samples NaN.
 
-    A speed that is a difference of positions is the mean over the row before.
+    A speed that is a difference of positions is the mean over the interval before.
     """
     known = np.isfinite(speed_rad_s)
     speed = np.interp(np.arange(known.size), np.flatnonzero(known), speed_rad_s[known])
@@ -139,7 +142,7 @@ def _travel(speed_rad_s: Float, dt_s: float, source: str | None) -> Float:
 
 
 def _as_lengths(table: RecordingTable, source: str) -> tuple[RecordingTable, tuple[float, float]]:
-    """Return a table of a rotary axis with lengths of arc in place of its angles, and which pitches it may have."""
+    """Convert the angles of a rotary axis to arc lengths; return the table and the allowed pitches."""
     headers, columns = dict(table.headers), dict(table.columns)
     if PITCH_OF_ROTARY not in headers:
         return table, PITCH_M
@@ -156,42 +159,39 @@ def _as_lengths(table: RecordingTable, source: str) -> tuple[RecordingTable, tup
 
 
 def check_size(rows: int, columns: int, source: str) -> None:
-    """Refuse, before any of it is read, a file that declares more than a recording has."""
+    """Refuse a file that declares more than a recording can have, before any of it is read."""
     if rows > MAX_ROWS or rows * columns > MAX_VALUES:
-        raise RecordingError(f"{source} declares {columns} columns of {rows} rows, more than a recording has: cut it")
+        raise RecordingError(f"{source} declares {columns} columns of {rows} rows, too many for a recording: split it")
 
 
 def unlike_lengths(sizes: Mapping[str, int], source: str) -> RecordingError:
-    """Return the error for columns that do not have one length."""
-    return RecordingError(f"{source} has columns of unlike lengths, {sizes}: export them with one time step")
+    return RecordingError(f"{source} has columns of different lengths, {sizes}: export them with one time step")
 
 
 def unreadable(source: str, kind: str, error: BaseException) -> RecordingError:
-    """Return the error that tells why a file is none of its kind."""
+    """Return the error that says why a file is not of its kind."""
     first = (str(error).splitlines() or [type(error).__name__])[0][:200]
-    return RecordingError(f"{source} is no {kind} that can be read: {first}; export it again")
+    return RecordingError(f"{source} is not a readable {kind}: {first}; export it again")
 
 
 def check_headers(headers: Mapping[str, str], columns: Mapping[str, object], source: str) -> dict[str, str]:
-    """Return the headers of a recording that has these columns; RecordingError names what is missing."""
+    """Return the headers of a recording with these columns. Raises RecordingError with what is missing."""
     rotary = PITCH_OF_ROTARY in headers
     has_path = any(name in columns for name in PATH)
     required = [*REQUIRED, *([PITCH] if has_path and not rotary else []), *([SAMPLING] if VOLTAGE in columns else [])]
     if rotary and "pitch_m_per_rev" in headers:
-        raise RecordingError(f"{source} has pitch_m_per_rev and {PITCH_OF_ROTARY}: keep that of its axis' unit")
+        raise RecordingError(f"{source} has pitch_m_per_rev and {PITCH_OF_ROTARY}: keep the one for its axis' unit")
     if not rotary and (angles := [name for name in ANGLES.values() if name in columns]):
-        what = f"{source} has {' and '.join(angles)}, and no header {PITCH_OF_ROTARY}"
+        what = f"{source} has {' and '.join(angles)}, but no header {PITCH_OF_ROTARY}"
         raise RecordingError(f"{what}: give it and radius_m, or name the columns position_m and demand_m")
     missing = [key for key in required if not headers.get(key)]
     if missing:
         raise RecordingError(
             f"{source} has no header {', '.join(missing)}: add a line such as '# {missing[0]}: ...', or give "
-            "--columns with a column map where another program wrote it"
+            "--columns with a column map for another program's file"
         )
     if headers["format"] != FORMAT:
-        raise RecordingError(
-            f"{source} has format {shown(headers['format'])}, which is not {FORMAT!r}: convert it first"
-        )
+        raise RecordingError(f"{source} has format {shown(headers['format'])}, not {FORMAT!r}: convert it first")
     absent = [name for name in COLUMNS if name not in columns]
     absent += [angle for name, angle in ANGLES.items() if rotary and name in columns]
     if absent:
@@ -203,23 +203,22 @@ def check_headers(headers: Mapping[str, str], columns: Mapping[str, object], sou
 
 
 def _rows(table: RecordingTable, names: list[str], source: str) -> Float:
-    """Return the columns side by side (n, k): all finite but what the table tells."""
     sizes = {name: table.columns[name].size for name in names}
     if len(set(sizes.values())) > 1:
         raise unlike_lengths(sizes, source)
     if sizes["time_s"] < MIN_ROWS and 1 < sizes["time_s"] < SLOW_HZ * np.ptp(table.columns["time_s"]):
         raise RecordingError(
-            f"{source} has {sizes['time_s']} samples in {np.ptp(table.columns['time_s']):.3g} s, which is too slow to "
-            f"follow how a drive accelerates: record at {RECORD_HZ} Hz or faster"
+            f"{source} has {sizes['time_s']} samples in {np.ptp(table.columns['time_s']):.3g} s, too few to "
+            f"resolve a drive's acceleration: record at {RECORD_HZ} Hz or faster"
         )
     if sizes["time_s"] < MIN_ROWS:
-        raise RecordingError(f"{source} is truncated: {sizes['time_s']} rows are no recording; record it again")
+        raise RecordingError(f"{source} is truncated: {sizes['time_s']} rows are too few; record it again")
     for name in names:
         values = table.columns[name]
         wrong = np.isinf(values) if name in TABLE else ~np.isfinite(values)
         if wrong.any():
             what = f"{source} has a non-finite {name} in row {int(np.argmax(wrong)) + 1}"
-            raise RecordingError(f"{what}: leave a lost sample's row out")
+            raise RecordingError(f"{what}: leave out the row of a lost sample")
     return np.column_stack([table.columns[name] for name in names])
 
 
@@ -228,35 +227,37 @@ def _told(name: str, names: list[str], columns: Float) -> Float | None:
 
 
 def _slow_voltage(headers: dict[str, str], start_s: float, dt_s: float, source: str) -> SlowVoltage | None:
-    """Return the samples of a voltage sensor that is slower than the rows, where the headers hold them.
+    """Return the samples of a voltage sensor that is slower than the rows, if the headers contain them.
 
-    Sample j begins ``voltage_begin_s`` + j ``voltage_period_s`` on the time axis of the rows, whose first is at
-    ``start_s`` and which are ``dt_s`` apart; a lost one is ``nan`` among ``voltage_samples_V``.
+    Sample j begins at ``voltage_begin_s`` + j ``voltage_period_s`` on the time axis of the rows, the first of which is
+    at ``start_s`` and which are ``dt_s`` apart; a lost one is ``nan`` in ``voltage_samples_V``.
     """
     if "voltage_samples_V" not in headers:
         return None
     period, begin = _positive(headers, "voltage_period_s", source), _optional(headers, "voltage_begin_s", source)
-    if period < dt_s / 2:  # the place of finer samples among the rows would be sought for hours
+    if period < dt_s / 2:  # aligning finer samples with the rows would take hours
         raise RecordingError(
             f"{source} has voltage samples {period:g} s apart, closer than its rows: give voltage_period_s in seconds"
         )
     if len(headers["voltage_samples_V"]) > MAX_SAMPLES_CHARS:
-        raise RecordingError(f"{source} has more voltage samples than a recording has: cut it into parts")
+        raise RecordingError(f"{source} has too many voltage samples for a recording: split it")
     try:
-        told = np.array(headers["voltage_samples_V"].split(), dtype=np.float64)
+        samples = np.array(headers["voltage_samples_V"].split(), dtype=np.float64)
     except ValueError:
-        raise RecordingError(f"{source} has a voltage sample that is no number: copy or export it again") from None
-    if begin is None or not told.size or np.isinf(told).any() or np.isnan(told).all():
+        raise RecordingError(f"{source} has an invalid voltage sample: copy or export it again") from None
+    if begin is None or not samples.size or np.isinf(samples).any() or np.isnan(samples).all():
         raise RecordingError(
             f"{source} has voltage samples of a slower sensor without voltage_begin_s or without a finite value: "
             "export it again"
         )
     error = _optional(headers, "voltage_error_s", source) or 0.0
-    return SlowVoltage(begin - start_s, period, abs(error), frozen(told), _late(headers, told.size, period, source))
+    return SlowVoltage(
+        begin - start_s, period, abs(error), frozen(samples), _late(headers, samples.size, period, source)
+    )
 
 
 def _late(headers: dict[str, str], samples: int, period: float, source: str) -> Float | None:
-    """Return by how much later than its place each sample of a slow sensor was true, where the headers hold it."""
+    """Return how much later than its grid time each sample of a slow sensor was taken."""
     if "voltage_late_s" not in headers:
         return None
     try:
@@ -264,7 +265,7 @@ def _late(headers: dict[str, str], samples: int, period: float, source: str) -> 
     except ValueError:
         late = np.zeros(0)
     if late.size != samples or not (np.abs(late) < period / 2).all():
-        raise RecordingError(f"{source} has voltage_late_s that do not fit its voltage samples: export it again")
+        raise RecordingError(f"{source} has invalid voltage_late_s for its voltage samples: export it again")
     return frozen(late)
 
 
@@ -275,17 +276,15 @@ def _place(
     steps = np.diff(time_s)
     if (steps <= 0).any():
         k = int(np.argmax(steps <= 0))
-        raise RecordingError(
-            f"{source}: time stands still or runs back at {time_s[k + 1]:g} s: sort or record it again"
-        )
+        raise RecordingError(f"{source}: time does not rise at {time_s[k + 1]:g} s: sort or record it again")
     if time_s[-1] - time_s[0] > MAX_ROWS * dt:
-        raise RecordingError(f"{source}: a gap of {steps.max():g} s is no recording of one run: cut the file there")
+        raise RecordingError(f"{source}: a gap of {steps.max():g} s is too long for one run: split the file there")
     off = np.abs(steps - dt) > STEP_TOLERANCE * dt
     if off.mean() > 0.5:
         raise RecordingError(
-            f"{source}: rows are {np.median(steps):g} s apart, but sample_rate_hz says {dt:g} s: correct the header"
+            f"{source}: rows are {np.median(steps):g} s apart, but sample_rate_hz means {dt:g} s: correct the header"
         )
-    # a step that is off is a gap even where it rounds to one sample: at least one row is then missing or misplaced
+    # a deviating step is a gap even if it rounds to one sample: a row is missing or misplaced
     counts = np.where(off, np.maximum(np.rint(steps / dt), 2), 1).astype(np.int64)
     rows = np.concatenate([[0], np.cumsum(counts)])
     gaps = tuple((int(rows[k]) + 1, int(rows[k + 1])) for k in np.flatnonzero(off))
@@ -308,7 +307,6 @@ def _sampling(headers: dict[str, str], source: str) -> VoltageSampling:
 
 
 def _check_sources(headers: dict[str, str], source: str) -> None:
-    """Refuse a word for where speed or voltage come from that is none."""
     for key, words in SOURCES.items():
         if key in headers and headers[key] not in words:
             raise RecordingError(f"{source} has {key} {shown(headers[key])}: it must be {' or '.join(words)}")
@@ -327,13 +325,12 @@ def _positive(headers: dict[str, str], key: str, source: str) -> float:
 
 
 def _within(headers: dict[str, str], key: str, bounds: tuple[float, float], source: str) -> float:
-    """Return a header's number; RecordingError beyond what machines have, with the unit that was likely meant."""
     value, (low, high) = _positive(headers, key, source), bounds
     if low <= value <= high:
         return value
     length = key in ("pitch_m_per_rev", "rapid_speed_m_per_s")
     guess = f" (is {value:g} in mm? then write {value / 1e3:g})" if length and value > high else ""
-    text = f"{source} has header {key} = {value:g}, machines have {low:g} to {high:g}: correct it{guess}"
+    text = f"{source} has header {key} = {value:g}, outside the {low:g} to {high:g} of machines: correct it{guess}"
     raise RecordingError(text)
 
 
@@ -344,7 +341,7 @@ def _optional(headers: dict[str, str], key: str, source: str) -> float | None:
         value = float(headers[key])
     except ValueError:
         raise RecordingError(
-            f"{source} has header {key} = {shown(headers[key])} where a number belongs: correct it"
+            f"{source} has header {key} = {shown(headers[key])} instead of a number: correct it"
         ) from None
     if not math.isfinite(value):
         raise RecordingError(f"{source} has the non-finite header {key} = {shown(headers[key])}: correct it")

@@ -1,4 +1,4 @@
-"""Reads a recording from any file: one of the recording formats, or another program's file with a column map."""
+"""Reads a recording from any file: a recording format, or another program's file with a column map."""
 
 from pathlib import Path
 
@@ -13,15 +13,15 @@ from fdhil.store.trace_text import TraceText, parse_trace
 
 
 def read_recording(path: Path, columns: ColumnMap | None = None) -> Recording:
-    """Read a recording; RecordingError names what is wrong with the file and what to do about it.
+    """Read a recording. Raises RecordingError with the file's fault and its remedy.
 
-    With ``columns`` the file may be of another program.
+    With ``columns`` the file may be another program's.
     """
     return recording_of(read_table(path, columns), str(path))
 
 
 def read_stored(path: Path) -> Window | None:
-    """Return the window of a file that is a stored one, None of any other. RecordingError where it is damaged."""
+    """Return the window of a stored window file, None for any other file. RecordingError if it is damaged."""
     if path.suffix.lower() != ".parquet":
         return None
     from fdhil.store.recording_parquet import read_if_window  # late: an extra
@@ -30,14 +30,14 @@ def read_stored(path: Path) -> Window | None:
 
 
 def read_table(path: Path, columns: ColumnMap | None = None) -> RecordingTable:
-    """Read headers and columns of a recording without looking at what they mean. Errors as :func:`read_recording`."""
+    """Read headers and columns of a recording without interpreting them. Errors as :func:`read_recording`."""
     if columns is not None:
         return mapped(read_raw(path, columns.text), columns, str(path))
     return _decoded(_format_of(path), read_content(path), str(path))
 
 
 def read_raw(path: Path, text: TraceText | None = None) -> RecordingTable:
-    """Read all columns of another program's file, ``text`` in the form that a column map gives. Errors as above."""
+    """Read all columns of another program's file, ``text`` as a column map describes it. Errors as above."""
     content, name = read_content(path), _format_of(path)
     return parse_trace(content, text or TraceText(), str(path)) if name == "csv" else _decoded(name, content, str(path))
 

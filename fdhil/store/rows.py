@@ -1,4 +1,4 @@
-"""The rows of the history as records, and how each is read from what SQLite gives."""
+"""The rows of the history as records, decoded from what SQLite returns."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 @dataclass(frozen=True, slots=True)
 class Stamp:
-    """When a row was written: wall clock (s since 1970, may be wrong), boot identifier, time since the boot."""
+    """When a row was written: wall clock (Unix, s, may be wrong), boot identifier, time since boot."""
 
     wall_s: float
     boot: str
@@ -35,18 +35,17 @@ class Stamp:
 
     @staticmethod
     def now(clock: Clock = SYSTEM_CLOCK) -> Stamp:
-        """Return the stamp of this moment."""
         return Stamp(clock.wall_s(), clock.boot_id(), clock.since_boot_ns())
 
     def age_s(self, clock: Clock = SYSTEM_CLOCK) -> float:
-        """Return how long ago that was; below 0 where a wall clock was set back, which is not to be believed."""
+        """Return the age; a negative one, of a clock that was set back, is unreliable."""
         now = Stamp.now(clock)
         if now.boot and self.boot == now.boot:
             return (now.monotonic_ns - self.monotonic_ns) * 1e-9
         return now.wall_s - self.wall_s
 
     def is_after(self, other: Stamp) -> bool:
-        """Return whether it was written after another, as far as the clocks say."""
+        """Return whether it was written after another, as far as the clocks show."""
         if self.boot and self.boot == other.boot:
             return self.monotonic_ns > other.monotonic_ns
         return self.wall_s > other.wall_s
@@ -67,9 +66,9 @@ class StoredWindow:
     """An analysed window as stored; ``parameters`` maps a symbol to {"value", "std"} or {"value": None, "reason"}.
 
     ``friction`` is {"value", "std", "speed_rad_s"}: the friction torque at the rapid speed (N.m), load included.
-    ``told`` is what an accepted window tells a pool: "names" and "values" (k,), the covariance (k, k) of its "own"
-    chance, and the doubts (k, q) "shared" by all windows of the drive. ``nc`` is what the NC said of the move: "line",
-    "program", "override" (least and greatest) and "held".
+    ``told`` is an accepted window's contribution to a pool: "names" and "values" (k,), the covariance (k, k) of its
+    "own" noise, and the doubts (k, q) "shared" by all windows of the drive. ``nc`` is the NC's report of the move:
+    "line", "program", "override" (least and greatest) and "held".
     """
 
     number: int
@@ -92,7 +91,7 @@ class StoredWindow:
 
 @dataclass(frozen=True, slots=True)
 class UsedParameters:
-    """An axis' parameters as a prediction used them: ``revision`` 0 where none was published."""
+    """An axis' parameters as a prediction used them: ``revision`` 0 if none was published."""
 
     revision: int
     parameters: Parameters
@@ -100,7 +99,7 @@ class UsedParameters:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """A prediction of a program: ``program`` is its digest, ``zones`` as ``fdhil predict --json`` has them."""
+    """A prediction of a program: ``program`` is its digest, ``zones`` as in ``fdhil predict --json``."""
 
     program: str
     name: str
@@ -112,7 +111,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class Acknowledgement:
-    """Who has answered for ``notices`` (their numbers), when, and what was remarked."""
+    """Who has acknowledged ``notices`` (their numbers), when, and with which note."""
 
     notices: tuple[int, ...]
     who: str
@@ -122,7 +121,7 @@ class Acknowledgement:
 
 @dataclass(frozen=True, slots=True)
 class StoredNotice:
-    """A notice as stored, and who has acknowledged it; one of severity info asks for no acknowledgement."""
+    """A notice as stored, and its acknowledgement; severity info requires none."""
 
     number: int
     notice: Notice
@@ -131,7 +130,6 @@ class StoredNotice:
 
     @property
     def is_open(self) -> bool:
-        """Whether it waits for somebody to acknowledge it."""
         return self.acknowledged is None and self.notice.severity != "info"
 
 
@@ -200,7 +198,7 @@ def _loops(row: Mapping[str, Any]) -> tuple[Stamp, LoopEstimate]:
     return _stamp(row), found
 
 
-# table -> what makes a record of its row; a row that is none raises one of the errors that the reader knows
+# table -> decoder of its rows; an invalid row raises one of the errors that the reader catches
 DECODED: Mapping[str, Callable[[Mapping[str, Any]], Any]] = {
     "windows": _stored_window,
     "revisions": _revision,

@@ -1,4 +1,4 @@
-"""Times of samples with too few digits or with jitter: the even grid that they stand for, if there is only one."""
+"""Recovers the even grid of sample times with low resolution or jitter, if it is unambiguous."""
 
 import numpy as np
 
@@ -6,24 +6,25 @@ from fdhil.errors import RecordingError
 from fdhil.records import Float, Int
 from fdhil.store.recording_table import STEP_TOLERANCE
 
-FIT = 1.1  # of the rounding, by which times may leave an even grid
-MULTIPLE = 0.05  # of the rounding, by which a step may be off a multiple of it
-FEW = 4  # steps that are off: as many may be lost samples of an even grid
-MANY = 0.05  # of the steps: as many are off by jitter, fewer by pauses of the recording
-LEAST_SPANS = 20  # of the rounding, that all times must cover to tell the period to a percent
+FIT = 1.1  # of the rounding: largest deviation from an even grid
+MULTIPLE = 0.05  # of the rounding: largest deviation of a step from a multiple
+FEW = 4  # deviating steps that may be lost samples of an even grid
+MANY = 0.05  # of the steps: more deviate by jitter, fewer by pauses of the recording
+LEAST_SPANS = 20  # of the rounding: span that determines the period to a percent
 
 
 def even_times(time_s: Float, rate_hz: float | None, source: str) -> tuple[Float, str]:
-    """Return the times (n,), or the even grid that they stand for, and what was done ("" if nothing).
+    """Return the times (n,), or the even grid that they approximate, and what was done ("" if nothing).
 
-    RecordingError where steps may be rounded or jittered times, or lost or uneven samples; ``rate_hz`` decides.
+    Raises RecordingError if steps may be rounded or jittered times as well as lost or uneven samples; ``rate_hz``
+    decides.
     """
     found_s, note = _unrounded(time_s, rate_hz, source)
     return (found_s, note) if note else _without_jitter(found_s, rate_hz, source)
 
 
 def _without_jitter(time_s: Float, rate_hz: float | None, source: str) -> tuple[Float, str]:
-    """Return the grid of the rate, where many steps are neither as long as most nor a multiple, as time stamps are."""
+    """Return the grid of the rate if many steps are neither usual nor a multiple, as with time stamps."""
     steps = np.diff(time_s)
     usual = float(np.median(steps)) if rate_hz is None else 1 / rate_hz
     if steps.size < FEW or not usual > 0 or (steps <= 0).any():
@@ -35,21 +36,20 @@ def _without_jitter(time_s: Float, rate_hz: float | None, source: str) -> tuple[
     shown = f"steps of time vary from {steps.min():.3g} to {steps.max():.3g} s"
     if rate_hz is None:
         raise RecordingError(
-            f"{source}: {shown}: even samples with jitter in their time stamps, then give sample_rate_hz under "
-            "[headers] of the column map; or samples taken unevenly, then record with a fixed step"
+            f"{source}: {shown}: for even samples with jittered time stamps give sample_rate_hz under "
+            "[headers] of the column map; uneven samples must be recorded with a fixed step"
         )
     rows = np.concatenate([[0], np.cumsum(counts)])
     drift_s = (time_s - time_s[0]) - rows * usual
     if np.ptp(drift_s) > usual:
         raise RecordingError(
-            f"{source}: {shown}, and leave those of {rate_hz:g} Hz by {np.ptp(drift_s):.3g} s: correct sample_rate_hz, "
+            f"{source}: {shown}and drift from {rate_hz:g} Hz by {np.ptp(drift_s):.3g} s: correct sample_rate_hz, "
             "or record with a fixed step"
         )
-    return time_s[0] + rows * usual, f"{shown}, samples are taken as {usual:.6g} s apart"
+    return time_s[0] + rows * usual, f"{shown}; a sample period of {usual:.6g} s is used"
 
 
 def _unrounded(time_s: Float, rate_hz: float | None, source: str) -> tuple[Float, str]:
-    """Return the times, or the even grid that they were rounded from, and what was done."""
     steps = np.diff(time_s)
     rounding_s = _rounding(steps)
     if steps.size < FEW or rounding_s is None or (steps < 0).any():
@@ -63,7 +63,7 @@ def _unrounded(time_s: Float, rate_hz: float | None, source: str) -> tuple[Float
     is_short = rate_hz is None and time_s[-1] - time_s[0] < LEAST_SPANS * rounding_s
     if usual == 0 and (grid is None or is_short):
         raise RecordingError(
-            f"{source}: times are written to {rounding_s:g} s, too coarse to tell how far its samples are apart: give "
+            f"{source}: times are written to {rounding_s:g} s, too coarse for the sample period: give "
             "sample_rate_hz under [headers] of the column map"
         )
     if grid is None or is_short:
@@ -71,23 +71,23 @@ def _unrounded(time_s: Float, rate_hz: float | None, source: str) -> tuple[Float
     period_s = float(grid[-1] - grid[0]) / steps.size
     if is_loss and rate_hz is None:
         raise RecordingError(
-            f"{source}: {off.sum()} of {steps.size} steps of time are a multiple of {usual:g} s: samples "
-            f"{period_s:.6g} s apart whose times are rounded to {rounding_s:g} s, or samples {usual:g} s apart of "
+            f"{source}: {off.sum()} of {steps.size} steps of time are a multiple of {usual:g} s: either samples "
+            f"{period_s:.6g} s apart with times rounded to {rounding_s:g} s, or samples {usual:g} s apart of "
             "which some are lost; give sample_rate_hz under [headers] of the column map"
         )
     return grid, _note(period_s, rounding_s)
 
 
 def usual_step(time_s: Float) -> float:
-    """Return the mean of the steps that are as long as most are, s; their median where none are."""
+    """Return the mean of the steps that are as long as most, s; their median if none are."""
     steps = np.diff(time_s)
     usual = np.median(steps)
-    alike = steps[np.abs(steps - usual) <= STEP_TOLERANCE * abs(usual)]
-    return float(alike.mean() if alike.size else usual)
+    similar = steps[np.abs(steps - usual) <= STEP_TOLERANCE * abs(usual)]
+    return float(similar.mean() if similar.size else usual)
 
 
 def _with_gaps(time_s: Float, steps: Float, rounding_s: float, rate_hz: float | None) -> tuple[Float, str]:
-    """Return the even grid with rows left out where whole samples are lost; the times where they are on none."""
+    """Return the even grid with rows left out for lost samples; the times unchanged if they are on no grid."""
     near = steps[steps < 1.5 * np.median(steps)]
     if not near.size or rounding_s > near.mean() / 2:
         return time_s, ""
@@ -97,11 +97,11 @@ def _with_gaps(time_s: Float, steps: Float, rounding_s: float, rate_hz: float | 
 
 
 def _note(period_s: float, rounding_s: float) -> str:
-    return f"times are rounded to {rounding_s:.4g} s, samples are taken as {period_s:.6g} s apart"
+    return f"times are rounded to {rounding_s:.4g} s; a sample period of {period_s:.6g} s is used"
 
 
 def _rounding(steps: Float) -> float | None:
-    """Return the least difference between two steps that differ, where all steps are multiples of it."""
+    """Return the least difference between distinct steps if all steps are multiples of it."""
     distinct = np.unique(np.round(steps, 9))
     least = float(np.diff(distinct).min()) if distinct.size > 1 else 0.0
     if least < 2e-9 or np.abs(distinct / least - np.rint(distinct / least)).max() > MULTIPLE:
@@ -110,13 +110,12 @@ def _rounding(steps: Float) -> float | None:
 
 
 def _are_multiples(steps: Float, usual: float) -> bool:
-    """Whether each step is as long as two usual ones or more, which is what lost samples leave."""
+    """Return whether each step is two usual ones or more, as lost samples leave it."""
     counts = np.rint(steps / usual)
     return bool(((counts >= 2) & (np.abs(steps - counts * usual) <= STEP_TOLERANCE * steps)).all())
 
 
 def _grid(time_s: Float, rows: Int, rounding_s: float, rate_hz: float | None) -> Float | None:
-    """Return the even times at ``rows`` that these are within one rounding of; None where there are none."""
     middle, about = rows - rows.mean(), time_s - time_s.mean()
     period_s = float(middle @ about / (middle @ middle)) if rate_hz is None else 1 / rate_hz
     if np.ptp(about - period_s * middle) > FIT * rounding_s:

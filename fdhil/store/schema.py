@@ -1,7 +1,7 @@
-"""The tables of the history, how an older file is brought up to them, and what tells a damaged file or row.
+"""The tables of the history, their upgrades, and the detection of damaged files and rows.
 
-Every row carries a digest over all its fields and its number. The file's own structure is checked when it is opened,
-and no index is kept: an index that is damaged would hide rows, a row that is damaged is seen by its digest.
+Every row carries a digest of all its fields and its number. The file's structure is checked when it is opened. There
+are no indexes: a damaged index would hide rows, a damaged row is detected by its digest.
 """
 
 import hashlib
@@ -17,7 +17,7 @@ from fdhil.store.atomic import CAUSES, is_full, store_error, sync_folder
 
 _CODES = {"SQLITE_FULL": "DiskFull", "SQLITE_READONLY": "ReadOnlyStore", "SQLITE_CANTOPEN": "ReadOnlyStore"}
 _NOT_WRITABLE = ("SQLITE_READONLY", "SQLITE_CANTOPEN")
-# SQLITE_ERROR: our own statements are right, so the tables are not what their version says
+# SQLITE_ERROR: the statements are correct, so the tables do not match their version
 _DAMAGE = {"SQLITE_NOTADB", "SQLITE_CORRUPT", "SQLITE_ERROR"}
 _STAMP = "wall_s REAL NOT NULL, boot TEXT NOT NULL, monotonic_ns INTEGER NOT NULL"
 _REVISION = f"""(id INTEGER PRIMARY KEY AUTOINCREMENT, axis TEXT NOT NULL, revision INTEGER NOT NULL,
@@ -42,7 +42,7 @@ CREATE TABLE comparisons (id INTEGER PRIMARY KEY AUTOINCREMENT, program TEXT NOT
 CREATE INDEX comparisons_program ON comparisons (program, id);
 """
 _WITH_DIGESTS = ("windows", "revisions", "skills", "notices", "comparisons")
-# a revision whose row was damaged is numbered again, so no two axis and revision need differ
+# the number of a damaged revision is reused, so that axis and revision need not be unique
 _DIGESTS = (
     "DROP INDEX windows_axis; DROP INDEX revisions_axis; DROP INDEX comparisons_program;"
     f"CREATE TABLE renewed {_REVISION}); INSERT INTO renewed SELECT * FROM revisions;"
@@ -50,7 +50,7 @@ _DIGESTS = (
     + "".join(f"ALTER TABLE {table} ADD COLUMN digest TEXT NOT NULL DEFAULT '';" for table in _WITH_DIGESTS)
     + "CREATE TABLE quarantine (id INTEGER PRIMARY KEY, of TEXT NOT NULL, row INTEGER NOT NULL, content TEXT NOT NULL);"
 )
-# ``told`` is what a window tells a pool; a history before that has none
+# ``told`` is a window's contribution to a pool; older histories have none
 _TERMS = f"""
 ALTER TABLE windows ADD COLUMN unexplained_um REAL; ALTER TABLE windows ADD COLUMN warnings TEXT;
 ALTER TABLE windows ADD COLUMN friction TEXT; ALTER TABLE windows ADD COLUMN told TEXT;
@@ -61,12 +61,12 @@ CREATE TABLE loops (id INTEGER PRIMARY KEY AUTOINCREMENT, axis TEXT NOT NULL, st
   warnings TEXT NOT NULL, {_STAMP}, digest TEXT NOT NULL DEFAULT '')
 """
 _NC = "ALTER TABLE windows ADD COLUMN nc TEXT"
-# ``notices`` are the numbers of the rows that one person has seen and answered for at once
+# ``notices`` are the numbers of the rows that one person acknowledged at once
 _ACKNOWLEDGEMENTS = f"""
 CREATE TABLE acknowledgements (id INTEGER PRIMARY KEY AUTOINCREMENT, notices TEXT NOT NULL, who TEXT NOT NULL,
   note TEXT NOT NULL, {_STAMP}, digest TEXT NOT NULL DEFAULT '')
 """
-# what a works is to be told: ``message`` is the digest of the row at the time; ``store`` tells this file from any other
+# rows for the fleet server: ``message`` is the row's digest at the time; ``store`` identifies this file
 _OUTBOX = """
 CREATE TABLE outbox (id INTEGER PRIMARY KEY AUTOINCREMENT, of TEXT NOT NULL, row INTEGER NOT NULL, axis TEXT NOT NULL,
   message TEXT NOT NULL, with_file INTEGER NOT NULL);
@@ -76,44 +76,43 @@ INSERT INTO outbox_of VALUES (lower(hex(randomblob(16))), 0)
 _SET_LOOPS = "ALTER TABLE revisions ADD COLUMN loops TEXT"
 TABLES = (*_WITH_DIGESTS, "loops", "acknowledgements")
 _BESIDE = ("quarantine", "outbox", "outbox_of")
-# what leads from each schema to the next, in order: a new one is added at the end, an old one never changes; one that
-# changes the columns of a table is listed with it in _CHANGED
+# the upgrade from each schema to the next: a new one is appended, an old one never changes; one that changes the
+# columns of a table is listed with it in _CHANGED
 _STEPS = (_FIRST, _COMPARISONS, _DIGESTS, _TERMS, _NC, _ACKNOWLEDGEMENTS, _OUTBOX, _SET_LOOPS)
-_CHANGED = {7: "revisions"}  # schema that was left -> table: its rows get other digests, and so do those in the outbox
+_CHANGED = {7: "revisions"}  # old schema -> table whose rows, and outbox entries, get new digests
 SCHEMA_VERSION = len(_STEPS)
 WITH_COMPARISONS, WITH_DIGESTS, WITH_TERMS, WITH_ACKNOWLEDGEMENTS, WITH_OUTBOX = 2, 3, 4, 6, 7
-# what the check of the structure says of single values; their row's digest tells the same and no more than the row
+# findings about single values: the row's digest detects them, and only the row is lost
 _OF_ONE_ROW = (" value in ", "CHECK constraint failed")
 
 
 @contextmanager
 def told(path: Path) -> Iterator[None]:
-    """Turn SQLite's errors into one sentence."""
+    """Translate SQLite's errors into a StoreError."""
     try:
         yield
     except UnicodeDecodeError:
-        raise _damaged(path, "a name in it is no text") from None
+        raise _damaged(path, "a name in it is not valid text") from None
     except sqlite3.Error as error:
         name = getattr(error, "sqlite_errorname", "") or ""
         raise (_damaged(path, str(error)) if _DAMAGE & {name, name[:14]} else _unusable(path, name, error)) from None
 
 
 def _unusable(path: Path, name: str, error: sqlite3.Error) -> StoreError:
-    """Say why the file cannot be used now; nothing is wrong with what is in it."""
     code = next((code for prefix, code in _CODES.items() if name.startswith(prefix)), "StoreFault")
-    if name.startswith("SQLITE_IOERR") and is_full(path):  # SQLite calls it by its name when it grows a table alone
+    if name.startswith("SQLITE_IOERR") and is_full(path):  # SQLite reports a full disk only while a table grows
         code = "DiskFull"
-    cause = CAUSES.get(code, "check the disk; the history is left as it is")
+    cause = CAUSES.get(code, "check the disk; the history is unchanged")
     return StoreError(f"{path} cannot be used ({error}): {cause}", code)
 
 
 def _damaged(path: Path, what: str) -> StoreError:
-    text = f"{path} is damaged ({what}), nothing of it is believed; start the daemon, which keeps it and begins anew"
+    text = f"{path} is damaged ({what}) and not used; start the daemon, which keeps it and begins a new one"
     return StoreError(text, "CorruptFile")
 
 
 def stamp_of(path: Path) -> tuple[int, ...]:
-    """Return what tells a file from another one and its content from an earlier one; nothing where there is none."""
+    """Return what identifies a file and its content; empty if there is none."""
     try:
         found = path.stat()
     except OSError:
@@ -122,19 +121,18 @@ def stamp_of(path: Path) -> tuple[int, ...]:
 
 
 def version_of(db: sqlite3.Connection) -> int:
-    """Return the schema of the file."""
     return int(db.execute("PRAGMA user_version").fetchone()[0])
 
 
 def check_file(db: sqlite3.Connection, path: Path, least: int = 0, *, pages: bool = True) -> int:
-    """Return the file's schema; StoreError when it is another program's, not what it says, or damaged in structure.
+    """Return the file's schema version. StoreError if it is another program's, inconsistent or damaged.
 
-    All ``pages`` are looked at, which takes a second for some hundred megabytes.
+    Checking all ``pages`` takes a second for some hundred megabytes.
     """
-    db.text_factory = lambda raw: raw.decode("utf-8", "replace")  # a damaged text is seen by its digest
+    db.text_factory = lambda raw: raw.decode("utf-8", "replace")  # a damaged text is detected by its digest
     version = version_of(db)
     if not least <= version <= SCHEMA_VERSION:
-        text = f"{path} has schema {version}, this fdhil knows {SCHEMA_VERSION}; use the fdhil that wrote it"
+        text = f"{path} has schema {version}, this fdhil supports {SCHEMA_VERSION}; use the fdhil that wrote it"
         raise StoreError(text, "SchemaVersion")
     if _columns(db) != _columns_of(version):
         raise _damaged(path, f"its tables are not those of schema {version}")
@@ -145,9 +143,9 @@ def check_file(db: sqlite3.Connection, path: Path, least: int = 0, *, pages: boo
 
 
 def open_to_read(path: Path, checked: set[tuple[int, int]] | None = None) -> tuple[sqlite3.Connection, int]:
-    """Open a file for reading only, also from a read-only disk, and return it with its schema; StoreError.
+    """Open a file for reading only, also from a read-only disk; return it with its schema version. StoreError.
 
-    Who opens it again and again keeps in ``checked`` which files were whole (device and inode).
+    A caller that reopens it often keeps in ``checked`` the files that were intact (device and inode).
     """
     if not path.is_file():
         raise StoreError(f"{path} does not exist: nothing was recorded yet; run the daemon first", "NoHistory")
@@ -156,7 +154,7 @@ def open_to_read(path: Path, checked: set[tuple[int, int]] | None = None) -> tup
         raise StoreError(f"{path} is empty: nothing was recorded yet; run the daemon first", "NoHistory")
     known = checked is not None and (place.st_dev, place.st_ino) in checked
     with told(path):
-        # where no shared-memory file can be made only the latter opens; nowhere else, since it heeds no lock
+        # the second only if no shared-memory file can be created: it ignores locks
         for flags in ("mode=ro", "mode=ro&immutable=1"):
             db = sqlite3.connect(f"{path.resolve().as_uri()}?{flags}", uri=True, timeout=5.0)
             try:
@@ -169,7 +167,7 @@ def open_to_read(path: Path, checked: set[tuple[int, int]] | None = None) -> tup
             if checked is not None:
                 checked.add((place.st_dev, place.st_ino))
             return db, version
-    raise StoreError(f"{path} cannot be opened; check its rights", "StoreFault")
+    raise StoreError(f"{path} cannot be opened; check its permissions", "StoreFault")
 
 
 def _columns(db: sqlite3.Connection) -> list[list[tuple[Any, ...]]]:
@@ -185,9 +183,9 @@ def _columns_of(version: int) -> list[list[tuple[Any, ...]]]:
 
 
 def bring_up(db: sqlite3.Connection, path: Path) -> None:
-    """Take an older schema, or an empty file, to the present one: every step is whole or not made at all.
+    """Upgrade an older schema, or an empty file, to the current one; every step is atomic.
 
-    An older file is kept beside it as it was at each step, under its name and the schema it had.
+    An older file is copied next to it before each step, under its name and its schema version.
     """
     new = version_of(db) == 0
     while (version := version_of(db)) < SCHEMA_VERSION:
@@ -208,7 +206,6 @@ def bring_up(db: sqlite3.Connection, path: Path) -> None:
 
 @contextmanager
 def _all_or_nothing(db: sqlite3.Connection) -> Iterator[None]:
-    """Make one transaction of what is done within; whatever ends it early leaves none open."""
     db.execute("BEGIN IMMEDIATE")
     try:
         yield
@@ -237,7 +234,6 @@ def _rows_of(db: sqlite3.Connection, table: str) -> Iterator[dict[str, Any]]:
 
 
 def _sound_rows(db: sqlite3.Connection) -> set[tuple[str, int]]:
-    """Return table and number of the rows that are what was written."""
     return {
         (table, row["id"])
         for table in _WITH_DIGESTS
@@ -247,7 +243,7 @@ def _sound_rows(db: sqlite3.Connection) -> set[tuple[str, int]]:
 
 
 def _sign(db: sqlite3.Connection, sound: set[tuple[str, int]] | None) -> None:
-    """Give rows of an older schema the digest of what can be read of them now; all, or those that were ``sound``."""
+    """Set the digests of rows of an older schema: of all rows, or of those that were ``sound``."""
     for table in _WITH_DIGESTS:
         rows = [row for row in _rows_of(db, table) if sound is None or (table, row["id"]) in sound]
         signed = [(digest_of(table, row), row["id"]) for row in rows]
@@ -265,7 +261,7 @@ Also = Callable[[sqlite3.Connection, str, Mapping[str, Any]], None]
 
 
 def insert(db: sqlite3.Connection, table: str, row: Mapping[str, Any], also: Also | None = None) -> int:
-    """Add a row with the digest of what the file then holds of it, and what ``also`` adds; return its number."""
+    """Insert a row with its digest, and what ``also`` adds; return its number."""
     names = ", ".join(row)
     marks = ", ".join(f":{name}" for name in row)
     row = {name: _storable(value) for name, value in row.items()}
@@ -281,12 +277,11 @@ def insert(db: sqlite3.Connection, table: str, row: Mapping[str, Any], also: Als
 
 
 def _storable(value: Any) -> Any:
-    """Return a value as SQLite takes it: what is no Unicode in a text, as in a file's Latin-1 name, is escaped."""
+    """Escape invalid Unicode, as from a Latin-1 file name, so that SQLite accepts it."""
     return value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
 
 
 def put_aside(db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
-    """Move a damaged row, as it is read now, to the table where nothing is believed."""
     with _all_or_nothing(db):
         content = (table, row["id"], ascii(dict(row)))
         db.execute("INSERT INTO quarantine (of, row, content) VALUES (?, ?, ?)", content)
@@ -294,7 +289,7 @@ def put_aside(db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> Non
 
 
 def named(rows: Mapping[tuple[str, int], Any]) -> str:
-    """Return which rows of which table these are, in one short phrase; empty for none."""
+    """Return which rows of which tables these are, in a short phrase; empty for none."""
     tables: dict[str, list[int]] = {}
     for table, number in sorted(rows):
         tables.setdefault(table, []).append(number)

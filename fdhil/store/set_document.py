@@ -1,4 +1,4 @@
-"""A published parameter set as JSON has it: each value with its interval, to full precision."""
+"""Formats a published parameter set for JSON: each value with its interval, to full precision."""
 
 import math
 from collections.abc import Mapping
@@ -10,20 +10,19 @@ from fdhil.records import INTERVAL_95, PARAMETERS, ParameterSet, unit_of
 
 
 def parameters_status(published: ParameterSet) -> Mapping[str, Mapping[str, Any]]:
-    """Return each parameter with its standard deviation and 95 % interval; nothing is told without its interval."""
+    """Return each parameter with its standard deviation and 95 % interval."""
     values, deviations = published.parameters.as_dict(), _deviations(published)
     return {name: _figures(name, value, deviations[k]) for k, (name, value) in enumerate(values.items())}
 
 
 def terms_status(published: ParameterSet) -> Mapping[str, Mapping[str, Any]]:
-    """Return each term that joined the six parameters in the same way."""
+    """Return each additional term with its standard deviation and 95 % interval."""
     deviations = _deviations(published)
     pairs = enumerate(published.parameters.terms, start=len(PARAMETERS))
     return {name: _figures(name, value, deviations[k]) for k, (name, value) in pairs}
 
 
 def _deviations(published: ParameterSet) -> list[float]:
-    """Return the standard deviations of the six parameters and the terms, NaN where none is known."""
     variances = np.diag(published.covariance)
     known = np.sqrt(np.where(variances >= 0, variances, np.nan)).tolist()
     return [*known, *[math.nan] * (len(PARAMETERS) + len(published.parameters.terms) - len(known))]
@@ -42,7 +41,6 @@ def _figures(name: str, value: float, std: float) -> Mapping[str, Any]:
 
 
 def set_document(published: ParameterSet) -> dict[str, Any]:
-    """Return a published set as JSON has it."""
     return {
         "axis": published.axis,
         "revision": published.revision,

@@ -1,4 +1,4 @@
-"""Which file format a name's suffix means."""
+"""Maps file name suffixes to file formats."""
 
 from collections.abc import Mapping
 
@@ -10,5 +10,4 @@ BUS_LOGS: Mapping[str, str] = {".log": "candump", ".blf": "blf", ".asc": "asc", 
 
 
 def suffix_of(table: Mapping[str, str], name: str) -> str:
-    """Return the first suffix that means the format ``name``."""
     return next(suffix for suffix, meant in table.items() if meant == name)

@@ -1,4 +1,4 @@
-"""Cells of text files as numbers: decimal marks, thousands' separators, times of day, and words for a lost value."""
+"""Parses cells of text files: decimal marks, thousands separators, times of day, and words for lost values."""
 
 import math
 import re
@@ -15,10 +15,10 @@ nan -nan nan(ind) -nan(ind) na n/a #n/a #na #nv null none nil nat inf +inf -inf 
 1.#qnan 1.#ind -1.#ind 1.#inf -1.#inf - -- --- ---- ? * *** **** ovl ovr ovf over overflow overload
 invalid overrange underrange nodata error err #error #value! #div/0! missing lost
 """
-VOID = frozenset(["", *_NOTHING.split()])  # what programs write where there is no value
+VOID = frozenset(["", *_NOTHING.split()])  # words for a missing value
 DAY_S, HALF_DAY_S = 86400.0, 43200.0
 _MINUS = str.maketrans({"\u2212": "-", "\u2013": "-", "\u00a0": " ", "\u2007": " ", "\u2009": " ", "\u202f": " "})
-_GROUPS = {".": "[,'\u2019 ]", ",": "[.'\u2019 ]"}  # what may stand between the thousands
+_GROUPS = {".": "[,'\u2019 ]", ",": "[.'\u2019 ]"}  # thousands separators
 _NUMBERS = {
     mark: re.compile(
         rf"([+-]?)(?:(\d+)|([1-9]\d{{0,2}})({group})(\d{{3}}(?:\4\d{{3}})*)|(?=[{mark}]\d))"
@@ -37,9 +37,9 @@ _STOPWATCH = re.compile(r"(?P<m>\d{1,3}):(?P<s>[0-5]\d)[.,](?P<f>\d+)")
 
 @dataclass(frozen=True, slots=True)
 class CellColumn:
-    """``values`` (n,) of a column, ``nan`` where one is lost; ``bad`` is the first row that is neither.
+    """``values`` (n,) of a column, ``nan`` for lost ones; ``bad`` is the first row that is neither.
 
-    ``is_clock`` where the cells are times of day: the values are seconds then, and go on past midnight.
+    ``is_clock``: the cells are times of day; the values are then seconds and continue past midnight.
     """
 
     values: Float
@@ -48,17 +48,17 @@ class CellColumn:
 
 
 def plain(cell: str) -> str:
-    """Return a cell without quotes and blanks about it, its minus sign and blanks as ASCII has them."""
+    """Return a cell without surrounding quotes and blanks, with ASCII minus sign and blanks."""
     return cell.translate(_MINUS).strip().strip("\"'").strip()
 
 
 def is_void(cell: str) -> bool:
-    """Whether a cell says that there is no value."""
+    """Return whether a cell means that there is no value."""
     return plain(cell).lower() in VOID
 
 
 def is_number(cell: str) -> bool:
-    """Whether a cell is a number by either decimal mark, or a time of day."""
+    """Return whether a cell is a number with either decimal mark, or a time of day."""
     if _QUICK.fullmatch(cell) is not None:
         return True
     text = plain(cell)
@@ -66,18 +66,18 @@ def is_number(cell: str) -> bool:
 
 
 def is_clock(cell: str) -> bool:
-    """Whether a cell is a time of day, with a date or without."""
+    """Return whether a cell is a time of day, with or without a date."""
     return _clock(plain(cell)) is not None
 
 
 def is_written_by(text: str, decimal: str) -> bool:
-    """Whether a plain text is a number with this decimal mark."""
+    """Return whether a plain text is a number with this decimal mark."""
     return _NUMBERS[decimal].fullmatch(text) is not None
 
 
 def parse_column(cells: Sequence[str], decimal: str) -> CellColumn:
-    """Return the cells as numbers whose decimal mark is ``decimal``, or as times of day."""
-    try:  # what most files have, ten times as quick
+    """Return the cells as numbers with the decimal mark ``decimal``, or as times of day."""
+    try:  # the usual format, ten times as fast
         return CellColumn(_quick(cells, decimal))
     except ValueError:
         pass
@@ -96,7 +96,6 @@ def parse_column(cells: Sequence[str], decimal: str) -> CellColumn:
 
 
 def _quick(cells: Sequence[str], decimal: str) -> Float:
-    """Return numbers without thousands' separators; ValueError where a cell is none."""
     other = "," if decimal == "." else "."
     if any(other in cell or "_" in cell for cell in cells):
         raise ValueError
@@ -115,7 +114,6 @@ def _number(text: str, decimal: str) -> float | None:
 
 
 def _clock(text: str) -> tuple[str, float] | None:
-    """Return the date (with its zone) and the seconds of a time of day; None of any other text."""
     found = _CLOCK.fullmatch(text) or _STOPWATCH.fullmatch(text)
     if found is None:
         return None
@@ -128,7 +126,7 @@ def _clock(text: str) -> tuple[str, float] | None:
 
 
 def _clock_column(texts: Sequence[str]) -> CellColumn:
-    """Return seconds; midnight is where the time falls by half a day or more, and there alone may the date change."""
+    """Return seconds; midnight is a drop of half a day or more, and only there may the date change."""
     values, before, dated = np.full(len(texts), np.nan), math.nan, ""
     for k, text in enumerate(texts):
         read = _clock(text)
@@ -145,7 +143,7 @@ def _clock_column(texts: Sequence[str]) -> CellColumn:
 
 
 def past_midnight(seconds: Float) -> Float:
-    """Return times of day that go on past midnight: where they fall by half a day or more a day has passed."""
+    """Return times of day that continue past midnight: a drop of half a day or more is a new day."""
     known = np.flatnonzero(np.isfinite(seconds))
     passed = np.cumsum(np.diff(seconds[known]) < -HALF_DAY_S)
     gone_on = seconds.copy()

@@ -1,4 +1,4 @@
-"""Names of columns in the head of a text: the nearest above the numbers, where the names count as the cells do."""
+"""Finds column names in the head of a text: the nearest line above the numbers with a matching number of cells."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -6,15 +6,15 @@ from dataclasses import dataclass
 from fdhil.store.trace_cells import plain
 from fdhil.store.trace_rows import Layout, Row
 
-UNFILLED = ("comment", "comments", "kommentar", "remark")  # a last column whose cells are left out where it has none
+UNFILLED = ("comment", "comments", "kommentar", "remark")  # headings of a last column that may be left empty
 
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """The texts above the columns (from 0).
+    """The texts above the columns (numbered from 0).
 
-    ``columns`` is the column of each name, ``twice`` those of a name that stands above several, with its line,
-    ``uneven`` why a text stands above none, and ``texts`` what stands above each column.
+    ``columns`` is the column of each name, ``twice`` those of a name above several columns, with its line, ``uneven``
+    why a text belongs to no column, and ``texts`` the texts above each column.
     """
 
     columns: Mapping[str, int]
@@ -24,7 +24,7 @@ class Head:
 
 
 def read_head(lines: Sequence[Sequence[Row]], layout: Layout) -> Head:
-    """Return the names of a head; ``lines`` has each line, from the top, in the ways in which it may be taken apart."""
+    """Return the names of a head; ``lines`` has each line, from the top, in the possible ways to split it."""
     columns: dict[str, int] = {}
     twice: dict[str, tuple[int, Sequence[int]]] = {}
     uneven: dict[str, str] = {}
@@ -40,12 +40,11 @@ def read_head(lines: Sequence[Sequence[Row]], layout: Layout) -> Head:
                 columns.setdefault(name, places[0])
         for name in () if fitting else _places(ways[0]):
             count = f"{len(ways[0].cells)} cells of line {ways[0].line}, the rows have {layout.width}"
-            uneven.setdefault(name, f"stands among the {count}: say by #1, #2 ... from the left which column it is")
+            uneven.setdefault(name, f"is one of the {count}: name the column #1, #2 ... from the left instead")
     return Head(columns, twice, uneven, texts)
 
 
 def _fits(row: Row, layout: Layout) -> bool:
-    """Whether a line has as many names as a row has cells, or has numbers."""
     filled = max((j + 1 for j, cell in enumerate(row.cells) if cell.strip()), default=0)
     if len(row.cells) == layout.width or filled == layout.filled:
         return True

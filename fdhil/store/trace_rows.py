@@ -1,4 +1,4 @@
-"""Which records of a text are rows of numbers: where they begin and end, and what stands between them."""
+"""Finds the rows of numbers in a text: where they begin and end, and what interrupts them."""
 
 import re
 from collections import Counter
@@ -10,10 +10,10 @@ from fdhil.csv_text import shown
 from fdhil.errors import RecordingError
 from fdhil.store.trace_cells import is_clock, is_number, is_void, plain
 
-HEAD_LINES = 400  # of a file's beginning, in which the first row of numbers is searched
-SAME_WIDTH = 3  # rows of numbers in succession that show where they begin
-SAMPLE_ROWS = 600  # that show which columns are numbers
-MOST_FOOTER_ROWS = 12  # with numbers, as a mean and a maximum
+HEAD_LINES = 400  # searched for the first row of numbers
+SAME_WIDTH = 3  # successive rows of numbers that mark their beginning
+SAMPLE_ROWS = 600  # examined for the columns of numbers
+MOST_FOOTER_ROWS = 12  # with numbers, such as a mean and a maximum
 COMMENTS = ("#", "%", "//")
 COMMENT_MARKS = "#%/ "
 
@@ -28,7 +28,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How many cells a row has, and which of its columns (from 0) are numbers, or empty, in most rows."""
+    """The number of cells of a row, and its columns (from 0) that are numbers, or empty, in most rows."""
 
     width: int
     numbers: tuple[int, ...]
@@ -36,33 +36,32 @@ class Layout:
 
     @property
     def filled(self) -> int:
-        """Return how many cells a row has up to its last number."""
         return self.numbers[-1] + 1
 
     def is_row(self, row: Row) -> bool:
-        """Whether a record is a row of numbers by its length and its first number."""
+        """Return whether a record is a row of numbers by its length and its first number."""
         return len(row.cells) == self.width and self._begins(row)
 
     def is_short(self, row: Row) -> bool:
-        """Whether a record is a row of numbers whose last cells are missing."""
+        """Return whether a record is a row of numbers whose last cells are missing."""
         if len(row.cells) >= self.width or not self._begins(row) or is_clock(row.cells[self.numbers[0]]):
             return False
         return len(self._found(row)) > 1 and self._is_clean(row)
 
     def has_numbers(self, row: Row) -> bool:
-        """Whether a record is as long as a row and has two numbers or more, after a text."""
+        """Return whether a record has the length of a row and two numbers or more, after a text."""
         return len(row.cells) == self.width and len(self._found(row)) > 1
 
     def begins_rows(self, rows: Sequence[Row]) -> bool:
-        """Whether these records are all rows of two numbers or more, without a text among them."""
+        """Return whether these records are all rows of two numbers or more, without texts."""
         return all(self.is_row(row) and len(self._found(row)) > 1 and self._is_clean(row) for row in rows)
 
     def is_doubtful(self, row: Row) -> bool:
-        """Whether a record is a row of two numbers or more, whatever its other cells are."""
+        """Return whether a record is a row of two numbers or more, whatever its other cells are."""
         return self.is_row(row) and len(self._found(row)) > 1
 
     def has_label(self, row: Row) -> bool:
-        """Whether a row of numbers has a text where the others have nothing."""
+        """Return whether a row of numbers has a text where the others are empty."""
         return any(not is_void(row.cells[j]) for j in self.empty)
 
     def _begins(self, row: Row) -> bool:
@@ -81,7 +80,7 @@ class Layout:
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """The rows of numbers of a text, the records before them, and the first interruption ("" where there is none)."""
+    """The rows of numbers of a text, the records before them, and the first interruption ("" without one)."""
 
     head: Sequence[Row]
     rows: Sequence[Row]
@@ -90,10 +89,10 @@ class Body:
 
 
 def find_body(rows: Sequence[Row], source: str, is_complete: bool) -> Body | None:
-    """Return the rows of numbers; None without any. A last row that was not written to its end is left out.
+    """Return the rows of numbers; None without any. An incomplete last row is left out.
 
-    Between rows may stand nothing but empty lines, comments, the names again, and rows without a value: RecordingError
-    for any other, and for a row of more or fewer cells than the others.
+    Empty lines, comments, repeated names and rows without a value may stand between rows. Raises RecordingError for
+    anything else, and for a row with more or fewer cells than the others.
     """
     rows = [row for row in rows if len(row.cells) > 1 or any(cell.strip() for cell in row.cells)]
     layout = _layout(rows)
@@ -124,20 +123,19 @@ def find_body(rows: Sequence[Row], source: str, is_complete: bool) -> Body | Non
 
 
 def _interruption(body: Sequence[Row]) -> str:
-    """Return where something else stands between rows; an empty line after each of them is nothing."""
     steps = [below.line - above.line for above, below in pairwise(body)]
     k = next((k for k, step in enumerate(steps) if step != min(steps)), None)
-    return "" if k is None else f"line {body[k].line + 1} between the rows is no row"
+    return "" if k is None else f"line {body[k].line + 1} interrupts the rows"
 
 
 def _spare(head: Sequence[Row], layout: Layout) -> list[int]:
-    """Return the empty columns after the last number that have no name: a number there was moved out of its column."""
+    """Return the empty columns after the last number without a name: a number there was moved out of its column."""
     after = [j for j in layout.empty if j >= layout.filled]
     return [j for j in after if not any(len(row.cells) > j and plain(row.cells[j]) for row in head)]
 
 
 def _is_cut_off(rows: Sequence[Row], layout: Layout) -> bool:
-    """Whether the last row lacks cells, or has in its last one another number of digits than all rows before it."""
+    """Return whether the last row lacks cells, or its last cell has fewer digits than those of all other rows."""
     if len(rows[-1].cells) < layout.width:
         return True
     last = [row.cells[-1].strip() for row in rows[-SAMPLE_ROWS:] if layout.is_row(row)]
@@ -150,9 +148,9 @@ def _last(rows: Sequence[Row], is_one: Callable[[Row], bool]) -> int:
 
 
 def _as_wide(row: Row, layout: Layout, is_before_full: bool, source: str) -> list[str] | None:
-    """Return as many cells as the other rows have; None of a record that is no row.
+    """Return as many cells as the other rows have; None for a record that is not a row.
 
-    RecordingError where some are missing and full rows follow, or where there are more than the others have.
+    Raises RecordingError if cells are missing before full rows, or if there are more than in the other rows.
     """
     missing = layout.width - len(row.cells)
     if layout.is_row(row) or (not missing and not any(cell.strip() for cell in row.cells)):
@@ -173,7 +171,7 @@ def _words(row: Row) -> str:
 def _no_row(row: Row, source: str, more: str = "") -> RecordingError:
     text = shown(" ".join(row.cells))
     return RecordingError(
-        f"{source} has a line that is no row of numbers: line {row.line}, {text}{more and f', {more}'}; export it again"
+        f"{source} line {row.line} is not a row of numbers: {text}{more and f', {more}'}; export it again"
     )
 
 
@@ -181,13 +179,12 @@ def _uneven(row: Row, layout: Layout, source: str) -> RecordingError:
     filled = len(row.cells) if len(row.cells) != layout.width else sum(not is_void(cell) for cell in row.cells)
     most = layout.width if len(row.cells) != layout.width else layout.filled
     return RecordingError(
-        f"{source} has {filled} cells in line {row.line} where the other rows have {most}: its numbers may stand in "
-        "wrong columns; quote cells with commas in them, or export it again"
+        f"{source} has {filled} cells in line {row.line}, the other rows have {most}: its numbers may be in the "
+        "wrong columns; quote cells that contain commas, or export it again"
     )
 
 
 def _layout(rows: Sequence[Row]) -> Layout | None:
-    """Return the layout that most records of two numbers or more have."""
     rows = rows[:: max(1, len(rows) // SAMPLE_ROWS)]
     sample = [[is_number(cell) for cell in row.cells] for row in rows]
     numeric = [flags for flags in sample if sum(flags) > 1]
@@ -205,7 +202,7 @@ def _layout(rows: Sequence[Row]) -> Layout | None:
 def _first_row(rows: Sequence[Row], layout: Layout) -> int | None:
     """Return where the rows of numbers begin: several in succession.
 
-    Labels may stand beside the first of them; a head whose lines have numbers beside labels goes on with other lines.
+    Labels may stand next to the first of them; a head with numbers next to labels continues with other lines.
     """
     for k in range(min(len(rows) - SAME_WIDTH + 1, HEAD_LINES)):
         if layout.begins_rows(rows[k : k + SAME_WIDTH]):
@@ -216,7 +213,6 @@ def _first_row(rows: Sequence[Row], layout: Layout) -> int | None:
 
 
 def _with_doubtful(rows: Sequence[Row], first: int, layout: Layout) -> int:
-    """Return where the rows begin that have a text among their numbers, which is doubted where it is used."""
     while first and layout.is_doubtful(rows[first - 1]):
         first -= 1
     return first

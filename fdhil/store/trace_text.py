@@ -1,8 +1,8 @@
-"""Text files of oscilloscopes, drives and NCs: a head of any kind, then rows of numbers, read as RFC 4180 has them.
+"""Parses text files of oscilloscopes, drives and NCs: a head of any kind, then rows of numbers, by RFC 4180.
 
-Separator, decimal mark, encoding and the first row of numbers are found where the column map does not give them. A
-column is found by the text nearest above its numbers, or as ``#1``, ``#2`` ... from the left. Where a text can be read
-in two ways it is refused with both: a name above two columns, a mark that is decimal or separates thousands.
+Separator, decimal mark, encoding and the first row of numbers are detected unless the column map gives them. A column
+is named by the nearest text above its numbers, or ``#1``, ``#2`` ... from the left. An ambiguous text is refused with
+both readings: a name above two columns, a mark that is decimal or separates thousands.
 """
 
 import codecs
@@ -23,18 +23,18 @@ from fdhil.store.trace_cells import DECIMALS, is_number, is_void, is_written_by,
 from fdhil.store.trace_head import Head, read_head
 from fdhil.store.trace_rows import SAMPLE_ROWS, Body, Row, find_body
 
-SEPARATORS = "\t;,| "  # a blank stands for a run of blanks
+SEPARATORS = "\t;,| "  # a blank means a run of blanks
 MOST_LINES_IN_ROW = 8
-ENCODINGS = ("utf-8-sig", "cp1252", "cp932")  # tried in turn; of Western and of Japanese programs
-BINARY = {  # what a file begins with -> what it is, and what to do about it
+ENCODINGS = ("utf-8-sig", "cp1252", "cp932")  # tried in turn; Western and Japanese programs
+BINARY = {  # first bytes of a file -> its format and the remedy
     b"MDF     4": "an MDF 4 file: name it .mf4",
     b"MDF     ": "an MDF file of version 3 or older: save it as MDF 4, .mf4",
     b"MATLAB ": "a MATLAB file: name it .mat",
     b"\x89HDF": "an HDF5 file: name it .h5 (MATLAB 7.3: .mat)",
     b"PAR1": "a Parquet file: name it .parquet",
-    b"PK\x03\x04": "a packed file, as a workbook of Excel is: save the sheet as CSV",
-    b"\xd0\xcf\x11\xe0": "an old workbook of Excel: save the sheet as CSV",
-    b"TDSm": "a TDMS file of LabVIEW: export it as CSV or HDF5",
+    b"PK\x03\x04": "a packed file, such as an Excel workbook: save the sheet as CSV",
+    b"\xd0\xcf\x11\xe0": "an old Excel workbook: save the sheet as CSV",
+    b"TDSm": "a LabVIEW TDMS file: export it as CSV or HDF5",
 }
 _EXCEL = re.compile(r"\"?sep=(.)\"?\s*", re.IGNORECASE)
 _WHOLE_LINE = re.compile(r'"((?:[^"]|"")*)"\s*')
@@ -43,22 +43,22 @@ _WIDE_BLANKS = re.compile(r"\t|\s{2,}")
 
 
 class TraceText(Section):
-    """[text] of a column map: what is not given is found."""
+    """[text] of a column map: what is not given is detected."""
 
-    separator: str | None = Field(None, min_length=1, max_length=1, description="between cells; left out: it shows")
-    decimal: str | None = Field(None, pattern="^[.,]$", description="of numbers; left out: it shows")
-    encoding: str | None = Field(None, max_length=20, description="left out: UTF-16, UTF-8, cp1252, else cp932")
+    separator: str | None = Field(None, min_length=1, max_length=1, description="between cells; default: detected")
+    decimal: str | None = Field(None, pattern="^[.,]$", description="of numbers; default: detected")
+    encoding: str | None = Field(None, max_length=20, description="default: UTF-16, UTF-8, cp1252, else cp932")
 
 
-def parse_trace(content: bytes, told: TraceText, source: str) -> RecordingTable:
-    """Return all columns of a text, under the names nearest above them and as ``#1``, ``#2`` ...
+def parse_trace(content: bytes, settings: TraceText, source: str) -> RecordingTable:
+    """Return all columns of a text, under the nearest names above them and as ``#1``, ``#2`` ...
 
-    A lost value is ``nan``. RecordingError where there are no rows of numbers, or where they can be read in two ways.
+    A lost value is ``nan``. Raises RecordingError if there are no rows of numbers, or if they are ambiguous.
     """
-    lines = _text(content, told, source).replace("\r\r\n", "\n").splitlines(keepends=True)
+    lines = _text(content, settings, source).replace("\r\r\n", "\n").splitlines(keepends=True)
     check_lengths(lines, 1, source)
     lines = _without_outer_quotes(lines)
-    separator = told.separator
+    separator = settings.separator
     if lines and (stated := _EXCEL.fullmatch(lines[0])):
         separator, lines[0] = separator or stated[1], "\n"
     separator = separator or _separator(lines)
@@ -66,19 +66,21 @@ def parse_trace(content: bytes, told: TraceText, source: str) -> RecordingTable:
     if body is None:
         raise _no_rows(lines, separator, source)
     check_size(len(body.rows), body.layout.width, source)
-    decimal = told.decimal or _decimal(body, separator, source)
+    decimal = settings.decimal or _decimal(body, separator, source)
     return _table(body, read_head(_head_lines(lines, body, separator), body.layout), decimal)
 
 
-def _text(content: bytes, told: TraceText, source: str) -> str:
+def _text(content: bytes, settings: TraceText, source: str) -> str:
     if kind := next((kind for mark, kind in BINARY.items() if content.startswith(mark)), None):
-        raise RecordingError(f"{source} is no text but {kind}")
-    if told.encoding is not None:
+        raise RecordingError(f"{source} is not a text but {kind}")
+    if settings.encoding is not None:
         try:
-            codecs.lookup(told.encoding)
+            codecs.lookup(settings.encoding)
         except LookupError:
-            raise RecordingError(f"{source}: {told.encoding} is no encoding: correct it in the column map") from None
-        return text_of(content, source, told.encoding)
+            raise RecordingError(
+                f"{source}: unknown encoding {settings.encoding}: correct it in the column map"
+            ) from None
+        return text_of(content, source, settings.encoding)
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return text_of(content, source, "utf-16")
     if b"\0" in content[:2]:  # UTF-16 without its mark
@@ -93,7 +95,7 @@ def _text(content: bytes, told: TraceText, source: str) -> str:
 
 
 def _without_outer_quotes(lines: list[str]) -> list[str]:
-    """Return the lines of a file whose rows a spreadsheet took for one cell each, as they were before."""
+    """Undo a spreadsheet's quoting of whole rows as single cells."""
     quoted = [_WHOLE_LINE.fullmatch(line) for line in lines]
     if 2 * sum(match is not None for match in quoted) <= len(lines):
         return lines
@@ -103,7 +105,6 @@ def _without_outer_quotes(lines: list[str]) -> list[str]:
 
 
 def _separator(lines: Sequence[str]) -> str:
-    """Return what takes most lines apart into numbers and nothing else."""
     some = [line for line in lines if any(map(str.isdigit, line))]
     sample = some[:: max(1, len(some) // SAMPLE_ROWS)]
 
@@ -115,11 +116,10 @@ def _separator(lines: Sequence[str]) -> str:
             total += 2 * numbers - len(cells) if numbers > 1 else 0
         return total
 
-    return max(SEPARATORS, key=score)  # the first of those that are as good
+    return max(SEPARATORS, key=score)  # the first of equally good ones
 
 
 def _split(lines: Iterable[str], separator: str, quoting: int = csv.QUOTE_MINIMAL) -> Iterator[tuple[int, list[str]]]:
-    """Yield the cells of each record, and the number of its last line."""
     is_blank = separator == " "
     if is_blank:
         lines = (re.sub(r"[ \t]+", " ", line.strip()) for line in lines)
@@ -134,9 +134,9 @@ def _records(lines: Sequence[str], separator: str, source: str) -> list[Row]:
         ends = [0, *(row.line for row in rows)]
         if any(below - above > MOST_LINES_IN_ROW for above, below in pairwise(ends)):  # a quote without an end
             rows = [Row(*record) for record in _split(lines, separator, csv.QUOTE_NONE)]
-    except (csv.Error, TypeError, ValueError) as error:  # of a separator that is a quote, or an end of line
+    except (csv.Error, TypeError, ValueError) as error:  # a separator that is a quote or an end of line
         raise RecordingError(
-            f"{source} cannot be taken apart with separator {separator!r} ({error}): correct it in the column map"
+            f"{source} cannot be split with separator {separator!r} ({error}): correct it in the column map"
         ) from None
     return rows
 
@@ -144,7 +144,7 @@ def _records(lines: Sequence[str], separator: str, source: str) -> list[Row]:
 def _no_rows(lines: Sequence[str], separator: str, source: str) -> RecordingError:
     last = next((line.strip() for line in reversed(lines) if any(map(str.isdigit, line))), "")
     return RecordingError(
-        f"{source} has no rows of numbers (looked for with separator {separator!r}; the last line with a digit is "
+        f"{source} has no rows of numbers (separator {separator!r}; the last line with a digit is "
         f"{shown(last)}): give separator and decimal under [text] of the column map, or export it as text"
     )
 
@@ -165,19 +165,19 @@ def _decimal(body: Body, separator: str, source: str) -> str:
                 padded = padded or cell
     if marked:
         raise RecordingError(
-            f"{source} has numbers such as {shown(marked)} alone, whose mark may be decimal or stand between "
+            f"{source} has numbers such as {shown(marked)} only, whose mark may be decimal or separate "
             "thousands: give decimal under [text] of the column map"
         )
     if padded and separator == ",":
         raise RecordingError(
-            f"{source} has cells such as {shown(padded)} and no decimal point: commas that separate cells may be "
-            "decimal commas too; export it with quoted cells, or with another separator"
+            f"{source} has cells such as {shown(padded)} and no decimal point: commas between cells may be "
+            "decimal commas; export it with quoted cells, or with another separator"
         )
     return "."
 
 
 def _head_lines(lines: Sequence[str], body: Body, separator: str) -> list[list[Row]]:
-    """Return the lines above the rows in the ways in which they may be taken apart."""
+    """Return the lines above the rows in the possible ways to split them."""
     head: list[list[Row]] = []
     for row in body.head:
         cells = row.cells
@@ -203,21 +203,21 @@ def _table(body: Body, head: Head, decimal: str) -> RecordingTable:
         columns |= dict.fromkeys(named[j], read.values)
         texts |= dict.fromkeys(named[j], head.texts.get(j, ()))
         if read.bad is not None:
-            text = f"has {shown(cells[read.bad])} in line {body.rows[read.bad].line}, where a number belongs"
-            doubts |= dict.fromkeys(named[j], f"{text}: correct it there, or export the file again")
+            text = f"has {shown(cells[read.bad])} in line {body.rows[read.bad].line}, instead of a number"
+            doubts |= dict.fromkeys(named[j], f"{text}: correct it, or export the file again")
         if read.is_clock:
             clocks.update(named[j])
     unclear = dict(head.uneven)
     for name, (line, places) in head.twice.items():
-        stands = " and ".join(f"#{j + 1}" for j in places)
-        unclear[name] = f"stands above {stands} (line {line}): give one of these as its name"
+        columns_of_name = " and ".join(f"#{j + 1}" for j in places)
+        unclear[name] = f"names {columns_of_name} (line {line}): use one of these as its name"
         doubts |= _uneven_times(name, [f"#{j + 1}" for j in places if j < body.layout.width], columns)
     doubts |= {name: why for name, why in unclear.items() if name not in columns}
     return RecordingTable({}, columns, frozenset(clocks), doubts, body.interruption, texts=texts)
 
 
 def _uneven_times(name: str, places: Sequence[str], columns: Mapping[str, Float]) -> dict[str, str]:
-    """Return the doubt about columns of one name that are all times and differ: each channel has times of its own."""
+    """Return the doubt about columns of one name that are differing times: each channel has times of its own."""
     every = [columns[place][np.isfinite(columns[place])] for place in places]
     is_time = all(
         values.size > 2 and np.diff(values).min() > 0 and np.ptp(np.diff(values)) < 0.01 * np.diff(values).mean()
@@ -225,5 +225,5 @@ def _uneven_times(name: str, places: Sequence[str], columns: Mapping[str, Float]
     )
     if not is_time or all(np.array_equal(values, every[0]) for values in every):
         return {}
-    text = f"is a time beside each channel ({name}), and they differ: export all channels with one sample time"
+    text = f"is a separate time of each channel ({name}): export all channels with one sample time"
     return dict.fromkeys(places, text)

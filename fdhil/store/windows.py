@@ -1,8 +1,8 @@
-"""G0 windows as Parquet, one file each: what goes in comes out bit by bit.
+"""Stores G0 windows as Parquet, one file each, exactly to the bit.
 
-A column that came from a drive is stored as the drive's own integers with scale and unit in the metadata (a 1 s window
-takes some 10 kB); the store tries the scales it is given and falls back to floats where a column is no exact multiple.
-Files are numbered, never dated: the order holds however wrong the wall clock is.
+A column from a drive is stored as the drive's own integers with scale and unit in the metadata (a 1 s window takes some
+10 kB); the store tries the given scales and falls back to floats if a column is not an exact multiple. Files are
+numbered, never dated: the order is independent of the wall clock.
 """
 
 import hashlib
@@ -40,7 +40,7 @@ COLUMNS: Mapping[str, str] = {
     "table_m_s2": "m/s2",
     "current_off_a": "A",
 }
-ADDED_LATER = {"table_mm", "table_m_s2", "current_off_a"}  # in no window of before they were known: its digest stays
+ADDED_LATER = {"table_mm", "table_m_s2", "current_off_a"}  # absent in older windows, whose digest stays the same
 OPTIONAL = {"voltage_v", "offset_mm", *ADDED_LATER}
 _NAME = re.compile(r"w(\d{8,12})-([A-Z]2?)\.parquet")
 _META = b"fdhil"
@@ -76,7 +76,7 @@ class RawScale:
 
 
 def _bits(values: Float) -> Bits:
-    """Return the bit patterns; all NaN are one, since a lost sample has no payload."""
+    """Return the bit patterns; all NaN are equal, since a lost sample has no payload."""
     return np.where(np.isnan(values), np.nan, values).view(np.int64)
 
 
@@ -122,15 +122,15 @@ def _column(values: Float, candidates: Sequence[RawScale]) -> tuple[RawScale | N
 
 
 def _head(window: Window) -> dict[str, Any]:
-    """The fields of a window that are no arrays, as JSON keeps them exactly.
+    """Return the fields of a window that are not arrays, exactly as JSON stores them.
 
-    A slow sensor's samples are a column that ends earlier than the others; its grid is kept here.
+    A slow sensor's samples are a column that ends earlier than the others; its grid is stored here.
     """
     plain = {field.name: getattr(window, field.name) for field in fields(Window) if field.name not in COLUMNS}
     slow = plain.pop("slow_voltage")
-    if plain["torque_constant_nm_per_a"] is None:  # as in windows of before there was one: their digest stays
+    if plain["torque_constant_nm_per_a"] is None:  # as in older windows, whose digest stays the same
         del plain["torque_constant_nm_per_a"]
-    if plain["is_rapid"]:  # as all windows of before there were laboratory moves
+    if plain["is_rapid"]:  # as in windows from before laboratory moves
         del plain["is_rapid"]
     nc = plain.pop("nc")
     if nc is not None:
@@ -144,7 +144,6 @@ def _head(window: Window) -> dict[str, Any]:
 
 
 def _digest(window: Window) -> str:
-    """SHA-256 of a window's meaning: no bit of it can change unseen."""
     digest = hashlib.sha256(json.dumps(_head(window), sort_keys=True).encode())
     for name in COLUMNS:
         values = getattr(window, name)
@@ -157,12 +156,12 @@ def _digest(window: Window) -> str:
 
 
 def decode_window(content: bytes, source: str = "recording") -> Window:
-    """Return the window of a Parquet file's bytes; RecordingError when it is foreign, truncated or damaged."""
+    """Return the window of a Parquet file's bytes. RecordingError if it is foreign, truncated or damaged."""
     try:
         window, digest = _decode(content)
     except REFUSED as error:
         first = (str(error).splitlines() or [type(error).__name__])[0][:200]
-        raise RecordingError(f"{source} is no window recording of fdhil: {first}; {_NEXT}") from None
+        raise RecordingError(f"{source} is not a window recording of fdhil: {first}; {_NEXT}") from None
     if digest != _digest(window):
         raise RecordingError(f"{source} is damaged: its digest does not match its content; {_NEXT}")
     return window
@@ -187,26 +186,26 @@ def _decode(content: bytes) -> tuple[Window, str]:
         begin, period, error = (float(grid[name]) for name in ("begin_s", "period_s", "error_s"))
         late = read_only(np.array(grid["late_s"], np.float64)) if "late_s" in grid else None
         if late is not None and late.shape != samples.shape:
-            raise ValueError("its slow voltage has not one time per sample")
+            raise ValueError("its slow voltage lacks a time per sample")
         arrays["slow_voltage"] = SlowVoltage(begin, period, error, samples, late)
     return _window(head, arrays), str(head["digest"])
 
 
 def _check_declared(file: pq.ParquetFile, content: bytes) -> None:
     """Refuse, before any of it is read, what would take more than a window does; ValueError says what."""
-    told = file.metadata
-    if told.num_rows > MAX_ROWS:
-        raise ValueError(f"it declares {told.num_rows} rows, {MAX_ROWS} are allowed")
-    names = [file.schema.column(k).path for k in range(told.num_columns)]
+    metadata = file.metadata
+    if metadata.num_rows > MAX_ROWS:
+        raise ValueError(f"it declares {metadata.num_rows} rows, {MAX_ROWS} are allowed")
+    names = [file.schema.column(k).path for k in range(metadata.num_columns)]
     if len(set(names)) != len(names) or not {"tick", *COLUMNS, "slow_voltage_v"}.issuperset(names):
-        raise ValueError("it has columns that no window has")
-    for group in map(told.row_group, range(told.num_row_groups)):
+        raise ValueError("it has columns unknown in windows")
+    for group in map(metadata.row_group, range(metadata.num_row_groups)):
         for k, name in enumerate(names):
             column, shape = group.column(k), file.schema.column(k)
             if column.physical_type not in ("INT64", "DOUBLE") or shape.max_repetition_level:
-                raise ValueError(f"its column {name} holds no plain numbers")
+                raise ValueError(f"its column {name} does not contain plain numbers")
             if column.has_dictionary_page:
-                raise ValueError(f"its column {name} has a dictionary, which no window has")
+                raise ValueError(f"its column {name} has a dictionary, which windows never have")
             size = uncompressed_bytes(content, column.data_page_offset, column.total_compressed_size)
             if size > ROW_BYTES * group.num_rows + SPARE_BYTES:
                 raise ValueError(f"its column {name} declares {size} bytes for {group.num_rows} rows")
@@ -232,14 +231,14 @@ def _window(head: Mapping[str, Any], arrays: Mapping[str, Any]) -> Window:
 
 
 def read_window(path: Path) -> Window:
-    """Read one window file. RecordingError when it cannot be read, is too large, foreign, truncated or damaged."""
+    """Read one window file. RecordingError if it is unreadable, too large, foreign, truncated or damaged."""
     try:
         with path.open("rb") as file:
             content = file.read(MAX_FILE_BYTES + 1)
     except OSError as error:
-        raise RecordingError(f"{path} cannot be read: {error.strerror}; check the path and the rights") from None
+        raise RecordingError(f"{path} cannot be read: {error.strerror}; check the path and its permissions") from None
     if len(content) > MAX_FILE_BYTES:
-        raise RecordingError(f"{path} is larger than 64 MiB, which no window is; {_NEXT}")
+        raise RecordingError(f"{path} is larger than 64 MiB, too large for a window; {_NEXT}")
     return decode_window(content, str(path))
 
 
@@ -261,7 +260,7 @@ class Listing:
 
 
 def list_windows(folder: Path) -> Listing:
-    """List the window files of a folder; a folder that does not exist is empty. StoreError when it cannot be read."""
+    """List the window files of a folder; a missing folder is empty. Raises StoreError if it cannot be read."""
     windows, strays = [], []
     try:
         entries = sorted(folder.iterdir()) if folder.exists() else []
@@ -272,16 +271,16 @@ def list_windows(folder: Path) -> Listing:
             else:
                 strays.append(path.name)
     except OSError as error:
-        raise StoreError(f"{folder} cannot be listed: {error.strerror}; check its rights") from None
+        raise StoreError(f"{folder} cannot be listed: {error.strerror}; check its permissions") from None
     windows.sort(key=lambda file: file.number)
     return Listing(tuple(windows), tuple(strays))
 
 
 class WindowStore:
-    """The folder of windows, written by one daemon: append, and let the oldest go beyond ``keep`` files."""
+    """Writes the folder of windows (one daemon): appends, and removes the oldest beyond ``keep`` files."""
 
     def __init__(self, folder: Path, keep: int, config_digest: str) -> None:
-        """Open, and create where needed. StoreError when the folder cannot be made or listed."""
+        """Open or create the folder. Raises StoreError if it cannot be created or listed."""
         self.folder = folder
         self._keep = keep
         self._config_digest = config_digest
@@ -291,14 +290,14 @@ class WindowStore:
             raise store_error(folder, error) from None
         listing = list_windows(folder)
         self.strays = listing.strays
-        self.left: StoreError | None = None  # why the first file that should have gone is still there
+        self.left: StoreError | None = None  # why the first file that should have been removed is still there
         self._files = list(listing.windows)
 
     def append(self, window: Window, scales: Scales | None = None, at_least: int = 0) -> WindowFile:
         """Write a window durably and return its file; its number exceeds every stored one and ``at_least``.
 
-        StoreError when it cannot be written: nothing half-written is left under the window's name. An old file that
-        cannot be removed is left there, ``left`` says why; it is tried again by the next store that is opened.
+        Raises StoreError if it cannot be written: no incomplete file remains under the window's name. If an old file
+        cannot be removed, ``left`` says why; the next store that is opened tries again.
         """
         number = max(self._files[-1].number if self._files else 0, at_least) + 1
         file = WindowFile(number, window.axis, self.folder / f"w{number:08d}-{window.axis}.parquet")
@@ -313,8 +312,8 @@ class WindowStore:
             try:
                 path.unlink(missing_ok=True)
             except OSError as error:
-                text = f"{path} cannot be removed ({error.strerror}): it stays there, new windows are stored as before"
-                self.left = self.left or StoreError(f"{text}; check the disk and the file's rights")
+                text = f"{path} cannot be removed ({error.strerror}) and stays; new windows are still stored"
+                self.left = self.left or StoreError(f"{text}; check the disk and the file's permissions")
         if old:
-            with suppress(OSError):  # what a power cut brings back goes later
+            with suppress(OSError):  # a file that a power cut brings back is removed later
                 sync_folder(self.folder)

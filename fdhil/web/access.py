@@ -1,6 +1,6 @@
-"""Who may ask: logins, tokens that expire, and the rate of guesses. It knows no HTTP.
+"""Manages logins: users, expiring tokens, and throttling of password guesses. Independent of HTTP.
 
-A token is 256 random bits that live in this process alone, kept as their SHA-256; a restart ends every login.
+A token is 256 random bits that exist in this process alone, stored as their SHA-256; a restart ends every login.
 """
 
 import asyncio
@@ -31,7 +31,7 @@ MOST_PLACES = 1024
 
 @dataclass(frozen=True, slots=True)
 class Asker:
-    """Who asks: a name, empty for someone on this computer who need not log in, and a role."""
+    """A client: its user name, empty for a local one that need not log in, and its role."""
 
     name: str
     role: Role
@@ -39,7 +39,7 @@ class Asker:
 
 @dataclass(slots=True)
 class Session:
-    """A login: whose, and until when, on the monotonic clock. ``user`` is what the file said of him then."""
+    """A login: its client, and its end on the monotonic clock. ``user`` is the users file's entry at login."""
 
     asker: Asker
     user: User
@@ -55,7 +55,7 @@ class Guesses:
         self._wrong: OrderedDict[str, tuple[int, float]] = OrderedDict()
 
     def wait_s(self, key: str) -> float:
-        """Return how long it is until the next guess is allowed; 0 when it is."""
+        """Return the time until the next attempt is allowed; 0 if it is."""
         wait_s = min(LONGEST_WAIT_S, 2.0 ** min(60, self.count(key) - FREE_GUESSES))
         return max(0.0, self._last_s(key) + wait_s - self._now_s()) if self.count(key) >= FREE_GUESSES else 0.0
 
@@ -67,7 +67,6 @@ class Guesses:
         return self._wrong.get(key, (0, -math.inf))[1]
 
     def wrong(self, *keys: str) -> None:
-        """Note a wrong password."""
         now_s = self._now_s()
         for key in keys:
             count = self.count(key) + 1
@@ -77,24 +76,23 @@ class Guesses:
                 self._wrong.popitem(last=False)
 
     def right(self, *keys: str) -> None:
-        """Forget what was wrong before."""
         for key in keys:
             self._wrong.pop(key, None)
 
 
 @dataclass(eq=False, slots=True)
 class Waiting:
-    """A login that waits for its check: the fewest wrong passwords first, of those the newest."""
+    """A login waiting for its password check: the fewest wrong passwords first, then the newest."""
 
     order: tuple[int, int]
     turn: asyncio.Event = field(default_factory=asyncio.Event)
 
 
 class Turns:
-    """Has one password checked at a time, which takes a tenth of a second and 32 MiB.
+    """Checks one password at a time, since a check takes a tenth of a second and 32 MiB.
 
-    First those from where the fewest were wrong, of them the newest: a crowd of first guesses that waits already delays
-    nobody. Of an address the newest alone waits: the connection of an older one may have ended.
+    Addresses with the fewest wrong passwords come first, and the newest among them, so that a flood of first guesses
+    delays no user. Of an address only the newest login waits: the connection of an older one may have ended.
     """
 
     def __init__(self) -> None:
@@ -104,10 +102,10 @@ class Turns:
 
     @asynccontextmanager
     async def turn(self, place: str, wrong: int) -> AsyncIterator[None]:
-        """Wait for a turn after ``wrong`` wrong passwords from a place; Refused where a newer login is from there."""
+        """Wait for a turn after ``wrong`` wrong passwords from an address; Refused if a newer login came from it."""
         own, older = Waiting((wrong, -next(self._arrivals))), self._line.get(place)
         if older is not None:
-            older.turn.set()  # which is refused, or checked already
+            older.turn.set()  # it is refused, unless already checked
         self._line[place] = own
         self._begin_next()
         try:
@@ -129,35 +127,35 @@ class Turns:
 
 
 def _too_many(wait_s: float) -> Refused:
-    text = "too many logins failed or are being checked; nothing was looked at"
+    text = "too many logins failed or are waiting; this one was not checked"
     return Refused(429, "TooMany", text, f"try again in {max(1.0, wait_s):.0f} s")
 
 
 class Access:
-    """The users of one machine, and who of them is logged in."""
+    """The users of one machine and their logins."""
 
     def __init__(self, users_file: Path | None, now_s: Callable[[], float] = time.monotonic) -> None:
-        """Read the users, so that a faulty file is told at the start; ConfigError."""
+        """Read the users, so that a faulty file is reported at start. Raises ConfigError."""
         self._users_file = UsersFile(users_file) if users_file else None
         self._now_s = now_s
         self._sessions: OrderedDict[str, Session] = OrderedDict()
         self._guesses = Guesses(now_s)
-        # where who has logged in: guesses elsewhere do not lock him out there
+        # users by network of their logins: guesses from elsewhere do not lock them out
         self._places: OrderedDict[tuple[str, str], None] = OrderedDict()
         self._turns = Turns()
 
     @property
     def by_login(self) -> bool:
-        """Whether there are users at all; without, who reaches the address may read, and nobody may act."""
+        """Whether there are users; without them every client may read, and none may act."""
         return self._users_file is not None
 
     def _user(self, name: str) -> User | None:
         return self._users_file.user(name) if self._users_file else None
 
     async def log_in(self, name: str, password: str, address: str) -> tuple[str, Session]:
-        """Return a new token and its session; Refused when name or password is wrong, or too many were.
+        """Return a new token and its session; Refused for a wrong name or password, or after too many.
 
-        Where no password was wrong before one is checked, and first: guessing elsewhere locks nobody out.
+        An address without a wrong password is checked, and first: guesses from elsewhere lock out no user.
         """
         place = place_of(address)
         of_place = f"address {place}"
@@ -171,7 +169,9 @@ class Access:
             fits = await asyncio.to_thread(matches, user, password[: LONGEST_PASSWORD + 1])
         if user is None or not fits:
             self._guesses.wrong(*keys)
-            raise Refused(401, "AuthRequired", "name or password is wrong", "check both; fdhil web-user sets a new one")
+            raise Refused(
+                401, "AuthRequired", "wrong name or password", "check both; fdhil web-user sets a new password"
+            )
         self._guesses.right(*keys)
         self._places[name, place] = None
         while len(self._places) > MOST_PLACES:
@@ -179,7 +179,7 @@ class Access:
         return self.begin(name, user)
 
     def begin(self, name: str, user: User) -> tuple[str, Session]:
-        """Return a new token of a user whose password was right; the oldest of who has the most makes room for it."""
+        """Return a new token for a user; beyond the limit the user with the most logins loses the oldest."""
         token, now_s = secrets.token_urlsafe(32), self._now_s()
         session = Session(Asker(name, user.role), user, now_s + LIFE_S, now_s + IDLE_S)
         self._sessions[_key(token)] = session
@@ -189,9 +189,9 @@ class Access:
         return token, session
 
     def asker(self, token: str | None) -> Asker | None:
-        """Return whose token this is; None for none, one that has expired, or of a user who was changed since.
+        """Return the client of a token; None if there is none, if it has expired, or if its user was changed.
 
-        What is looked up is its digest, so that the time it takes tells nothing of the token.
+        The lookup is by digest, so that its duration reveals nothing about the token.
         """
         if not self.by_login:
             return Asker("", "watch")
@@ -203,16 +203,16 @@ class Access:
         if changed or now_s >= min(session.ends_s, session.idle_ends_s):
             self.log_out(token)
             return None
-        session.idle_ends_s = now_s + IDLE_S  # in place: to write it back would undo a logout that came meanwhile
+        session.idle_ends_s = now_s + IDLE_S  # in place: storing it again would undo a concurrent logout
         return session.asker
 
     def log_out(self, token: str | None) -> None:
-        """End a login; one that is not there is ended already."""
+        """End a login; an unknown token is ignored."""
         self._sessions.pop(_key(token or ""), None)
 
 
 def place_of(address: str) -> str:
-    """Return whose address it is: of IPv6 its network, for a computer has as many addresses there as it likes."""
+    """Return the network of an address: of IPv6 the /64, since one computer can use all of its addresses."""
     try:
         ip = ipaddress.ip_address(address.partition("%")[0])
     except ValueError:

@@ -1,4 +1,4 @@
-"""What is answered when it is no: one document for every fault, and the status that fits."""
+"""Fault responses: one kind of document for every fault, with its HTTP status."""
 
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -18,11 +18,11 @@ STATUS: Mapping[type[FdhilError], int] = {
 }
 BY_CODE = {"AuthRequired": 403, "BadRequest": 422, "BadName": 400, "NoHistory": 404, "NotKept": 404, "Busy": 503}
 REFUSED = 409
-"""What the daemon or the guard refuses is a conflict with the state of the machine."""
+"""A refusal of the daemon or the guard is a conflict with the machine's state."""
 
 
 class Fault(BaseModel):
-    """A no: its class, what happened and what it means for the machine, what to do next."""
+    """A fault: its code, what happened and what it means for the machine, and the next action."""
 
     ok: Literal[False] = False
     code: str
@@ -31,7 +31,7 @@ class Fault(BaseModel):
 
 
 class Refused(Exception):
-    """Ends a request with a status and a :class:`Fault`; ``more`` is told beside it."""
+    """Ends a request with a status and a :class:`Fault`; ``more`` is added to the document."""
 
     def __init__(self, status: int, code: str, text: str, advice: str = "", more: Mapping[str, Any] | None = None):
         self.status = status
@@ -40,7 +40,6 @@ class Refused(Exception):
 
 
 def status_of(error: FdhilError) -> int:
-    """Return the HTTP status that fits an error of fdhil."""
     code = getattr(error, "code", "")
     if code in BY_CODE:
         return BY_CODE[code]
@@ -48,16 +47,16 @@ def status_of(error: FdhilError) -> int:
 
 
 def document_of(error: FdhilError) -> dict[str, Any]:
-    """Return an error of fdhil as a fault; what to do next is behind the last semicolon of its sentence."""
+    """Return an fdhil error as a fault; the text after the last semicolon is the advice."""
     text, _, advice = str(error).rpartition("; ")
     code = getattr(error, "code", None)
     return refusal(code if isinstance(code, str) else type(error).__name__, text or advice, advice if text else "")
 
 
 def granted(answer: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the daemon's answer when it is yes; Refused with its reasons when it is no."""
+    """Return the daemon's answer if it was granted; raise Refused with its reasons if not."""
     if answer.get("ok") is True:
         return answer
     code = str(answer.get("code", "NoAnswer"))
-    told = (str(answer.get("text", "the daemon gave no reason")), str(answer.get("advice", "see the daemon's log")))
-    raise Refused(BY_CODE.get(code, REFUSED), code, *told, more=answer)
+    reason = (str(answer.get("text", "the daemon gave no reason")), str(answer.get("advice", "see the daemon's log")))
+    raise Refused(BY_CODE.get(code, REFUSED), code, *reason, more=answer)

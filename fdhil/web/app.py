@@ -1,4 +1,4 @@
-"""Puts the pages together behind the gate: one application for one machine, or for many."""
+"""Builds the web application behind the request gate, for one machine or for many."""
 
 import logging
 import pkgutil
@@ -31,23 +31,23 @@ from fdhil.web.json_answer import Json
 
 MENU = ("machine", "live", "rapids", "history", "program", "events")
 SHELL = (*MENU, "panel")
-"""The first parts of the paths that the browser's router knows."""
-PACKED_FROM, PACKING = 4096, 4  # bytes, and how hard: a slow network gains, no token is in what is that long
+"""The first parts of the paths of the browser's router."""
+PACKED_FROM, PACKING = 4096, 4  # bytes, level: helps slow networks; no token is in responses of this size
 STATIC = Path(__file__).parent / "static"
 FAULTS: dict[int | str, dict[str, Any]] = {
     status: {"model": Fault, "description": what}
     for status, what in {
-        400: "not understood", 401: "no login", 403: "not allowed", 404: "not there", 405: "no such method",
-        408: "too slow", 409: "refused by the machine's state", 413: "too large",
-        421: "not the name of this server", 422: "a value is wrong", 429: "too many", 500: "a fault of fdhil",
-        503: "the daemon or the store is not there",
-        504: "the daemon is silent",
+        400: "bad request", 401: "no login", 403: "not allowed", 404: "not found", 405: "method not allowed",
+        408: "too slow", 409: "refused in the machine's state", 413: "too large",
+        421: "unknown host name", 422: "invalid value", 429: "too many requests", 500: "internal error",
+        503: "daemon or store unavailable",
+        504: "no answer from the daemon",
     }.items()
 }  # fmt: skip
 
 
 def make_app(config: MachineConfig) -> FastAPI:
-    """Return the application of one machine. ConfigError where its users file is faulty."""
+    """Return the application of one machine. Raises ConfigError if its users file is faulty."""
     app = application(config.web, page_routers(), MENU, SHELL, "fdhil status CONFIG")
     app.state.context = Context(config, Daemon(config.run_directory / SOCKET_NAME), app.state.entry.access)
     return app
@@ -56,10 +56,10 @@ def make_app(config: MachineConfig) -> FastAPI:
 def application(
     web: Web, routers: Iterable[APIRouter], menu: Iterable[str], paths: Iterable[str], command: str
 ) -> FastAPI:
-    """Return an application behind the gate. ConfigError as above.
+    """Return an application behind the gate. Raises ConfigError as above.
 
-    ``paths`` are the first parts of those that the browser's router knows, ``menu`` the pages that it offers;
-    ``command`` tells the same where a browser runs no scripts.
+    ``paths`` are the first parts of those of the browser's router, ``menu`` its pages; ``command`` is the alternative
+    shown if the browser runs no scripts.
     """
     access = Access(web.users_file)
     app = FastAPI(
@@ -102,7 +102,7 @@ def _serve_shell(app: FastAPI, document: str, paths: Iterable[str]) -> None:
 def _answer_faults(app: FastAPI) -> None:
     """Answer every fault with one kind of document, and never with a traceback.
 
-    All are coroutines, as in ``fdhil.web.context``: a disarm that is refused waits for no thread either.
+    All handlers are coroutines, as in ``fdhil.web.context``: a refused disarm must not wait for a thread either.
     """
 
     @app.exception_handler(Refused)
@@ -115,20 +115,20 @@ def _answer_faults(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def wrong(_request: Request, error: RequestValidationError) -> Json:
-        told = "; ".join(f"{'.'.join(map(str, fault['loc'][1:]))}: {fault['msg']}" for fault in error.errors()[:5])
-        return Json(refusal("BadRequest", told, "mend the values that are named"), 422)
+        faults = "; ".join(f"{'.'.join(map(str, fault['loc'][1:]))}: {fault['msg']}" for fault in error.errors()[:5])
+        return Json(refusal("BadRequest", faults, "correct the listed values"), 422)
 
     @app.exception_handler(HTTPException)
     async def none_such(_request: Request, error: HTTPException) -> Json:
-        if isinstance(error.__cause__, Refused):  # a body that grew too large while it was read
+        if isinstance(error.__cause__, Refused):  # the body exceeded its limit while it was read
             return await refused(_request, error.__cause__)
         code = {404: "NotFound", 405: "NoSuchMethod"}.get(error.status_code, "BadRequest")
-        text = {404: "there is nothing at this address", 405: "this address does not take that method"}
-        told = refusal(code, text.get(error.status_code, str(error.detail)), "see /api/openapi.json")
-        return Json(told, error.status_code, headers=error.headers)
+        text = {404: "there is nothing at this address", 405: "this address does not support the method"}
+        faults = refusal(code, text.get(error.status_code, str(error.detail)), "see /api/openapi.json")
+        return Json(faults, error.status_code, headers=error.headers)
 
     @app.exception_handler(Exception)
     async def broken(request: Request, error: Exception) -> Json:
         logging.getLogger("fdhil.web").error("%s %s failed", request.method, request.url.path, exc_info=error)
-        text = "fdhil web met a fault of its own; the machine and the daemon are not touched by it"
-        return Json(refusal("InternalError", text, "report what its log says"), 500)
+        text = "fdhil web had an internal error; the machine and the daemon are not affected"
+        return Json(refusal("InternalError", text, "report it with the log of fdhil web"), 500)

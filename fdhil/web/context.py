@@ -1,7 +1,7 @@
-"""What the routes need: the configuration, the daemon, the store, and who asks.
+"""Dependencies of the routes: configuration, daemon, store, and the client.
 
-What is needed before a route begins is a coroutine here and on every page: a plain function would wait for one of the
-forty threads that plain routes run in, and who takes those would keep an operator from disarming.
+Dependencies are coroutines here and on every page: a plain function would wait for one of the forty threads of plain
+routes, and clients that occupy those could keep an operator from disarming.
 """
 
 from collections.abc import Iterator
@@ -27,7 +27,7 @@ class Context:
     daemon: Daemon
     access: Access
     checked: set[tuple[int, int]] = field(default_factory=set)
-    """Histories, by device and inode, that were found whole: to look at all of a large one takes a second."""
+    """Intact histories by device and inode: checking a large one takes a second."""
 
     @contextmanager
     def history(self) -> Iterator[History]:
@@ -38,7 +38,7 @@ class Context:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Who may come in: the same for the pages of one machine and of many."""
+    """The login data, the same for the pages of one machine and of many."""
 
     web: Web
     access: Access
@@ -57,14 +57,14 @@ async def _context(connection: HTTPConnection) -> Context:
 
 
 async def _asker(connection: HTTPConnection) -> Asker:
-    asker = connection.scope["fdhil.asker"]  # the gate has put it there
-    assert isinstance(asker, Asker)
-    return asker
+    principal = connection.scope["fdhil.principal"]  # set by the gate
+    assert isinstance(principal, Asker)
+    return principal
 
 
-AtEntry = Annotated[Entry, Depends(_entry)]
-"""The parameter of a route that needs to know who may come in."""
-Here = Annotated[Context, Depends(_context)]
-"""The parameter of a route that needs the machine: ``def windows(here: Here) -> ...``."""
-Asking = Annotated[Asker, Depends(_asker)]
-"""The parameter of a route that needs to know who asks: a name and a role."""
+LoginDependency = Annotated[Entry, Depends(_entry)]
+"""Route parameter: the login data."""
+MachineDependency = Annotated[Context, Depends(_context)]
+"""Route parameter: the machine, as in ``def windows(context: MachineDependency) -> ...``."""
+PrincipalDependency = Annotated[Asker, Depends(_asker)]
+"""Route parameter: the client's name and role."""

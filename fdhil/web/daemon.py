@@ -1,4 +1,4 @@
-"""Asks the daemon over its socket, without blocking; who is not waited for any more takes the question back."""
+"""Sends requests to the daemon's socket without blocking; cancelling a request withdraws it."""
 
 import asyncio
 import time
@@ -16,7 +16,7 @@ Progress = Callable[[Mapping[str, Any]], None]
 
 
 class Daemon:
-    """The daemon of one machine, as seen from a process of its own."""
+    """The daemon of one machine, as seen from another process."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -25,9 +25,9 @@ class Daemon:
     async def ask(
         self, request: Mapping[str, Any], timeout_s: float = ANSWER_S, progress: Progress | None = None
     ) -> dict[str, Any]:
-        """Send one request and return its answer. ConnectError when no daemon listens, DeviceTimeout when it is silent.
+        """Send one request and return its answer. ConnectError if no daemon listens, DeviceTimeout if it is silent.
 
-        Cancelled it closes the connection, by which the daemon abandons what it was preparing.
+        Cancelling it closes the connection, by which the daemon abandons what it was preparing.
         """
         asked = {**request, "progress": True} if progress else request
         try:
@@ -39,16 +39,16 @@ class Daemon:
                 finally:
                     writer.close()
         except TimeoutError:
-            text = f"did not answer within {timeout_s:.0f} s, what the machine does is unknown here; see its log"
+            text = f"did not answer within {timeout_s:.0f} s, the machine's state is unknown here; check its log"
             raise DeviceTimeout("daemon", text) from None
         except OSError as error:
             absent = f"is not running ({error.strerror or error}); start it with fdhil run CONFIG"
             raise ConnectError.of_socket("daemon", error, absent) from None
 
     async def status(self) -> Mapping[str, Any]:
-        """Return the status document, at most half a second old: many browsers ask the daemon no more than one does.
+        """Return the status document, at most half a second old: many browsers cause no more requests than one.
 
-        Who comes while it is asked has the same answer, or the same failure: nobody waits in a line before silence.
+        Concurrent callers share one answer, or one failure: they do not queue for a silent daemon.
         """
         now_s = time.monotonic()
         if self._status is None or _stale(*self._status, now_s):
@@ -69,5 +69,5 @@ async def _answer(reader: asyncio.StreamReader, progress: Progress | None) -> di
     except ValueError:  # a line without an end
         answer = None
     if answer is None:
-        raise ConnectError("daemon", "closed the connection without an answer; see its log")
+        raise ConnectError("daemon", "closed the connection without an answer; check its log")
     return answer

@@ -1,4 +1,4 @@
-"""Sends a file as it is: a recording, a black box."""
+"""Sends a file unchanged: a recording or a black box."""
 
 from functools import partial
 from typing import BinaryIO
@@ -10,7 +10,7 @@ PIECE = 64 * 1024
 
 
 class FileAnswer(StreamingResponse):
-    """An open file, piece by piece: of however many ask at once and read slowly, no more is held in memory."""
+    """An open file, sent in pieces, so that many slow clients do not fill the memory."""
 
     def __init__(self, file: BinaryIO, name: str, media_type: str) -> None:
         self._file = file
@@ -18,6 +18,5 @@ class FileAnswer(StreamingResponse):
         super().__init__(iter(partial(file.read, PIECE), b""), headers=headers, media_type=media_type)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send it, and close it."""
         with self._file:
             await super().__call__(scope, receive, send)

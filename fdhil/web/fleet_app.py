@@ -1,6 +1,6 @@
-"""The page of many machines: who they are, what is due, which axis is unlike its sisters, how each parameter moved.
+"""The page of many machines: their state, due maintenance, axes that differ from their peers, parameter trends.
 
-It reads the works' database by what it is given to ask with, and reaches no machine.
+It reads the fleet's database through the given query function and reaches no machine.
 """
 
 import threading
@@ -18,7 +18,7 @@ from fdhil.web.app import application
 from fdhil.web.pages import session
 
 router = APIRouter(prefix="/api/fleet")
-KEPT_S = 30.0  # an answer is as good for so long: a hundred browsers ask the database as one
+KEPT_S = 30.0  # lifetime of an answer: a hundred browsers load the database like one
 MOST_KEPT = 64
 MOST_SETS = 2000
 Ask = Callable[..., Mapping[str, Any]]
@@ -28,7 +28,7 @@ Axis = Annotated[str, Query(pattern=r"^[A-Z]2?$")]
 
 
 class Answers:
-    """Asks one question at a time, and keeps the newest answers for a while."""
+    """Runs one query at a time, and caches the newest answers for a while."""
 
     def __init__(self, ask: Ask, now_s: Callable[[], float] = time.monotonic) -> None:
         self._ask, self._now_s = ask, now_s
@@ -36,7 +36,6 @@ class Answers:
         self._one = threading.Lock()
 
     def __call__(self, question: str, **given: str | None) -> Mapping[str, Any]:
-        """Return the answer of a question, as JSON has it. FdhilError."""
         key = (question, *given.values())
         with self._one:
             at_s, answer = self._kept.pop(key, (-KEPT_S, {}))
@@ -54,46 +53,54 @@ async def _answers(request: Request) -> Answers:
     return answers
 
 
-Asked = Annotated[Answers, Depends(_answers)]
+CacheDependency = Annotated[Answers, Depends(_answers)]
 
 
 def make_fleet_app(web: Web, ask: Ask) -> FastAPI:
-    """Return the application; ``ask(question, **given)`` answers. ConfigError where the users file is faulty."""
+    """Return the application; ``ask(question, **given)`` answers. Raises ConfigError for a faulty users file."""
     app = application(web, (session.router, router), ("fleet",), ("fleet",), "fdhil fleet status FLEET")
     app.state.answers = Answers(ask)
     return app
 
 
 @router.get("")
-def machines(asked: Asked) -> Mapping[str, Any]:
+def machines(cache: CacheDependency) -> Mapping[str, Any]:
     """Return all machines, and what is due."""
-    return asked("status")
+    return cache("status")
 
 
 @router.get("/outliers")
-def outliers(asked: Asked, by: Label = "type") -> Mapping[str, Any]:
-    """Return the axes that are unlike their sisters: those of machines with the same label ``by``."""
-    return asked("outliers", by=by, axis=None)
+def outliers(cache: CacheDependency, by: Label = "type") -> Mapping[str, Any]:
+    """Return the axes that differ from their peers: those of machines with the same label ``by``."""
+    return cache("outliers", by=by, axis=None)
 
 
 @router.get("/compare")
 def compare(
-    asked: Asked, parameter: Literal["R", "L", "K", "Jt", "ft", "Cd"], by: Label = "type", axis: Axis | None = None
+    cache: CacheDependency,
+    parameter: Literal["R", "L", "K", "Jt", "ft", "Cd"],
+    by: Label = "type",
+    axis: Axis | None = None,
 ) -> Mapping[str, Any]:
     """Return one parameter of all machines side by side."""
-    return asked("compare", parameter=parameter, by=by, axis=axis)
+    return cache("compare", parameter=parameter, by=by, axis=axis)
 
 
 @router.get("/services")
-def services(asked: Asked, machine: Machine | None = None) -> Mapping[str, Any]:
+def services(cache: CacheDependency, machine: Machine | None = None) -> Mapping[str, Any]:
     """Return the services, and what each changed."""
-    return asked("services", machine=machine)
+    return cache("services", machine=machine)
 
 
 @router.get("/axis")
-def axis(asked: Asked, machine: Machine, axis: Axis) -> dict[str, Any]:
-    """Return how each parameter of an axis moved, its newest sets."""
-    courses = [asked("trend", machine=machine, axis=axis, parameter=name) for name in PARAMETERS]
+def axis(cache: CacheDependency, machine: Machine, axis: Axis) -> dict[str, Any]:
+    """Return the trend of each parameter of an axis, with its newest sets."""
+    courses = [cache("trend", machine=machine, axis=axis, parameter=name) for name in PARAMETERS]
     if not courses[0]["sets"]:
-        raise Refused(404, "NoSuchAxis", f"no parameters of axis {axis} of {machine} were collected", "see /fleet")
+        raise Refused(
+            404,
+            "NoSuchAxis",
+            f"no parameters of axis {axis} of {machine} were collected",
+            "choose a machine and axis of /fleet",
+        )
     return {"machine": machine, "axis": axis, "courses": [{**c, "sets": c["sets"][-MOST_SETS:]} for c in courses]}

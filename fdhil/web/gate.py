@@ -1,8 +1,8 @@
-"""The gate before every route: host, origin, size, login and role are checked before a byte of a body is read.
+"""The gate before every route: checks host, origin, size, login and role before a byte of a body is read.
 
-One rule for all routes, so that no page can forget it: what is under /api needs the role ``watch`` to be read, and
-``operate`` to be changed. To disarm, a login is enough: standing still is never refused to one who may look. The
-shell, its scripts and the login are open; they tell nothing of the machine.
+One rule for all routes: reading below /api requires the role ``watch``, changing ``operate``. Disarming requires only a
+login: a client that may read can always stop the correction. The shell, its scripts and the login are open and reveal
+nothing of the machine.
 """
 
 import asyncio
@@ -22,14 +22,14 @@ API = "/api/"
 SESSION = "/api/session"
 DISARM = "/api/machine/disarm"
 COMPUTES_ONLY = "/api/program"
-"""A program is judged for who may read: nothing of the machine is touched."""
+"""Judging a program requires reading rights only: it does not affect the machine."""
 READING = ("GET", "HEAD", "OPTIONS")
 LARGEST_BODY = 64 * 1024
 LARGEST_PROGRAM = 16 * 1024 * 1024
 BODY_S, PROGRAM_S = 20.0, 300.0
-"""For how long a body may take to come: who sends it a byte at a time holds no connection."""
+"""Time limits of a body, so that slow senders cannot hold connections."""
 BEARER = "bearer."
-"""A browser's socket has no header for its token: it comes as a subprotocol, ["fdhil", "bearer.TOKEN"]."""
+"""A browser's WebSocket has no header for the token: it is a subprotocol, ["fdhil", "bearer.TOKEN"]."""
 HEADERS: Mapping[str, str] = {
     "content-security-policy": (
         "default-src 'self'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'; object-src 'none'"
@@ -44,7 +44,7 @@ HEADERS: Mapping[str, str] = {
 
 
 class Gate:
-    """Lets through what may pass, and answers the rest itself."""
+    """Passes permitted requests on, and answers the others."""
 
     def __init__(self, app: ASGIApp, settings: Web, access: Access) -> None:
         self._app, self._access, self._settings = app, access, settings
@@ -54,31 +54,32 @@ class Gate:
         self._origins = {origin.rstrip("/").lower() for origin in settings.allowed_origins}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Check a request or a socket, then hand it on."""
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
         headers = Headers(scope=scope)
         try:
             self._check_place(scope, headers)
-            asker = self._check_asker(scope, headers)
+            principal = self._check_asker(scope, headers)
             most, within_s = (LARGEST_PROGRAM, PROGRAM_S) if _computes(scope["path"]) else (LARGEST_BODY, BODY_S)
             _check_length(headers, most)
         except Refused as refused:
             await _refuse(scope, send, refused)
             return
-        scope["fdhil.asker"] = asker
+        scope["fdhil.principal"] = principal
         if scope["type"] == "websocket":
             await self._app(scope, receive, send)
         else:
             await self._app(scope, _bounded(receive, most, within_s), _with_headers(scope, send))
 
     def _check_place(self, scope: Scope, headers: Headers) -> None:
-        """Refuse a name that is not ours (DNS rebinding) and a page that is not ours (forged requests)."""
+        """Refuse foreign host names (DNS rebinding) and foreign pages (forged requests)."""
         host = headers.get("host", "").lower()
         if _name(host) not in self._hosts or len(headers.getlist("host")) != 1:
-            text = "this is not the name of this server"
-            raise Refused(421, "BadHost", text, "use the address fdhil web told, or add the name to web.allowed_hosts")
+            text = "this server does not have the requested name"
+            raise Refused(
+                421, "BadHost", text, "use the address printed by fdhil web, or add the name to web.allowed_hosts"
+            )
         origin = headers.get("origin")
         own = f"{'https' if scope['scheme'] in ('https', 'wss') else 'http'}://{host}"
         foreign = origin is not None and origin.lower() not in (own, *self._origins)
@@ -86,35 +87,35 @@ class Gate:
         if origin is None and scope["path"].startswith(API):
             foreign = site not in ("none", "same-origin")
         if foreign:
-            text = "the request comes from a page of another server, nothing was done"
+            text = "the request comes from another server's page, nothing was done"
             raise Refused(403, "BadOrigin", text, "open fdhil's own page, or add the page to web.allowed_origins")
 
     def _check_asker(self, scope: Scope, headers: Headers) -> Asker:
         path, token = scope["path"], token_of(headers)
-        asker = self._access.asker(token)
+        principal = self._access.asker(token)
         writes = scope["type"] == "http" and scope["method"] not in READING
         if writes and headers.get("x-fdhil") != "1":
             raise Refused(403, "BadOrigin", "the header X-Fdhil is missing, nothing was done", "send X-Fdhil: 1")
         if not path.startswith(API) or path == SESSION:
-            return asker or Asker("", "watch")
-        if asker is None:
-            text = "this needs a login, and there is none or it has ended; nothing was done"
+            return principal or Asker("", "watch")
+        if principal is None:
+            text = "not logged in, or the login has expired; nothing was done"
             raise Refused(401, "AuthRequired", text, "log in again")
         if writes and not _computes(path):
-            self._check_acting(path, asker)
-        return asker
+            self._check_acting(path, principal)
+        return principal
 
-    def _check_acting(self, path: str, asker: Asker) -> None:
+    def _check_acting(self, path: str, principal: Asker) -> None:
         if not self._access.by_login:
-            text = "nobody may act in this browser: there are no users; nothing was done"
-            raise Refused(401, "AuthRequired", text, "set web.users_file and make a user with fdhil web-user")
+            text = "no user may act in the browser: there are no users; nothing was done"
+            raise Refused(401, "AuthRequired", text, "set web.users_file and add a user with fdhil web-user")
         if path == DISARM:
             return
-        if asker.role != "operate":
-            text = f"{asker.name} has the role {asker.role}, nothing was done"
-            raise Refused(403, "RoleRequired", text, "have someone with the role operate do it")
+        if principal.role != "operate":
+            text = f"{principal.name} has the role {principal.role}, nothing was done"
+            raise Refused(403, "RoleRequired", text, "ask a user with the role operate")
         if not self._settings.acting:
-            text = "nothing but to disarm may be done in a browser here, nothing was done"
+            text = "only disarming is allowed in the browser here, nothing was done"
             raise Refused(403, "ActingOff", text, "use the command line, or set web.acting = true")
 
 
@@ -123,7 +124,7 @@ def _computes(path: str) -> bool:
 
 
 def token_of(headers: Headers) -> str | None:
-    """Return the token of a request: a header, or of a browser's socket a subprotocol."""
+    """Return the token of a request: from a header, or from the subprotocol of a browser's socket."""
     kind, _, token = headers.get("authorization", "").partition(" ")
     if kind.lower() == "bearer":
         return token.strip() or None
@@ -132,7 +133,6 @@ def token_of(headers: Headers) -> str | None:
 
 
 def _name(host: str) -> str:
-    """Return a host without its port; empty where it is none."""
     try:
         parts = urlsplit(f"//{host}")
         name, _ = parts.hostname or "", parts.port
@@ -146,11 +146,11 @@ def _name(host: str) -> str:
 def _check_length(headers: Headers, most: int) -> None:
     length = headers.get("content-length", "0")
     if not length.isdecimal() or int(length[:20]) > most:
-        raise Refused(413, "TooLarge", f"more than {most >> 10} KiB were sent, they were not read", "send less")
+        raise Refused(413, "TooLarge", f"more than {most >> 10} KiB were sent, nothing was read", "send less")
 
 
 def _bounded(receive: Receive, most: int, within_s: float) -> Receive:
-    """Return a ``receive`` that ends a body which is longer than it may be, also one that told no length, or slower."""
+    """Wrap ``receive`` to end a body that is too long or too slow, whatever length it declared."""
     taken = 0
     until_s: float | None = asyncio.get_running_loop().time() + within_s
 
@@ -160,9 +160,11 @@ def _bounded(receive: Receive, most: int, within_s: float) -> Receive:
             async with asyncio.timeout_at(until_s):
                 message = await receive()
         except TimeoutError:
-            raise Refused(408, "TooSlow", "what was sent did not end, nothing was done", "send it again") from None
+            raise Refused(
+                408, "TooSlow", "the request was not complete in time, nothing was done", "send it again"
+            ) from None
         if not message.get("more_body", False):
-            until_s = None  # what comes now is that the browser leaves
+            until_s = None  # what follows is the disconnect
         taken += len(message.get("body", b""))
         if taken > most:
             raise Refused(413, "TooLarge", f"more than {most >> 10} KiB were sent, nothing was done", "send less")
@@ -172,11 +174,11 @@ def _bounded(receive: Receive, most: int, within_s: float) -> Receive:
 
 
 def _with_headers(scope: Scope, send: Send) -> Send:
-    kept = "no-store" if scope["path"].startswith(API) else "no-cache"
+    cache_control = "no-store" if scope["path"].startswith(API) else "no-cache"
 
     async def sending(message: Message) -> None:
         if message["type"] == "http.response.start":
-            more = {**HEADERS, "cache-control": kept}
+            more = {**HEADERS, "cache-control": cache_control}
             message["headers"] = [*message["headers"], *((k.encode(), v.encode()) for k, v in more.items())]
         await send(message)
 

@@ -1,4 +1,4 @@
-"""How every answer that is JSON is written: whatever text is in it."""
+"""Serialises JSON responses, whatever text they contain."""
 
 import json
 from typing import Any
@@ -8,13 +8,12 @@ from pydantic_core import PydanticSerializationError, to_json
 
 
 class Json(JSONResponse):
-    """Every JSON of the pages: a number that is none is null, half a character a question mark.
+    """A JSON response: non-finite numbers become null, lone surrogates a question mark.
 
-    Half of one comes in file names that are no UTF-8; it cannot be sent.
+    Lone surrogates come from file names that are not UTF-8 and cannot be sent.
     """
 
     def render(self, content: Any) -> bytes:
-        """Return the body."""
         try:
             return to_json(content, inf_nan_mode="null")
         except PydanticSerializationError:

@@ -1,8 +1,8 @@
-"""Reads the daemon's stream of samples for all browsers together, while at least one looks on.
+"""Reads the daemon's stream of samples once for all browsers, while at least one is watching.
 
-The daemon is asked once, however many look. What it tells is kept in a ring for each axis; a daemon that went away is
-asked again, and the hole stays one. The ticks of two buses need not agree, and begin anew with the daemon: each axis'
-are laid on one count of this process by when its first block came, and stay on it as long as they rise.
+The samples are kept in a ring for each axis; after a lost connection the daemon is asked again, and the gap stays. The
+ticks of two buses need not agree and restart with the daemon: each axis' ticks are mapped to one count of this process
+by the arrival of the first block, and stay mapped as long as they rise.
 """
 
 import asyncio
@@ -25,17 +25,17 @@ from fdhil.web.live_ring import Ring
 KEPT_S = 300.0
 SILENT_S = 5.0
 RETRY_S = 1.0
-LINGER_S = 60.0  # a browser that comes back within it finds what it missed
+LINGER_S = 60.0  # a browser that returns within it gets what it missed
 SAME_COUNT_S = 1.0
 LONGEST_LINE = 16 * 1024 * 1024
 MAX_BROWSERS = 8
-UNDRAWN_S = 5.0  # a browser that draws does so at least once a second
+UNDRAWN_S = 5.0  # an active browser draws at least once a second
 NONSENSE = (ValueError, LookupError, TypeError, ArithmeticError, RecursionError)
 
 
 @dataclass(eq=False, slots=True)
 class Viewer:
-    """A browser that looks on: its user or address, when it last drew, and whether another one has its place."""
+    """A watching browser: its user or address, when it last drew, and whether another one took its place."""
 
     owner: str
     drawn_s: float
@@ -43,13 +43,13 @@ class Viewer:
 
 
 class LiveFeed:
-    """The newest samples of one machine. ``trouble`` says why none come, empty while they do."""
+    """The newest samples of one machine. ``trouble`` says why there are none, empty while there are."""
 
     def __init__(self, path: Path, axes: Mapping[str, Any], period_s: float) -> None:
         self._path = path
         self.period_s = period_s
         self.rings = {axis: Ring(round(KEPT_S / period_s)) for axis in axes}
-        self.trouble = "the daemon is being asked"
+        self.trouble = "waiting for the daemon"
         self.skipped_lines = 0
         self._bases: dict[str, int] = {}
         self._line: tuple[float, float] | None = None
@@ -58,7 +58,7 @@ class LiveFeed:
 
     @asynccontextmanager
     async def watched(self, viewer: Viewer) -> AsyncIterator[None]:
-        """Have the daemon asked while the block is open, and a minute longer."""
+        """Keep the daemon's stream open while the block is open, and a minute longer."""
         self.viewers.append(viewer)
         self._wanted.set()
         try:
@@ -68,9 +68,9 @@ class LiveFeed:
                 self.viewers.remove(viewer)
 
     def make_room(self, owner: str) -> bool:
-        """Return whether a browser of ``owner`` may look on.
+        """Return whether a browser of ``owner`` may watch.
 
-        Where all places are taken, one that draws nothing leaves for it, or one of the owner who has two more.
+        If all places are taken, a browser that draws nothing leaves for it, or one of an owner with two more.
         """
         if len(self.viewers) < MAX_BROWSERS:
             return True
@@ -85,13 +85,13 @@ class LiveFeed:
         return True
 
     async def run(self) -> None:
-        """Serve for ever: connect while somebody looks on, and again when the daemon went away."""
+        """Serve until cancelled: connect while a browser watches, and again after a lost connection."""
         while True:
             await self._wanted.wait()
             try:
                 await run_attempt("daemon", self._read())
                 self._wanted.clear()
-                self.trouble = "the daemon is being asked"
+                self.trouble = "waiting for the daemon"
             except (OSError, TimeoutError, DeviceError, *NONSENSE) as error:
                 self.trouble = _cause(error)
                 await asyncio.sleep(RETRY_S)
@@ -99,7 +99,6 @@ class LiveFeed:
                     self._wanted.clear()
 
     async def _read(self) -> None:
-        """Read until nobody has looked on for a minute; OSError and the like when the daemon does not tell."""
         reader, writer = await asyncio.open_unix_connection(str(self._path), limit=LONGEST_LINE)
         try:
             writer.write(b'{"request": "live"}\n')
@@ -117,12 +116,12 @@ class LiveFeed:
             writer.close()
 
     def take(self, line: Mapping[str, Any]) -> None:
-        """Take in one line of the daemon; one of ``NONSENSE`` for what is none."""
+        """Take one line of the daemon; one of ``NONSENSE`` for an invalid one."""
         take: Callable[[Mapping[str, Any]], None] | None = {
             "samples": self._samples,
             "voltage": self._voltage,
             "times": self._times,
-            "temperature": lambda told: self.rings[told["axis"]].warm(float(told["celsius"])),
+            "temperature": lambda line_of_axis: self.rings[line_of_axis["axis"]].warm(float(line_of_axis["celsius"])),
             "skipped": self._skip,
         }.get(line.get("live", ""))
         if take is not None and line.get("axis", next(iter(self.rings))) in self.rings:
@@ -138,7 +137,7 @@ class LiveFeed:
         self.rings[axis].put(after.astype(np.int64) + first + base, values)
 
     def _base(self, axis: str, first: int) -> int:
-        """Return what lays an axis' ticks on this process' count: that of another axis where both count alike."""
+        """Return the offset from an axis' ticks to this process' count: another axis' offset if both agree."""
         end = self.rings[axis].end
         for other, base in self._bases.items():
             apart = abs(first + base - self.rings[other].end) * self.period_s
@@ -152,7 +151,6 @@ class LiveFeed:
         self._line = (first - slope * first_ns, slope)
 
     def _voltage(self, line: Mapping[str, Any]) -> None:
-        """Lay a sensor's samples on the ticks in which its clock says they were taken: to look at, no closer."""
         base = self._bases.get(line["axis"])
         if self._line is None or base is None:
             return
@@ -168,18 +166,18 @@ async def _line_of(reader: asyncio.StreamReader) -> dict[str, Any]:
     async with asyncio.timeout(SILENT_S):
         line = await reader.readline()
     if not line:
-        raise ConnectError("daemon", "closed the connection; see its log")
-    told = decode_line(line)
-    if told is None:
-        raise ConnectError("daemon", "told no line of a daemon; see what listens at its socket")
-    return told
+        raise ConnectError("daemon", "closed the connection; check its log")
+    document = decode_line(line)
+    if document is None:
+        raise ConnectError("daemon", "sent an invalid line; check which process listens at its socket")
+    return document
 
 
 def _cause(error: Exception) -> str:
     if isinstance(error, DeviceError):
         return str(error)
     if isinstance(error, TimeoutError):
-        return f"the daemon has said nothing for {SILENT_S:.0f} s; see its log"
+        return f"the daemon was silent for {SILENT_S:.0f} s; check its log"
     if isinstance(error, OSError):
         return str(ConnectError.of_socket("daemon", error, "is not running; start it with fdhil run CONFIG"))
-    return "the daemon told what is not understood here; use one version of fdhil for both"
+    return "the daemon sent an unknown message; use the same version of fdhil for both"

@@ -1,6 +1,6 @@
-"""Keeps the newest samples of one axis, and draws them together where there are more than a screen has columns.
+"""Keeps the newest samples of one axis, and combines them to columns if there are more than a screen can show.
 
-Pure: nothing here knows a clock or a socket. Rows are placed by their tick; one that is missing stays NaN.
+Pure: no clock, no socket. Samples are placed by their tick; a missing one stays NaN.
 """
 
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ VOLTAGE, TEMPERATURE = DRAWN.index("voltage_v"), DRAWN.index("temperature_c")
 
 @dataclass(frozen=True, slots=True)
 class Envelope:
-    """The least and the greatest of every signal in each column, (signals, columns), NaN where no sample came.
+    """The minimum and maximum of every signal in each column, (signals, columns), NaN without samples.
 
     Column j covers ``per_column`` ticks from ``first_tick`` + j ``per_column`` on.
     """
@@ -40,10 +40,10 @@ class Envelope:
 
 
 class Ring:
-    """The newest ``capacity`` rows of one axis: those of the ticks from ``begin`` to before ``end``."""
+    """The newest ``capacity`` samples of one axis: those of the ticks from ``begin`` to before ``end``."""
 
     def __init__(self, capacity: int) -> None:
-        self._values: Rows | None = None  # memory is taken when there is something to keep
+        self._values: Rows | None = None  # allocated with the first samples
         self._celsius = np.nan
         self._first = 0
         self.capacity = capacity
@@ -55,7 +55,7 @@ class Ring:
         return max(self._first, self.end - self.capacity)
 
     def put(self, ticks: NDArray[np.int64], values: NDArray[Any]) -> None:
-        """Take rows in: ``ticks`` (n,) that rise, behind all before them, and the daemon's signals (7, n)."""
+        """Add samples: rising ``ticks`` (n,), after all before them, and the daemon's signals (7, n)."""
         if self._values is None:
             self._values = np.full((len(DRAWN), self.capacity), np.nan, np.float32)
             self._first = self.end = int(ticks[0])
@@ -69,17 +69,17 @@ class Ring:
         self._values[TEMPERATURE, places] = self._celsius
 
     def put_voltage(self, ticks: NDArray[np.int64], values: NDArray[Any]) -> None:
-        """Lay the voltage (n,) of a sensor of its own on the rows at ``ticks`` (n,) that are there."""
+        """Set the voltage (n,) of a separate sensor at the existing samples of ``ticks`` (n,)."""
         if self._values is not None:
             held = (ticks >= self.begin) & (ticks < self.end)
             self._values[VOLTAGE, ticks[held] % self.capacity] = values[held]
 
     def warm(self, celsius: float) -> None:
-        """Take a temperature in: it holds from here on."""
+        """Set the temperature of the samples from here on."""
         self._celsius = celsius
 
     def rows(self, first: int, end: int) -> Rows:
-        """Return the rows (signals, n) of the ticks from ``first`` to before ``end``, NaN where none is kept."""
+        """Return the samples (signals, n) of the ticks from ``first`` to before ``end``, NaN for missing ones."""
         values = np.full((len(DRAWN), end - first), np.nan, np.float32)
         held = np.arange(max(first, self.begin), min(end, self.end))
         if self._values is not None and held.size:
@@ -87,7 +87,7 @@ class Ring:
         return values
 
     def envelope(self, first: int, end: int, per_column: int) -> Envelope:
-        """Return the columns that lie between two ticks, whole ones: the first begins at a multiple of their width."""
+        """Return the complete columns between two ticks; the first begins at a multiple of their width."""
         start = -(-first // per_column) * per_column
         columns = max(0, (end - start) // per_column)
         rows = self.rows(start, start + columns * per_column).reshape(len(DRAWN), columns, per_column)

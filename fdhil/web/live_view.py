@@ -1,7 +1,7 @@
-"""What one browser has yet to be told of the rings: whole columns, fewer and wider ones when it cannot keep up.
+"""Selects what one browser still has to receive: complete columns, fewer and wider ones if it cannot keep up.
 
-Pure. A browser says which message it has drawn. While two are on their way nothing is sent; what came meanwhile is told
-at once in columns that are twice, four times ... as wide, and what is older than the view is skipped and counted.
+Pure. A browser acknowledges the messages that it has drawn. While two are unacknowledged nothing is sent; the backlog
+is then sent in columns that are twice, four times ... as wide, and what is older than the view is skipped and counted.
 """
 
 import json
@@ -14,11 +14,11 @@ import numpy as np
 from fdhil.web.live_ring import Envelope, Ring
 
 MOST_UNSEEN = 2
-BURST_S = 0.5  # what one message tells in full
+BURST_S = 0.5  # sent in full resolution by one message
 
 
 class View:
-    """The pictures of one browser: ``axes`` over the newest ``seconds`` in so many ``columns``."""
+    """The state of one browser: ``axes`` over the newest ``seconds`` in so many ``columns``."""
 
     def __init__(self, axes: Sequence[str], seconds: float, columns: int, period_s: float) -> None:
         self._axes = axes
@@ -29,22 +29,20 @@ class View:
         self._number = self._seen = 0
 
     def may_send(self) -> bool:
-        """Whether the browser has drawn enough of what it was sent."""
         return self._number - self._seen < MOST_UNSEEN
 
     def drawn(self, number: int) -> bool:
-        """Note that the browser has drawn message ``number``; return whether it was not drawn before."""
+        """Acknowledge message ``number``; return whether it is new."""
         before, self._seen = self._seen, max(self._seen, min(number, self._number))
         return self._seen > before
 
     def has_news(self, rings: Mapping[str, Ring]) -> bool:
-        """Whether a column of any axis is complete."""
         return any(rings[axis].end - self._next.get(axis, rings[axis].begin) >= self.per_column for axis in self._axes)
 
-    def message(self, rings: Mapping[str, Ring], told: Mapping[str, Any]) -> bytes:
-        """Return what is new as one message: a length (uint32), a JSON header, and float32 numbers behind it.
+    def message(self, rings: Mapping[str, Ring], fields: Mapping[str, Any]) -> bytes:
+        """Return the new columns as one message: a length (uint32), a JSON header, and float32 numbers.
 
-        The header lists the parts; each has (signals, columns) least values, then as many greatest.
+        The header lists the parts; each has (signals, columns) minima, then as many maxima.
         """
         self._number += 1
         parts = [(axis, *self._part(axis, rings[axis])) for axis in self._axes]
@@ -60,13 +58,12 @@ class View:
             for axis, part, skipped in parts
             if part.low.shape[1]
         ]
-        header = json.dumps({**told, "number": self._number, "parts": listed}).encode()
+        header = json.dumps({**fields, "number": self._number, "parts": listed}).encode()
         header += b" " * (-len(header) % 4)
         numbers = [values.tobytes() for _, part, _ in parts for values in (part.low, part.high)]
         return b"".join([len(header).to_bytes(4, "little"), header, *numbers])
 
     def _part(self, axis: str, ring: Ring) -> tuple[Envelope, int]:
-        """Return what is new of an axis, and how many ticks were skipped before it."""
         oldest = max(ring.begin, ring.end - self._ticks)
         first = self._next.get(axis, oldest)
         skipped = max(0, oldest - first)
@@ -81,5 +78,5 @@ class View:
 
 
 def finite(values: np.ndarray[Any, Any]) -> list[float | None]:
-    """Return numbers for JSON: None where there is none."""
+    """Return numbers for JSON: None for non-finite ones."""
     return [round(value, 4) if math.isfinite(value) else None for value in values.tolist()]

@@ -1,4 +1,4 @@
-"""The NC programs that may be armed from a browser: plain files of one folder, by names that lead nowhere else."""
+"""The NC programs that may be armed from a browser: regular files of one folder, by names without a path."""
 
 import hashlib
 import os
@@ -18,7 +18,7 @@ LARGEST = 64 * 1024 * 1024
 
 
 class Program(BaseModel):
-    """A program of the folder: its name, size and time of change; its digest where it was read."""
+    """A program of the folder: its name, size and modification time; its digest if it was read."""
 
     name: str
     size_bytes: int
@@ -28,7 +28,7 @@ class Program(BaseModel):
 
 
 def listed(folder: Path) -> list[Program]:
-    """Return the folder's programs, the newest first; none where the folder cannot be read."""
+    """Return the folder's programs, the newest first; none if the folder cannot be read."""
     found = []
     try:
         with os.scandir(folder) as entries:
@@ -42,7 +42,7 @@ def listed(folder: Path) -> list[Program]:
 
 
 def look_at(folder: Path | None, name: str) -> Program:
-    """Return a program with its digest (blocking). Refused for a name that is no file of the folder."""
+    """Return a program with its digest (blocking). Refused if the name is not a file of the folder."""
     with _opened(folder, name, LARGEST) as file:
         status = os.fstat(file.fileno())
         digest = hashlib.file_digest(file, "sha256").hexdigest()
@@ -52,24 +52,26 @@ def look_at(folder: Path | None, name: str) -> Program:
 
 
 def content_of(folder: Path | None, name: str, most: int) -> bytes:
-    """Return the bytes of a program (blocking). Refused for a name that is no file of the folder, or a larger file."""
+    """Return the bytes of a program (blocking). Refused if the name is not a file of the folder, or too large."""
     with _opened(folder, name, most) as file:
         return file.read(most)
 
 
 def _opened(folder: Path | None, name: str, most: int) -> BufferedReader:
     if folder is None:
-        text = "no folder is named whose programs may be armed from a browser"
+        text = "no folder is configured whose programs may be armed from the browser"
         raise Refused(409, "NoPrograms", text, "set web.programs_directory, or use fdhil arm CONFIG PROGRAM")
     if not re.fullmatch(NAME, name):
-        raise Refused(422, "BadName", "this is no name of a program", "letters, digits, . _ and -, at most 64")
+        raise Refused(422, "BadName", "invalid program name", "use at most 64 letters, digits, . _ and -")
     try:
         file = open_named(folder, name)
     except StoreError as error:
         if error.code == "BadName":
-            raise Refused(422, "BadName", f"{name} is no program that can be armed here", "use fdhil arm") from None
-        raise Refused(404, "NotFound", f"{name} is not there or cannot be read", "look at the list again") from None
+            raise Refused(
+                422, "BadName", f"{name} cannot be armed here: it is not a program file", "use fdhil arm"
+            ) from None
+        raise Refused(404, "NotFound", f"{name} does not exist or cannot be read", "reload the list") from None
     if os.fstat(file.fileno()).st_size > most:
         file.close()
-        raise Refused(422, "BadName", f"{name} is too large to be used from a browser", "use fdhil arm")
+        raise Refused(422, "BadName", f"{name} is too large for the browser", "use fdhil arm")
     return file

@@ -1,4 +1,4 @@
-"""Asks the process that replays rapids, starts it where it does not run, and ends it where it does not answer."""
+"""Runs the process that replays rapids: starts it on demand, and ends it if it does not answer."""
 
 import asyncio
 import json
@@ -9,12 +9,12 @@ from fdhil.web.answers import Refused
 
 PROCESS = "fdhil.web.replay_process"
 LONGEST_S = 60.0
-"""A rapid takes 20 ms, the process a second to start, kernels that were never compiled here half a minute."""
+"""A rapid takes 20 ms, the start of the process a second, the first compilation of kernels half a minute."""
 MOST_ASKING = 8
 
 
 class Replayer:
-    """The one process that replays for a serving process; requests are answered one after another."""
+    """The only replay process of a serving process; requests are answered one after another."""
 
     def __init__(self, config: MachineConfig) -> None:
         self._config = config
@@ -23,9 +23,9 @@ class Replayer:
         self._asking = 0
 
     async def signals(self, axis: str, number: int) -> bytes:
-        """Return a rapid's signals with the model laid over them, as JSON. Refused, also where many wait."""
+        """Return a rapid's signals with the model, as JSON. Refused, also if many requests wait."""
         if self._asking >= MOST_ASKING:
-            text = f"{MOST_ASKING} others wait for a replay already, this rapid was not replayed"
+            text = f"{MOST_ASKING} replays are waiting already, this rapid was not replayed"
             raise Refused(503, "Busy", text, "try again in a few seconds")
         self._asking += 1
         try:
@@ -37,37 +37,37 @@ class Replayer:
     async def _replay(self, axis: str, number: int) -> bytes:
         fresh = self._process is None
         answer = await self._ask(axis, number)
-        if not answer and not fresh:  # it has ended since, for it was idle
+        if not answer and not fresh:  # it had ended because it was idle
             answer = await self._ask(axis, number)
         if not answer:
-            text = f"the replay of rapid {number} of axis {axis} failed, the machine is not touched by it"
-            raise Refused(500, "ReplayFailed", text, "see the log of fdhil web, and try fdhil replay on its recording")
+            text = f"the replay of rapid {number} of axis {axis} failed, the machine is not affected"
+            raise Refused(
+                500, "ReplayFailed", text, "check the log of fdhil web, and try fdhil replay on its recording"
+            )
         if answer.startswith(b"-"):
             fault = json.loads(answer[1:])
             raise Refused(fault["status"], fault["code"], fault["text"], fault["advice"])
         return answer[1:]
 
     async def _ask(self, axis: str, number: int) -> bytes:
-        """Return the line that answers, empty where the process ended or had to be ended."""
         answer = b""
         try:
             async with asyncio.timeout(LONGEST_S):
                 if self._process is None:
                     self._process = BoundedProcess(PROCESS)
-                    await self._process.start(
-                        {"config": self._config.model_dump(mode="json"), "digest": self._config.digest}
-                    )
+                    settings = {"config": self._config.model_dump(mode="json"), "digest": self._config.digest}
+                    await self._process.start(settings)
                 await self._process.send({"axis": axis, "number": number})
                 answer = await self._process.read_line()
         except (TimeoutError, OSError, ValueError):
-            answer = b""
+            pass
         finally:
-            if not answer.endswith(b"\n"):  # the next request must not get the answer to this one
+            whole = answer.endswith(b"\n")
+            if not whole:  # the next request must not get the answer to this one
                 await self.close()
-        return answer
+        return answer if whole else b""
 
     async def close(self) -> None:
-        """End the process."""
         process, self._process = self._process, None
         if process is not None:
             await process.end()

@@ -1,4 +1,4 @@
-"""Listens for browsers: where it may, with TLS where it must, until it is told to stop."""
+"""Serves the pages: listens where the configuration allows it, with TLS where required, until stopped."""
 
 from __future__ import annotations
 
@@ -32,35 +32,35 @@ GIVE_BACK_S = 60.0
 
 
 def require() -> None:
-    """Raise FdhilError where what serves the pages is not installed."""
+    """Raise FdhilError if the web extra is not installed."""
     if any(find_spec(name) is None for name in NEEDED):
         raise FdhilError("fdhil web needs the extra 'web': pip install 'fdhil[web]'")
 
 
 def check_reach(web: Web) -> None:
-    """Refuse to listen where others could read or act unprotected. ConfigError with what to set."""
+    """Refuse to listen where other computers could read or act without protection. Raises ConfigError."""
     if web.on_loopback:
         return
     faults = []
-    where = f"{web.host} can be reached from other computers"
+    where = f"other computers can reach {web.host}"
     if web.tls_certificate_file is None and (web.acting or not web.unprotected):
         faults.append(ConfigFault("web.tls_certificate_file", f"is missing, and {where}", _tls_advice(web)))
     if web.users_file is None and not web.unprotected:
-        advice = "make users with fdhil web-user, or set web.unprotected = true to let all of them read"
+        advice = "add users with fdhil web-user, or set web.unprotected = true to let every computer read"
         faults.append(ConfigFault("web.users_file", f"is missing, and {where}", advice))
     if faults:
         raise ConfigError("web.host", faults)
 
 
 def _tls_advice(web: Web) -> str:
-    files = "give certificate and key"
+    files = "set certificate and key"
     if web.acting:
-        return f"{files}: who acts sends a password"
-    return f"{files}, or set web.unprotected = true to do without"
+        return f"{files}: operators send passwords"
+    return f"{files}, or set web.unprotected = true to serve without TLS"
 
 
 def run(config: MachineConfig, ready: Callable[[str], None]) -> None:
-    """Serve the pages of a machine until SIGTERM or SIGINT; ``ready`` is told the address. FdhilError as below."""
+    """Serve the pages of a machine until SIGTERM or SIGINT; ``ready`` receives the address. FdhilError as below."""
     require()
     from fdhil.web.app import make_app
 
@@ -68,7 +68,7 @@ def run(config: MachineConfig, ready: Callable[[str], None]) -> None:
 
 
 def serve(web: Web, make: Callable[[], FastAPI], ready: Callable[[str], None]) -> None:
-    """Serve an application until SIGTERM or SIGINT. FdhilError when it cannot start."""
+    """Serve an application until SIGTERM or SIGINT. Raises FdhilError if it cannot start."""
     require()
     check_reach(web)
     certificate = _tls(web)
@@ -82,7 +82,6 @@ def serve(web: Web, make: Callable[[], FastAPI], ready: Callable[[str], None]) -
 
 
 def url_of(web: Web, listener: socket.socket) -> str:
-    """Return the address to open in a browser."""
     port = listener.getsockname()[1]
     host = "localhost" if web.host in ("0.0.0.0", "::") else f"[{web.host}]" if ":" in web.host else web.host
     return f"{'https' if web.tls_certificate_file else 'http'}://{host}:{port}"
@@ -107,10 +106,10 @@ def _listening(web: Web) -> Iterator[socket.socket]:
     try:
         family, _, _, _, address = socket.getaddrinfo(web.host, web.port, type=socket.SOCK_STREAM)[0]
         if is_loopback(web.host) and not is_loopback(str(address[0])):
-            raise OSError("the name does not lead to this computer")
+            raise OSError("the name is not an address of this computer")
         listener = socket.create_server(address[:2], family=family, backlog=BACKLOG)
     except OSError as error:
-        text = f"cannot be listened at ({error.strerror or error}); set another web.host or web.port"
+        text = f"is not available ({error.strerror or error}); set another web.host or web.port"
         raise ConnectError(f"{web.host}:{web.port}", text) from None
     with listener:
         yield listener
@@ -140,22 +139,22 @@ async def _serve(
 
 
 async def _give_back() -> None:
-    """Give free memory back now and then: a page of a long history takes 100 MB while it is made."""
+    """Return free memory regularly: a page of a long history takes 100 MB while it is made."""
     while True:
         await asyncio.sleep(GIVE_BACK_S)
         await asyncio.to_thread(heap.give_back)
 
 
 def server_of(app: FastAPI, certificate: ssl.SSLContext | None, ready: Callable[[], None]) -> uvicorn.Server:
-    """Return the server of an application; it calls ``ready`` when it has begun."""
-    import uvicorn  # late: the extra may be missing, and this must import without it
+    """Return the server of an application; it calls ``ready`` once it listens."""
+    import uvicorn  # late: this module must import without the extra
 
     from fdhil.connections import MOST_CONNECTIONS, BoundedHttp, BoundedSocket
 
     class Server(uvicorn.Server):
         @contextlib.contextmanager
         def capture_signals(self) -> Iterator[None]:
-            yield  # ours end it: uvicorn's would end the process by the signal, which systemd calls a failure
+            yield  # uvicorn would end the process by the signal, which systemd reports as a failure
 
         async def startup(self, sockets: list[socket.socket] | None = None) -> None:
             await super().startup(sockets)

@@ -42,7 +42,7 @@ def test_question_mark_writes_a_map_that_identifies_the_file(trace: Path) -> Non
     asked = invoke("identify", trace, "--columns", "?")
     assert asked.return_value == 1
     written = trace.with_suffix(".columns.toml")
-    assert "by the equations" in asked.stderr
+    assert "fits the equations" in asked.stderr
     assert str(written) in asked.stderr
     result = invoke("identify", trace, "--columns", written, "--any-move", "--json")
     assert result.return_value == 0, result.output

@@ -75,7 +75,7 @@ def test_column_of_another_length_is_not_proposed() -> None:
     columns = {"t": m.time, "u": m.voltage, "i": m.current[1:], "w": m.speed}
     proposal = propose(RecordingTable({}, columns))
     assert [p.signal for p in proposal.columns] == ["time_s", "voltage_V", "speed_rad_per_s"]
-    assert proposal.faults == ["no current was recognised"]
+    assert proposal.faults == ["no current recognised"]
 
 
 def test_file_without_a_current_is_not_proposed_as_a_recording(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The process of the check: what it is asked, what it answers, what it imports, what can stand for it."""
+"""Runs the check of a program as a child process: its request, its answer, its imports, and a substitute."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from fdhil.program import program_digest
 
 
 def asked(program: Path, config: MachineConfig, folder: Path) -> bytes:
-    """The request to check a program."""
     request = {
         "program": str(program),
         "program_digest": program_digest(program),
@@ -32,7 +31,6 @@ def asked(program: Path, config: MachineConfig, folder: Path) -> bytes:
 
 
 def answered(request: bytes, errors: Path) -> bytes:
-    """What the process answers; it says nothing on stderr but what it imports."""
     command = [sys.executable, "-X", "importtime", "-m", MAKER]
     with errors.open("wb") as stderr, subprocess.Popen(command, stdin=PIPE, stdout=PIPE, stderr=stderr) as process:
         assert process.stdin is not None
@@ -48,7 +46,7 @@ def answered(request: bytes, errors: Path) -> bytes:
 
 
 def _covered_by_the_digest(imported: set[str]) -> None:
-    """Derived from the imports as they are written; what is really imported must be among it."""
+    """The digest covers the imports as written; every module that is really imported must be among them."""
     files = code_files(Path(fdhil.__file__).parent)
     covered = {name.removesuffix(".py").removesuffix("/__init__").replace("/", ".") for name in files}
     modules = {name.removeprefix("fdhil.") for name in imported if name.startswith("fdhil.")}
@@ -57,7 +55,6 @@ def _covered_by_the_digest(imported: set[str]) -> None:
 
 
 def says_instead(monkeypatch: pytest.MonkeyPatch, folder: Path, script: str) -> None:
-    """Let a shell script stand for the process of the check."""
     python = folder / "python"
     python.write_text(f"#!/bin/sh\n{script}")
     python.chmod(0o700)

@@ -1,4 +1,4 @@
-"""What the tests of passes share: the guard's stand-in, a corner to be cut, and its plan."""
+"""Fixtures of the arming tests: a guard peer, a corner, and its planned correction."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from tests.store.made import published
 
 @pytest.fixture
 def mill(config: MachineConfig) -> Iterator[Mill]:
-    """The guard."""
     assert config.store.run_directory is not None
     config.store.run_directory.mkdir(parents=True)
     made = Mill(config.store.run_directory)
@@ -28,7 +27,6 @@ def mill(config: MachineConfig) -> Iterator[Mill]:
 
 @pytest.fixture
 def program(tmp_path: Path) -> Path:
-    """A corner."""
     path = tmp_path / "gentle.ngc"
     path.write_text(GENTLE)
     return path
@@ -36,6 +34,5 @@ def program(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def planned(config: MachineConfig, program: Path) -> Correction:
-    """The corner, planned."""
     models = {axis: published().parameters for axis in "XY"}
     return correction.plan(load_trajectory(program, config), models, config)

@@ -1,4 +1,4 @@
-"""What listens at the guard's socket instead of the guard."""
+"""A peer that listens at the guard's socket in place of the guard."""
 
 from __future__ import annotations
 
@@ -17,10 +17,7 @@ Says = Callable[[str], Mapping[str, Any] | None]
 
 
 class Guard:
-    """What listens at ``guard.sock`` instead of the guard: answers by ``says``, None: not at all.
-
-    ``descriptor`` came with the requests that are answered now.
-    """
+    """Answers requests by ``says``; None: no answer. ``descriptor`` came with the current request."""
 
     def __init__(self, folder: Path) -> None:
         self.says: Says = lambda _kind: FINE
@@ -75,7 +72,6 @@ class Guard:
             peer.sendall(json.dumps({**answer, "id": request["id"]}).encode() + b"\n")
 
     def close(self) -> None:
-        """End all connections."""
         for each in (self._listener, *self._peers):
             with contextlib.suppress(OSError):
                 each.shutdown(socket.SHUT_RDWR)

@@ -1,4 +1,4 @@
-"""A guard that believes its table: it joins the rows that it is given, as the real one does, and is moved by hand."""
+"""A guard peer that accepts its table and joins rows like the real guard; the test moves the machine along it."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ Answer = Mapping[str, Any]
 
 
 class Mill:
-    """What listens at ``guard.sock``: loads tables, arms, starves; ``move`` is the machine's motion."""
-
     def __init__(self, folder: Path) -> None:
         self.state, self.row, self.cause = "OFF", 0, ""
         self.rows: list[tuple[int, ...]] = []
@@ -46,11 +44,10 @@ class Mill:
         return {"ok": True, "rows": [0, len(self.rows)]}
 
     def move(self, row: int) -> None:
-        """Let the machine come to a row; where too few are left behind it, the correction is ramped down."""
+        """Let the machine reach a row; with too few rows ahead, the correction is ramped down."""
         self.state, self.row = "ACTIVE", row
         if not self.final and len(self.rows) - row < RESERVE_ROWS:
             self.state, self.cause = "OFF", "TableStarved"
 
     def close(self) -> None:
-        """End all connections."""
         self._peer.close()

@@ -1,4 +1,4 @@
-"""A long program is armed ahead of its check: what is sent has passed, what ends it is told by name and in time."""
+"""A long program is armed ahead of its check: only checked rows are sent, and its end is reported with the cause."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ PATIENCE_S = 500.0  # another process computes, on a host that may be busy
 
 @pytest.fixture
 def config(tmp_path: Path) -> MachineConfig:
-    """The bench, two axes, commissioned; its NC smooths little, so that a high feed asks too much."""
+    """Two commissioned axes; the NC smooths little, so that a high feed exceeds the limits."""
     config = config_of(tmp_path, ("X", "Y"), nc={"smoothing_s": [0.02, 0.01]})
     save_records(config)
     return config
@@ -53,7 +53,6 @@ def config(tmp_path: Path) -> MachineConfig:
 
 @pytest.fixture
 def mill(config: MachineConfig, monkeypatch: pytest.MonkeyPatch) -> Iterator[Mill]:
-    """The guard, armed as soon as ``NEAR_S`` of a program have passed."""
     monkeypatch.setattr("fdhil.arming.preparing.AHEAD_S", NEAR_S)
     assert config.store.run_directory is not None
     config.store.run_directory.mkdir(parents=True)
@@ -64,30 +63,24 @@ def mill(config: MachineConfig, monkeypatch: pytest.MonkeyPatch) -> Iterator[Mil
 
 @dataclass
 class Shop:
-    """The operator's side of a daemon whose guard is the mill."""
-
     desk: ArmingDesk
     mill: Mill
     token: str
     told: list[Notice]
 
     async def arm(self, program: Path, **options: Any) -> dict[str, Any]:
-        """Arm a program."""
         return dict(await self.desk.arm({"request": "arm", "program": str(program), "token": self.token, **options}))
 
     async def until(self, done: Callable[[], object]) -> None:
-        """Wait for what other tasks and processes bring about."""
         async with asyncio.timeout(PATIENCE_S):
             while not done():  # noqa: ASYNC110 - what other processes do has no event
                 await asyncio.sleep(0.02)
 
     async def fed(self, row: int) -> None:
-        """Move the machine to a row and wait for the ring ahead of it."""
         self.mill.move(row)
         await self.until(lambda: len(self.mill.rows) - row >= 10_000)
 
     async def walk(self, to: int, end: int) -> None:
-        """Move the machine to a row, in steps, each with its ring ahead as far as rows are there: to ``end``."""
         for row in [*range(self.mill.row, to, 4_000), to]:
             wanted = min(row + 10_000, end)
             self.mill.move(row)
@@ -97,16 +90,13 @@ class Shop:
         return len(self.mill.rows) >= rows
 
     def tripped(self) -> bool:
-        """Whether the guard's end of a correction has been told."""
         return any(notice.code == "GuardTripped" for notice in self.told)
 
     def major(self) -> list[Notice]:
-        """What the operator must not miss."""
         return [notice for notice in self.told if notice.severity == "MAJOR" and notice.code != "GuardTripped"]
 
     @property
     def process(self) -> int:
-        """The check's process."""
         going = self.desk._check._going
         assert going is not None
         assert going._process.pid is not None
@@ -114,7 +104,6 @@ class Shop:
 
     @property
     def checked(self) -> CheckedProgram:
-        """What has passed."""
         going = self.desk._check._going
         assert going is not None
         return going.checked
@@ -122,7 +111,6 @@ class Shop:
 
 @asynccontextmanager
 async def opened(config: MachineConfig, mill: Mill) -> AsyncIterator[Shop]:
-    """Run the two tasks of the daemon that look after what is armed."""
     assert config.store.run_directory is not None
     desk = ArmingDesk(config, OutcomeStore(config), config.store.run_directory)
     stamp = Stamp(0.0, "another boot", 0)
@@ -144,7 +132,6 @@ async def opened(config: MachineConfig, mill: Mill) -> AsyncIterator[Shop]:
 
 
 def written(folder: Path, text: str) -> Path:
-    """A program on disk."""
     path = folder / "long.ngc"
     path.write_text(text)
     return path
@@ -160,7 +147,7 @@ async def test_it_is_armed_ahead_of_its_check_and_ends_gently_when_that_stops(
         assert answer["ok"], answer
         assert answer["check"]["whole"] is False
         assert answer["check"]["checked_s"] >= NEAR_S
-        assert "the check of the rest goes on ahead of it" in answer["text"]
+        assert "the rest is checked ahead of the motion" in answer["text"]
         assert (mill.state, len(mill.rows), mill.final) == ("ARMED", 10_000, False)
         await shop.until(lambda: shop.checked.rows >= 30_000)  # no busy host may have the check fall behind by itself
         for row in (500, 3_000, 8_000, 15_000):
@@ -174,21 +161,20 @@ async def test_it_is_armed_ahead_of_its_check_and_ends_gently_when_that_stops(
 
 
 async def _is_not_abandoned_by_another(shop: Shop, program: Path) -> None:
-    """Who is refused because something runs, and leaves, ends nothing of what runs."""
+    """A client that is refused because a check runs, and disconnects, does not end that check."""
     answer = await shop.arm(program)
-    assert (answer["code"], answer["text"]) == ("NotOff", "what was armed before is still on, in state ACTIVE")
+    assert (answer["code"], answer["text"]) == ("NotOff", "the previous correction is still active, in state ACTIVE")
     assert not shop.desk.abandon()
     assert shop.desk.checking is not None
 
 
 def stop(pid: int) -> None:
-    """Stop a process, and return when it stands."""
     os.kill(pid, signal.SIGSTOP)
     os.waitid(os.P_PID, pid, os.WSTOPPED | os.WNOWAIT)
 
 
 async def _starves_with_a_word(shop: Shop) -> None:
-    """A check that stands still is told before the rows end; when it goes on, so do they."""
+    """A check that stops is reported before the rows end; when it continues, so do the rows."""
     stop(shop.process)
     try:
         await asyncio.sleep(0.5)
@@ -211,7 +197,7 @@ async def _starves_with_a_word(shop: Shop) -> None:
 
 
 async def _dies_with_a_word(shop: Shop) -> None:
-    """A check that is killed: told at once; what had passed is still sent, and nothing else."""
+    """A killed check is reported at once; the rows that had passed are still sent."""
     os.kill(shop.process, signal.SIGKILL)
     await shop.until(lambda: len(shop.major()) == 2)
     died = shop.major()[1]
@@ -243,7 +229,7 @@ async def test_a_place_that_is_refused_later_is_told_long_before_the_motion_reac
         refused = shop.major()[0]
         assert refused.code == "DemandTooHigh"
         place = re.search(rf"line {HARD_LINE}, at (\d+\.\d+) s: axis X has a current or voltage limit", refused.text)
-        left = re.search(r"corrected for another (\d+\.\d) s, then ramped to zero before that place", refused.text)
+        left = re.search(r"corrected for another (\d+\.\d) s, then ramped to zero before that line", refused.text)
         assert place, refused.text
         assert left, refused.text
         assert "lower the feed" in refused.text
@@ -294,12 +280,11 @@ async def test_what_ended_a_moment_ago_is_waited_for(
         answer = await shop.arm(program)
         assert (answer["code"], answer["advice"]) == (
             "NotOff",
-            "run fdhil disarm or wait until it has ended, then arm again",
+            "run fdhil disarm or wait for its end, then arm again",
         )
 
 
 def checked_of(config: MachineConfig, folder: Path, seconds: float, after_um: float = 1.0) -> CheckedProgram:
-    """Rows at rest that passed, with an error of 30 um before."""
     folder.mkdir(exist_ok=True)
     rows = {axis: np.zeros(round(seconds / 0.001)) for axis in config.axis}
     (folder / "rows").write_bytes(encoded(rows, rows, config))
@@ -309,14 +294,12 @@ def checked_of(config: MachineConfig, folder: Path, seconds: float, after_um: fl
 
 
 def pass_on(checked: CheckedProgram, end: int, after_um: float = 1.0, *, last: bool = False) -> None:
-    """Let the rows at rest up to ``end`` pass."""
     digest = hashlib.sha256(bytes(16 * (end - checked.rows))).hexdigest()
     before, after = ({"rms_um": rms, "max_um": 2 * rms} for rms in (30.0, after_um))
     checked.take(Block(end, digest, last), {"before": before, "after": after})
 
 
 def feeder_of(checked: CheckedProgram, mill: Mill, folder: Path) -> tuple[StreamFeeder, GuardLink]:
-    """What feeds the mill with these rows, of which it has none yet."""
     link = GuardLink(folder, folder)
     link.look()
     stream = RowStream(checked, "digest", 0.001)
@@ -325,7 +308,6 @@ def feeder_of(checked: CheckedProgram, mill: Mill, folder: Path) -> tuple[Stream
 
 
 def test_what_is_refused_before_it_begins_is_disarmed(config: MachineConfig, mill: Mill, tmp_path: Path) -> None:
-    """Nothing has moved: it is as if it had been refused at once; further places are told as they are found."""
     checked = checked_of(config, tmp_path / "c", 62.0)
     assert config.store.run_directory is not None
     feeder, link = feeder_of(checked, mill, config.store.run_directory)
@@ -335,8 +317,8 @@ def test_what_is_refused_before_it_begins_is_disarmed(config: MachineConfig, mil
     (found,) = feeder.go_on()
     assert (found.code, found.severity, mill.state) == ("DemandTooHigh", "MAJOR", "OFF")
     assert found.text == (
-        "line 7, at 63.00 s: axis X has; lower the feed; long.ngc was armed ahead of its check: it had not begun and is"
-        " disarmed"
+        "line 7, at 63.00 s: axis X has; lower the feed; long.ngc was armed ahead of its check: the program had not"
+        " begun and was disarmed"
     )
     link.close()
 
@@ -359,7 +341,7 @@ def test_a_block_that_is_not_what_was_checked_is_not_sent(config: MachineConfig,
 def test_the_last_block_waits_for_what_is_found_of_the_whole(
     refused: bool, config: MachineConfig, tmp_path: Path
 ) -> None:
-    """A file that was changed, or a gain that there is not, is found at the end: nothing is final before that."""
+    """A changed file or a missing gain is found only at the end, so that no block is final before."""
     checked = checked_of(config, tmp_path / "c", 4.0)
     (tmp_path / "c" / "rows").write_bytes(bytes(16 * 5_000))
     pass_on(checked, 5_000, last=True)

@@ -1,4 +1,4 @@
-"""The on-line feed-forward is switched on only for drives that were commissioned for it, with validated parameters."""
+"""The on-line feed-forward is enabled only for drives commissioned for it, with validated parameters."""
 
 from __future__ import annotations
 
@@ -18,14 +18,12 @@ from tests.daemon.machine import config_of
 
 @pytest.fixture
 def config(tmp_path: Path) -> MachineConfig:
-    """The bench, both axes with a feed-forward."""
     made = config_of(tmp_path, ("X", "Y"))
     axes = {name: axis.model_copy(update={"feedforward": FeedforwardLimits()}) for name, axis in made.axis.items()}
     return made.model_copy(update={"axis": axes})
 
 
 def save_records(config: MachineConfig, **changes: Any) -> None:
-    """Save the records of both axes as a commissioning leaves them, with ``changes`` for X."""
     for axis in "XY":
         options = {"6007": 1, "1402": 0x400 + config.node_id(axis)}
         values: dict[str, Any] = {"axis": axis, "config_digest": axis_digest(config, axis), "options": options}
@@ -33,7 +31,6 @@ def save_records(config: MachineConfig, **changes: Any) -> None:
 
 
 def test_a_good_machine_is_vouched_for(config: MachineConfig) -> None:
-    """All facts but the journal's, which the desk adds; laws that the guard takes."""
     save_records(config)
     feeding = prepare_feeding(config, known(config))
     assert isinstance(feeding, Feeding)
@@ -56,7 +53,6 @@ def test_a_good_machine_is_vouched_for(config: MachineConfig) -> None:
 def test_what_the_record_does_not_show_is_withheld(
     config: MachineConfig, changes: dict[str, Any], withheld: str
 ) -> None:
-    """Each fact by itself."""
     save_records(config, **changes)
     feeding = prepare_feeding(config, known(config))
     assert isinstance(feeding, Feeding)
@@ -64,7 +60,6 @@ def test_what_the_record_does_not_show_is_withheld(
 
 
 def test_without_a_section_or_parameters_there_is_no_law(config: MachineConfig) -> None:
-    """The refusal names the section, or the rapids that are missing."""
     refused = prepare_feeding(config, known(config, published=None))
     assert isinstance(refused, Refused)
     assert refused.reasons[0].code == "ModelNotValidated"
@@ -76,6 +71,5 @@ def test_without_a_section_or_parameters_there_is_no_law(config: MachineConfig) 
 
 
 def test_an_old_model_is_withdrawn_while_it_runs(config: MachineConfig) -> None:
-    """The daemon says so with every sign of life, and the guard fades out."""
     assert feeding_facts("XY", config, known(config)) == {"model_fresh": True}
     assert feeding_facts("XY", config, known(config, age_s=MODEL_AGE_S + 1)) == {"model_fresh": False}

@@ -1,4 +1,4 @@
-"""The first rows begin from what the drives hold at rest, as it is heard on the bus."""
+"""The first rows are recomputed from the holding currents at standstill."""
 
 from __future__ import annotations
 
@@ -33,7 +33,6 @@ SHORT = "G21 G90 G94\nG1 X20 F4000\nG1 Y20\nG4 P0.2\nM2\n"
 
 
 def checked(folder: Path, text: str, models: dict[str, Parameters], config: MachineConfig) -> tuple[Path, Piece]:
-    """Return a program and its rows as a check finds them: for drives without current."""
     program = folder / "part.ngc"
     program.write_text(text)
     reference = load_trajectory(program, config)
@@ -44,7 +43,6 @@ def checked(folder: Path, text: str, models: dict[str, Parameters], config: Mach
 
 
 def resting(amperes: dict[str, float]) -> dict[str, AtRest]:
-    """Return axes that stand at the origin with a current."""
     return {axis: AtRest(0.0, 0.0, current) for axis, current in amperes.items()}
 
 
@@ -65,7 +63,6 @@ def cut(program: Path, piece: Piece, amperes: dict[str, float], config: MachineC
 @pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize("text", [LONG, SHORT])
 def test_the_error_before_the_first_corner_is_gone(text: str, tmp_path: Path) -> None:
-    """Drives that stand with a current somewhere in the band of dry friction: what is left is what is left without."""
     amperes = {"X": 4.0, "Y": -3.0}
     program, begin = checked(tmp_path, text, MODELS, CONFIG)
     first = FirstBlock(begin, program, MODELS, CONFIG)
@@ -89,7 +86,6 @@ def test_the_error_before_the_first_corner_is_gone(text: str, tmp_path: Path) ->
 
 
 def test_rows_that_are_right_already_stay(tmp_path: Path) -> None:
-    """Axes without a current begin as the check assumed, others as they were known to stand."""
     program, begin = checked(tmp_path, SHORT, MODELS, CONFIG)
     first = FirstBlock(begin, program, MODELS, CONFIG)
     assert first.renew(resting({"X": 0.1, "Y": -0.1})) is None
@@ -102,7 +98,6 @@ def test_rows_that_are_right_already_stay(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("long_computation")
 def test_what_the_way_to_the_start_leaves_is_expected(tmp_path: Path) -> None:
-    """X comes from the positive side, Y stands there: independent drives that do so are corrected from their start."""
     program, begin = checked(tmp_path, LONG, MODELS, CONFIG)
     first = FirstBlock(begin, program, MODELS, CONFIG)
     rows = first.expect({"X": AtRest(250.0, 250.0, 3.0), "Y": AtRest(0.0, 0.0, 5.0)})
@@ -115,7 +110,7 @@ def test_what_the_way_to_the_start_leaves_is_expected(tmp_path: Path) -> None:
 
 
 def test_a_load_shifts_what_the_axes_hold(tmp_path: Path) -> None:
-    """On a plant that shares nothing with the model: each axis stands at an edge of a band that its load has moved."""
+    """The plant is independent of the model: each axis stands at an edge of a friction band shifted by its load."""
     plant = replace(Mechanics(), load_nm=4.0, static=0.2)
     model = Parameters.of({**plant.truth(), "load": 4.0, "stribeck": 1.0, "stribeck_speed": 10.0})
     models = {"X": model, "Y": model}
@@ -140,7 +135,6 @@ def test_a_load_shifts_what_the_axes_hold(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("rest", [{}, {"X": AtRest(0, 0, 3)}, {"X": AtRest(0, 0, 3), "Y": AtRest(5, 5, 3)}])
 def test_an_axis_that_does_not_stand_at_the_start_leaves_the_rows(rest: dict[str, AtRest], tmp_path: Path) -> None:
-    """What it holds when the program starts is not known yet."""
     program, begin = checked(tmp_path, SHORT, MODELS, CONFIG)
     first = FirstBlock(begin, program, MODELS, CONFIG)
     assert first.renew(rest) is None
@@ -148,7 +142,6 @@ def test_an_axis_that_does_not_stand_at_the_start_leaves_the_rows(rest: dict[str
 
 
 def heard(first: int, current: Float, position: float = 1.0) -> AxisSamples:
-    """Return samples of an axis that stands, from a tick on."""
     n = current.size
     still = frozen(np.full(n, position))
     zero, ticks = frozen(np.zeros(n)), frozen_ints(np.arange(first, first + n))
@@ -156,7 +149,6 @@ def heard(first: int, current: Float, position: float = 1.0) -> AxisSamples:
 
 
 def test_the_current_is_that_of_the_last_samples() -> None:
-    """It is heard once the axis has stood for a while, and is the newest that is known."""
     standstill = Standstill(CONFIG)
     rows = round(WATCHED_S / 0.001)
     standstill.take(heard(0, np.full(rows // 2, 1.0)))
@@ -166,7 +158,6 @@ def test_the_current_is_that_of_the_last_samples() -> None:
 
 
 def test_an_axis_that_moves_or_was_not_heard_is_not_at_rest() -> None:
-    """Motion, a lost row, an offset in force, or a SYNC count that begins anew."""
     rows = round(WATCHED_S / 0.001)
     good = heard(0, np.full(2 * rows, 2.0))
     moved = replace(good, position_mm=frozen(np.linspace(0, 1, 2 * rows)))

@@ -25,7 +25,6 @@ from tests.guard.machine import settings
 
 @pytest.fixture
 def far(tmp_path: Path) -> Iterator[Callable[[bytes | None], GuardClient]]:
-    """A guard that answers every request with the same bytes; None: it hangs up."""
     server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     server.bind(str(tmp_path / "guard.sock"))
     server.listen()
@@ -66,7 +65,7 @@ def test_answers_of_others_are_passed_over(far: Far) -> None:
 
 
 def test_a_guard_that_gives_no_answer_is_told(far: Far) -> None:
-    with pytest.raises(DeviceTimeout, match="gave no answer"), far(b"") as client:
+    with pytest.raises(DeviceTimeout, match="did not answer"), far(b"") as client:
         client.disarm()
 
 
@@ -139,7 +138,6 @@ def start(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
 def test_it_starts_on_its_descriptor_and_stops_at_a_signal(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, handlers: None
 ) -> None:
-    """With nothing heard it does not know that nothing stands, and says so."""
     file = tmp_path / "guard.json"
     file.write_text(to_json(settings(run_directory=str(tmp_path), clock="monotonic")))
     caught = signals.catch

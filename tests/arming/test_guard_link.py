@@ -1,4 +1,4 @@
-"""The daemon's link to the guard: no trip is missed, whoever looked; a guard that does not answer holds nothing up."""
+"""The daemon's link to the guard: it reports every trip, and a silent guard does not block it."""
 
 from __future__ import annotations
 
@@ -28,13 +28,11 @@ STARVED = {"state": "RAMP_DOWN", "cause": {"code": "TableStarved", "text": "no r
 
 @pytest.fixture
 def config(tmp_path: Path) -> MachineConfig:
-    """The bench, two axes, writing allowed."""
     return config_of(tmp_path, ("X", "Y"))
 
 
 @pytest.fixture
 def folder(config: MachineConfig) -> Path:
-    """The run directory."""
     assert config.store.run_directory is not None
     config.store.run_directory.mkdir(parents=True)
     return config.store.run_directory
@@ -42,26 +40,23 @@ def folder(config: MachineConfig) -> Path:
 
 @pytest.fixture
 def guard(folder: Path) -> Iterator[Guard]:
-    """A guard that says what it is told to."""
     made = Guard(folder)
     yield made
     made.close()
 
 
 class Long:
-    """A streamed program, as far as handing on its rows asks."""
-
     stream = SimpleNamespace(axes=("X",), program_digest="digest")
 
 
 def test_a_link_that_was_ended_makes_no_new_connection(guard: Guard, folder: Path) -> None:
-    """A look that was under way when the daemon ended would leave one that nobody closes."""
+    """A status request in progress at shutdown would otherwise leave an open connection."""
     link = GuardLink(folder, folder)
     link.refresh()
     link.close()
     assert link.refresh() == []
     assert not link.connected
-    with pytest.raises(DeviceError, match="is not asked any more, since the daemon ends"):
+    with pytest.raises(DeviceError, match="is disconnected: the daemon is shutting down"):
         link.disarm()
 
 
@@ -78,7 +73,6 @@ def test_a_trip_that_another_request_saw_is_told_all_the_same(guard: Guard, fold
 
 
 def test_a_guard_that_does_not_answer_is_let_go(guard: Guard, folder: Path) -> None:
-    """What it may have armed by then ends with the connection: nobody was told that it is armed."""
     link = GuardLink(folder, folder)
     link.refresh()
     assert link._client is not None
@@ -95,7 +89,6 @@ def test_a_guard_that_does_not_answer_is_let_go(guard: Guard, folder: Path) -> N
 async def test_a_slow_guard_still_hears_that_the_daemon_lives(
     config: MachineConfig, guard: Guard, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its answers are not waited for, not even while something is armed."""
     monkeypatch.setattr("fdhil.arming.guard_link.GuardClient", partial(GuardClient, timeout_s=100.0))
     guard.says = lambda _kind: None
     desk = ArmingDesk(config, OutcomeStore(config), folder)
@@ -152,7 +145,7 @@ async def test_what_is_given_up_while_it_is_planned_is_not_armed(
 
 @pytest.mark.fault("E18")
 async def test_a_disarm_waits_for_no_disk(config: MachineConfig, guard: Guard, folder: Path) -> None:
-    """Every thread of asyncio's pool waits for one, as where axes, history, notices and requests are to be stored."""
+    """Every thread of asyncio's pool waits for the disk, as with pending axes, history, notices and requests."""
     guard.says = lambda _kind: {**FINE, "state": "OFF"}
     desk, answers = ArmingDesk(config, OutcomeStore(config), folder), threading.Event()
     waiting = [asyncio.create_task(asyncio.to_thread(answers.wait, 60.0)) for _ in range(40)]
@@ -185,7 +178,6 @@ async def test_a_text_that_no_file_and_no_token_can_be_is_answered(
 async def test_a_disarm_that_is_answered_before_the_guard_is_asked_to_arm_is_the_last_word(
     config: MachineConfig, guard: Guard, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All is planned, and the guard's slow answer to another request is waited for when the operator disarms."""
     feeding = SimpleNamespace(laws={}, facts={}, summary=dict, progress=dict)
     monkeypatch.setattr("fdhil.arming.desk.prepare_feeding", lambda *_: feeding)
     guard.says = lambda _kind: {**FINE, "state": "OFF"}
@@ -211,7 +203,6 @@ async def test_a_disarm_that_is_answered_before_the_guard_is_asked_to_arm_is_the
 async def test_the_guard_is_told_as_of_which_disarm_it_is_asked(
     config: MachineConfig, guard: Guard, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """While all is planned the status says of one disarm more, which this daemon has not asked for."""
     desk = ArmingDesk(config, OutcomeStore(config), folder)
     desk.begin({}, [])
     disarms, of_its_time = 4, SimpleNamespace(laws={}, facts={}, summary=dict, progress=dict)

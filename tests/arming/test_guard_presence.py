@@ -1,4 +1,4 @@
-"""Whether a guard is there: by who listens at its socket, not by the socket's name."""
+"""A guard is present if a process listens at its socket; the socket file alone does not count."""
 
 from __future__ import annotations
 

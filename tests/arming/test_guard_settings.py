@@ -1,4 +1,4 @@
-"""The guard's settings: what is made of a config, its profiles and the records of commissioning."""
+"""The guard's settings from configuration, profiles and commissioning records."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_the_guard_knows_the_record_and_whether_it_holds(tmp_path: Path) -> None
 
 
 def test_what_the_guard_sends_is_nobody_elses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An offset that another drive takes for its set-point would move an axis that nobody corrects."""
+    """An offset that another drive takes for its set-point would move an axis that is not corrected."""
     config = machine_config.load(write_config(tmp_path, 1))
     drives = {"X": config.axis["X"], "Y": config.axis["Y"].model_copy(update={"correction": None})}
     (sent,) = (
@@ -92,7 +92,6 @@ def test_what_the_guard_sends_is_nobody_elses(tmp_path: Path, monkeypatch: pytes
         settings_of(config.model_copy(update={"axis": with_encoder}), "can0", tmp_path, "")
 
     def other(drive: Drive) -> DriveProfile:
-        """A drive with node-ID 2 that takes its set-points from the next PDO of node-ID 1."""
         profile = load_profile(drive)
         if drive != drives["Y"].drive:
             return profile

@@ -1,4 +1,4 @@
-"""A program that is armed again carries what its last pass taught; a disturbed pass teaches nothing."""
+"""A program armed again applies the offsets learned in its last pass; a disturbed pass is not used."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ WAVE_MM = 2e-3
 
 @pytest.fixture
 def config(tmp_path: Path) -> MachineConfig:
-    """The bench, two axes, commissioned; it learns."""
     config = config_of(tmp_path, ("X", "Y")).model_copy(update={"correction": Learning(learning=True)})
     save_records(config)
     return config
@@ -65,13 +64,13 @@ async def test_the_next_pass_carries_what_the_last_one_taught(
         learned = np.array([row[2:] for row in mill.rows])
     assert [told.get("learned") is not None for told in shop.desk.passes] == [False, False, False, True]
     assert shop.desk.passes[2]["text"].endswith(
-        "the NC's override was 80 % in line 3: nothing is learned from this pass"
+        "the NC's override was 80 % in line 3: the pass is not used for learning"
     )
     assert shop.desk.passes[-1]["learned"]["passes"] == 1
     # the first arming did not know yet at which current the axes stand
     assert np.array_equal(offsets[1], offsets[3]), "a disturbed pass has taught something"
     assert not any("Learned" in text for told in warnings for text in told)
-    assert any("Learned: what 1 passes taught is added" in text for text in answer["warnings"])
+    assert any("Learned: offsets of 1 passes are added" in text for text in answer["warnings"])
     added_mm = (learned - offsets[3])[: wave.size, 0] * config.axis["X"].screw_pitch_mm / 65536
     assert np.corrcoef(added_mm, -wave)[0, 1] > 0.95
     assert not np.array_equal(learned[:, 0], offsets[3][:, 0])

@@ -1,4 +1,4 @@
-"""After each pass under a correction its measured error stands beside the predicted one and its uncertainty."""
+"""After each corrected pass its measured error is reported with the predicted one and its uncertainty."""
 
 from __future__ import annotations
 
@@ -28,7 +28,6 @@ REST_ROWS = 300
 
 @pytest.fixture
 def config(tmp_path: Path) -> MachineConfig:
-    """The bench, two axes, commissioned."""
     config = config_of(tmp_path, ("X", "Y"))
     save_records(config)
     return config
@@ -36,14 +35,12 @@ def config(tmp_path: Path) -> MachineConfig:
 
 @pytest.fixture
 def armament(config: MachineConfig, program: Path) -> Armament:
-    """The corner, ready for the guard."""
     found = whole(program, config)
     assert isinstance(found, Armament)
     return found
 
 
 def heard(demand: Mapping[str, Float], position: Mapping[str, Float]) -> Iterator[AxisSamples]:
-    """What the bus shows of a pass: the way to its start, a rest, the pass, a rest; the axes in blocks of their own."""
     for axis, size in (("X", 40), ("Y", 37)):
         way = np.concatenate([np.linspace(30.0, 0.0, 200) + demand[axis][0], np.full(REST_ROWS, demand[axis][0])])
         wanted = np.concatenate([way, demand[axis], np.full(REST_ROWS, demand[axis][-1])])
@@ -58,7 +55,6 @@ def heard(demand: Mapping[str, Float], position: Mapping[str, Float]) -> Iterato
 def test_a_pass_is_measured_as_a_prediction_is_whatever_its_pieces(
     config: MachineConfig, armament: Armament, planned: Correction, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Chunks, margins and joined blocks change nothing: the figures are those of all rows at once."""
     monkeypatch.setattr(passes, "CHUNK_S", 0.2)
     reference, after = planned.before.reference, planned.after
     demand = armament.begin.demand
@@ -94,7 +90,6 @@ def test_a_pass_that_never_began_measures_nothing(
 
 
 def measured(told: Sequence[Notice], count: int) -> bool:
-    """Whether so many passes were told as measured: the last thing that is done of each."""
     return sum(notice.code == "PassMeasured" for notice in told) == count
 
 
@@ -135,7 +130,7 @@ async def test_each_pass_is_told_beside_what_was_predicted(
     assert first["gain"]["measured"] > first["gain"]["predicted"] > 1.0
     assert "ended early: StaleData" in third["text"]
     assert any("more than predicted; identify again" in notice.text for notice in shop.told)
-    assert any("worse than without; leave it off" in notice.text for notice in shop.told)
+    assert any("worse than uncorrected; leave it off" in notice.text for notice in shop.told)
 
 
 def test_a_gain_is_bounded_by_the_parameters_spread_and_by_the_skill(config: MachineConfig, program: Path) -> None:
@@ -186,7 +181,6 @@ def test_a_spread_below_the_digits_is_not_zero() -> None:
 def test_a_table_behind_a_known_spring_is_measured_where_it_is(
     config: MachineConfig, armament: Armament, planned: Correction
 ) -> None:
-    """What the model says that the table is ahead of its motor is added to what the motor's encoder shows."""
     reference = planned.before.reference
     rows = reference.time_s.size
     ahead = np.column_stack([5e-3 * np.sin(2 * np.pi * 2.0 * reference.time_s), np.zeros(rows)])
@@ -203,8 +197,8 @@ def test_a_table_behind_a_known_spring_is_measured_where_it_is(
 @pytest.mark.parametrize(
     ("late", "severity", "told"),
     [
-        ("this PC was late (37 offsets, worst 9.0 ms)", "minor", "take load off this PC, then arm again"),
-        ("", "MAJOR", "worse than without; leave it off and identify again"),
+        ("this PC was late (37 offsets, worst 9.0 ms)", "minor", "reduce the load of this PC, then arm again"),
+        ("", "MAJOR", "worse than uncorrected; leave it off and identify again"),
     ],
 )
 def test_pass_that_a_late_pc_ended_is_not_the_models_fault(late: str, severity: str, told: str) -> None:

@@ -1,4 +1,4 @@
-"""Nothing is armed that the daemon cannot vouch for; every no has its class and what to do about it."""
+"""Nothing is armed unless all facts hold; every refusal has its code and the next action."""
 
 from __future__ import annotations
 
@@ -45,20 +45,17 @@ GENTLE = "G21 G90 G94\nG1 X20 F4000\nG1 Y20\nG4 P0.2\nM2\n"
 
 @pytest.fixture
 def config(tmp_path: Path) -> MachineConfig:
-    """The bench, two axes, writing allowed."""
     return config_of(tmp_path, ("X", "Y"))
 
 
 @pytest.fixture
 def program(tmp_path: Path) -> Path:
-    """A corner, whose error a correction can take away."""
     path = tmp_path / "gentle.ngc"
     path.write_text(GENTLE)
     return path
 
 
 def known(config: MachineConfig, **changes: Any) -> dict[str, AxisKnowledge]:
-    """Return what a daemon knows of axes that are in good order, but for ``changes`` of X."""
     newest = replace(published(), config_digest=config.digest)
     skill = Skill("X", 1, 0.5, 1.0, 0.0, 30.0)
     good = AxisKnowledge(newest, 60.0, 21.5, (skill, skill, skill))
@@ -66,7 +63,6 @@ def known(config: MachineConfig, **changes: Any) -> dict[str, AxisKnowledge]:
 
 
 def record_of(config: MachineConfig, **changes: Any) -> CommissioningRecord:
-    """Return the record of X as it should be, but for ``changes``."""
     record = CommissioningRecord(
         axis="X",
         vendor_id=1,
@@ -87,14 +83,12 @@ def record_of(config: MachineConfig, **changes: Any) -> CommissioningRecord:
 
 
 def save_records(config: MachineConfig, **changes: Any) -> None:
-    """Save the records of both axes, with ``changes`` for X."""
     save_record(record_of(config, **changes), config.store.directory)
     other = record_of(config, axis="Y", config_digest=axis_digest(config, "Y"))
     save_record(other, config.store.directory)
 
 
 def whole(program: Path, config: MachineConfig, method: str | None = None, **changes: Any) -> Armament | Refused:
-    """Make a program ready that is planned at once, where it may be."""
     request = prepare(program, method, config, known(config, **changes))
     assert isinstance(request, ArmRequest)
     assert not request.ahead
@@ -235,7 +229,7 @@ async def test_the_operators_token_decides_and_a_missing_guard_is_told(config: M
 
 @pytest.mark.timeout(100)
 def test_a_pipe_is_no_program_and_nobody_waits_for_it(config: MachineConfig, tmp_path: Path) -> None:
-    """Nothing else could be armed, and the daemon could not stop, for as long as nobody writes to it."""
+    """Opening a pipe would block arming and shutdown until somebody writes to it."""
     os.mkfifo(tmp_path / "program.ngc")
     axis = AxisKnowledge(published(), 0.0, None, ())
     for program in (tmp_path / "program.ngc", Path(os.devnull)):
@@ -246,7 +240,7 @@ def test_a_pipe_is_no_program_and_nobody_waits_for_it(config: MachineConfig, tmp
 @pytest.mark.timeout(100)
 @pytest.mark.parametrize("name", ["program.ngc", "demand.csv"])
 def test_file_of_holes_is_refused_by_its_size(name: str, config: MachineConfig, tmp_path: Path) -> None:
-    """It takes no room on the disk, and hashing it takes many minutes, in which nothing else can be armed."""
+    """A sparse file takes no disk space, but hashing it would block arming for minutes."""
     (tmp_path / name).touch()
     os.truncate(tmp_path / name, 1 << 40)
     known = dict.fromkeys(config.axis, AxisKnowledge(published(), 0.0, None, ()))
@@ -282,7 +276,6 @@ def test_a_model_ages_while_the_computer_is_suspended(config: MachineConfig, mon
 
 
 def test_loops_that_were_identified_and_are_believed_are_planned_with(config: MachineConfig, program: Path) -> None:
-    """Others are not; the configuration that was commissioned stays what it is."""
     believed = Verdict(True, None, unexplained_um=0.5, warnings=(Reason(DIFFER, "speed_kp is 21"),))
     loops = LoopEstimate(
         "X", "p_pi_pi", ("speed_kp", "speed_filter_s"), np.array([21.0, 5e-4]), np.zeros((2, 2)), believed
@@ -306,14 +299,12 @@ def test_loops_that_were_identified_and_are_believed_are_planned_with(config: Ma
 
 
 def own_config(config: MachineConfig, knowledge: Knowledge) -> MachineConfig:
-    """Return the configuration with which what is known would be planned."""
     found = models_with_loops("XY", config, knowledge.now())
     assert not isinstance(found, Refused)
     return found[1]
 
 
 def test_a_set_is_planned_with_the_loops_it_was_validated_with(config: MachineConfig, program: Path) -> None:
-    """Also where the daemon was started since then, and found none itself."""
     newest = replace(published(), config_digest=config.digest, loops={"speed_filter_s": 0.002})
     request = prepare(program, None, config, known(config, published=newest))
     assert isinstance(request, ArmRequest)

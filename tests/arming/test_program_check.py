@@ -1,4 +1,4 @@
-"""A long program is checked as a whole before it is armed: what is sent was checked, what is refused is named."""
+"""A long program is checked as a whole before it is armed: only checked rows are sent, refusals are named."""
 
 from __future__ import annotations
 
@@ -41,19 +41,16 @@ HARD_LINES = (15, 24)  # in the third square and in the fifth
 
 @pytest.fixture
 def config(tmp_path: Path) -> MachineConfig:
-    """The bench, two axes, writing allowed."""
     return config_of(tmp_path, ("X", "Y"))
 
 
 def written(folder: Path, text: str) -> Path:
-    """A program on disk."""
     path = folder / "program.ngc"
     path.write_text(text)
     return path
 
 
 def checked(program: Path, config: MachineConfig) -> tuple[dict[str, Any], bytes, list[Any]]:
-    """Check a program in this process; return header, rows and what was told."""
     body, told = io.BytesIO(), list[Any]()
     header = check(program, program_digest(program), nominal_models(config), config, body, told.append)
     return header, body.getvalue(), told
@@ -84,7 +81,6 @@ def test_the_rows_are_those_of_the_whole_plan(config: MachineConfig, tmp_path: P
 
 
 def test_a_block_is_written_before_it_is_told(config: MachineConfig, tmp_path: Path) -> None:
-    """Who reads as far as was told finds the rows that were told."""
     file, program, seen = tmp_path / "rows", written(tmp_path, LONG), 0
 
     def look(told: Mapping[str, Any]) -> None:
@@ -102,7 +98,6 @@ def test_a_block_is_written_before_it_is_told(config: MachineConfig, tmp_path: P
 
 
 def hard_program() -> str:
-    """Two lines of a program ask more of the drives than they have."""
     lines = LONG.splitlines()
     for number in HARD_LINES:
         lines[number - 1] = lines[number - 1].split(" F")[0] + " F30000"
@@ -158,12 +153,10 @@ def test_a_checked_program_is_armed_with_its_first_rows_and_goes_on(config: Mach
 
 
 def whole(_checked: CheckedProgram) -> bool:
-    """Nothing but the whole is enough."""
     return False
 
 
 async def _twice(config: MachineConfig, found: ArmRequest) -> list[CheckedProgram | tuple[Reason, ...]]:
-    """Check in a process; the second time nothing is started."""
     check, heard = BackgroundCheck(config), list[Mapping[str, Any]]()
 
     async def listen() -> None:
@@ -205,7 +198,6 @@ BESIDE = "O<square> SUB\n" + SQUARE + "O<square> ENDSUB\n"
 
 @pytest.mark.usefixtures("processes")
 async def test_a_subroutine_beside_the_program_belongs_to_it(config: MachineConfig, tmp_path: Path) -> None:
-    """The program is the same, its subroutine is not: what was checked is not what would be cut."""
     beside = tmp_path / "square.ngc"
     beside.write_text(BESIDE)
     program = written(tmp_path, CALLS)
@@ -231,7 +223,7 @@ async def test_a_subroutine_beside_the_program_belongs_to_it(config: MachineConf
 
 @pytest.mark.parametrize("which", ["program.ngc", "square.ngc"])
 def test_what_changes_while_it_is_checked_is_refused(which: str, config: MachineConfig, tmp_path: Path) -> None:
-    """Its rows would be known under the digest of what it was."""
+    """Its rows would otherwise be stored under the digest of the old content."""
     (tmp_path / "square.ngc").write_text(BESIDE)
     program = written(tmp_path, CALLS)
 
@@ -270,7 +262,6 @@ async def test_a_process_that_cannot_be_started_is_told(
 async def test_a_broken_program_is_refused_with_its_line_by_a_process_that_ends(
     config: MachineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It answers and ends while its stdin is open; its digest covers what it ran; the daemon makes a refusal of it."""
     program = written(tmp_path, HEAD + SQUARE * 10 + "G1 X[1/0]\nM2\n")
     answer = answered(asked(program, config, tmp_path), tmp_path / "stderr")
     assert json.loads(answer.splitlines()[-1])["error"]["code"] == "ProgramError"
@@ -292,7 +283,6 @@ def test_the_process_ends_with_the_daemon(config: MachineConfig, tmp_path: Path)
 
 
 def made(folder: Path, key: str) -> Path:
-    """Keep eight rows in two blocks under a key; return their file."""
     code = code_digest()
 
     def rows(body: Any) -> dict[str, Any]:
@@ -332,7 +322,6 @@ def test_what_was_checked_is_only_believed_whole(tmp_path: Path) -> None:
 
 
 def test_what_is_armed_outlives_its_file(tmp_path: Path) -> None:
-    """Another program may take its place in the store while it runs."""
     file = made(tmp_path, "a")
     found = CheckedProgram.find(tmp_path, "a", tmp_path)
     assert found is not None
@@ -341,7 +330,6 @@ def test_what_is_armed_outlives_its_file(tmp_path: Path) -> None:
 
 
 def test_what_other_code_made_is_checked_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A changed planner under the same version makes other rows."""
     made(tmp_path, "a")
     home = tmp_path / "fdhil"
     shutil.copytree(Path(fdhil.__file__).parent, home, ignore=shutil.ignore_patterns("__pycache__"))
@@ -377,7 +365,6 @@ def test_a_store_that_refuses_is_told(tmp_path: Path) -> None:
 
 
 def test_rows_of_other_terms_or_loops_are_other_rows(config: MachineConfig, tmp_path: Path) -> None:
-    """A check is known by all that its rows depend on, and the request to its process has all of it."""
     program = written(tmp_path, HEAD + SQUARE + "G4 P0.3\nM2\n")
     digest, six = program_digest(program), nominal_models(config)
     rich = {axis: model.changed(stribeck=2.0, stribeck_speed=10.0) for axis, model in six.items()}

@@ -1,4 +1,4 @@
-"""What may still be applied is told, never hidden: by the link, the daemon and its commands, without a guard too."""
+"""A residual offset is always reported: by the link, the daemon and its commands, also without a guard."""
 
 from __future__ import annotations
 
@@ -38,7 +38,6 @@ STANDS = "-4.6 um on axis X and an unknown offset on axis Y may still be applied
 
 @pytest.fixture
 def machine(tmp_path: Path) -> Path:
-    """A machine's config and its run directory with a token."""
     path = tmp_path / "machine.toml"
     path.write_text(BENCH)
     run = tmp_path / "fdhil-data" / "run"
@@ -49,13 +48,11 @@ def machine(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def folder(machine: Path) -> Path:
-    """The run directory."""
     return machine.parent / "fdhil-data" / "run"
 
 
 @pytest.fixture
 def guard(folder: Path) -> Iterator[Guard]:
-    """A guard that says what it is told to."""
     made = Guard(folder)
     made.says = lambda _kind: OFF
     yield made
@@ -64,14 +61,13 @@ def guard(folder: Path) -> Iterator[Guard]:
 
 @pytest.fixture
 def config(tmp_path: Path) -> MachineConfig:
-    """The bench, two axes, with the same run directory."""
     return config_of(tmp_path, ("X", "Y"))
 
 
 @pytest.mark.parametrize(
     ("status", "nothing", "text"),
     [
-        (standing.ABSENT, True, "no guard was heard, nothing was sent"),
+        (standing.ABSENT, True, "there was no guard, nothing was sent"),
         (OFF, True, "offset 0"),
         ({"state": "OFF"}, False, "an unknown offset may still be applied"),
         ({"state": "OFF", "may_stand_um": {}}, False, "an unknown offset may still be applied"),
@@ -145,15 +141,12 @@ def test_a_guard_that_is_lost_while_it_arms_may_have_armed(guard: Guard, folder:
 
 
 class Law:
-    """What is fed forward, as far as handing it over asks."""
-
     laws: Mapping[str, Any] = {}
     facts: Mapping[str, bool] = {}
 
 
 @pytest.mark.parametrize("kept", ["", "[1]", '{"X": [], "Y": NaN}', f'{{"X": 1{"0" * 400}}}', "{" * 100_000])
 def test_the_next_daemon_knows_what_the_one_before_it_left(tmp_path: Path, folder: Path, kept: str) -> None:
-    """Both are killed in the cut, guard and daemon; the next daemon finds no guard, however it reads what was kept."""
     guard = Guard(folder)
     guard.says = lambda kind: OFF if kind == "status" else {**OFF, "ok": True}
     link = GuardLink(folder, tmp_path)
@@ -202,7 +195,6 @@ def test_what_a_frozen_guard_holds_is_known_to_the_next_daemon_by_its_size(tmp_p
 
 
 async def test_disarm_is_ok_at_zero_only(config: MachineConfig, guard: Guard, folder: Path) -> None:
-    """The ramp is waited for; FROZEN, and an offset that nobody knows, are no zero."""
     ramp = iter([{**ACTIVE, "state": "RAMP_DOWN"}] * 3)
     guard.says = lambda kind: OFF if kind == "disarm" else next(ramp, OFF)
     desk = ArmingDesk(config, OutcomeStore(config), folder)
@@ -248,7 +240,6 @@ async def test_arming_a_frozen_guard_says_adopt_and_not_disarm(
 
 
 def running(machine: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any, meanwhile: Any) -> tuple[int, str]:
-    """Run ``fdhil run`` in this process, call ``meanwhile`` beside it, stop it; return exit code and stderr."""
     monkeypatch.setattr("fdhil.daemon.service.warm", lambda config, method: None)
     monkeypatch.setattr("fdhil.drivers.open_machine", Machine().open)
     path = machine.parent / "fdhil-data" / "run" / "daemon.sock"
@@ -271,7 +262,6 @@ def running(machine: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any, meanwhi
 
 
 def status_when(path: Path, ready: Any) -> dict[str, Any]:
-    """Ask for the status until it is ``ready``."""
     while not ready(told := ask(path, {"request": "status"})):
         threading.Event().wait(0.02)
     return told
@@ -349,14 +339,12 @@ def test_adopt_says_what_stands_asks_and_ends_at_zero(
 
 
 def in_the_audit(machine: Path) -> list[tuple[str, str | None]]:
-    """What was asked or answered, and with which result."""
     found = audit.entries(machine_config.load(machine).store.directory)
     return [(entry.get("asked") or entry["answered"], entry.get("result")) for entry, wrong in found if wrong is None]
 
 
 @pytest.mark.fault("F5")
 def test_no_disk_keeps_an_offset_from_being_taken_away(machine: Path, guard: Guard, capsys: Any) -> None:
-    """What cannot be written down is told, after the answer."""
     folder = machine_config.load(machine).store.directory
     (folder / audit.FILE_NAME).mkdir(parents=True)
     now = [FROZEN, OFF]

@@ -1,4 +1,4 @@
-"""A program that is planned at once has rows in the drives' increments; what was refused has none."""
+"""A program planned at once has rows in the drives' increments; a refused one has none."""
 
 from __future__ import annotations
 
@@ -27,12 +27,10 @@ from tests.paths import bench_trajectory
 
 @pytest.fixture
 def config(tmp_path: Path) -> MachineConfig:
-    """The bench, two axes, writing allowed."""
     return config_of(tmp_path, ("X", "Y"))
 
 
 def test_rows_are_in_the_drives_increments_and_sign() -> None:
-    """Demand and offset are rounded, and turned where the drive counts against the axis."""
     document = copy.deepcopy(bench_document())
     document["axis"]["Y"]["drive"] = {"sign": -1}
     config = parse(document)
@@ -63,7 +61,6 @@ FAR = "G1 X{:.4f} F30000\nG1 X0\nM2\n"
 
 
 def test_a_program_beyond_32_bits_is_refused_whichever_way_it_is_checked(tmp_path: Path) -> None:
-    """At once and ahead of the motion: an error for the operator, never the end of the daemon."""
     document = bench_document("X")
     document["axis"]["X"]["drive"] = {"increments_per_rev": 20_000_000}
     config = parse(document, folder=tmp_path)
@@ -79,7 +76,6 @@ def test_a_program_beyond_32_bits_is_refused_whichever_way_it_is_checked(tmp_pat
 
 @pytest.mark.parametrize("name", ["program.ngc", "program.csv"])
 def test_rows_and_digest_are_of_one_content(name: str, config: MachineConfig, tmp_path: Path) -> None:
-    """Another file is renamed to the program's name after its digest was taken: nothing is made of it."""
     program, other = tmp_path / name, tmp_path / "other"
     texts = {".ngc": FAR.format(30), ".csv": "time_s,X_mm,Y_mm\n0.000,0,0\n0.001,0,0\n0.002,0,0\n"}
     program.write_text(texts[program.suffix])

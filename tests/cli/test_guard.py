@@ -181,4 +181,4 @@ def test_a_guard_under_a_user_of_its_own(
     assert not (tmp_path / "fdhil-data" / "run").exists()
     config.write_text(config.read_text().replace('"daemon"', '"nobody of that name"'))
     assert run(monkeypatch, str(config), "--check") == 2
-    assert "there is no user 'nobody of that name'" in capsys.readouterr().err
+    assert "the user 'nobody of that name' does not exist" in capsys.readouterr().err

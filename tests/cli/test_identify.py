@@ -265,7 +265,7 @@ def test_a_scopes_trace_is_identified_and_says_how_it_was_read(tmp_path: Path) -
     pooled = told_document(result)["files"][0]["pooled"]
     assert pooled["validated"], pooled
     assert pooled["parameters"]["K"]["value"] == pytest.approx(0.8, rel=0.01)
-    assert "ReadOtherwise: Position jumps by 2^16 as a counter of 16 bits does, and was unwrapped" in pooled["warnings"]
+    assert "ReadOtherwise: Position wraps like a counter of 16 bits and was unwrapped" in pooled["warnings"]
 
 
 def test_a_rapid_recorded_too_slowly_is_refused_by_its_rate(tmp_path: Path) -> None:

@@ -117,10 +117,10 @@ def test_a_file_of_another_run_or_kind_is_refused(tmp_path: Path) -> None:
     rows = np.random.default_rng(1).standard_normal((4000, 3))
     other.write_text("".join(f"{k * 1e-3:.4f},{a:.3f},{b:.3f},{c:.3f}\n" for k, (a, b, c) in enumerate(rows)))
     file = told(invoke(path, "--accelerometer", other, "--json"))
-    assert "does not show the moves of the recording" in file["error"]["text"]
+    assert "does not match the moves of the recording" in file["error"]["text"]
     other.write_text("time,x\n1,2\n")
     assert (
-        "is no recording of an accelerometer" in told(invoke(path, "--accelerometer", other, "--json"))["error"]["text"]
+        "is not an accelerometer recording" in told(invoke(path, "--accelerometer", other, "--json"))["error"]["text"]
     )
     result = CliRunner().invoke(cli, ["identify", str(path), str(path), "--accelerometer", str(other)])
     assert "belongs to one recording" in str(result.output) + str(result.exception)

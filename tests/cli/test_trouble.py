@@ -199,7 +199,7 @@ def test_a_file_that_cannot_be_read_is_3(kind: str, capsys: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("out", "words"), [("dir", "a folder"), ("pipe", "a pipe"), ("no/such/file", "there is no folder")]
+    ("out", "words"), [("dir", "a folder"), ("pipe", "a pipe"), ("no/such/file", "does not exist")]
 )
 def test_a_file_that_cannot_be_written_is_3_and_found_at_once(out: str, words: str, capsys: Any) -> None:
     for command, arguments in WITH_OUT.items():

@@ -333,7 +333,7 @@ def test_the_token_is_made_once_and_only_for_its_owner(tmp_path: Path) -> None:
     assert ensure_token(tmp_path) == read_token(tmp_path) == token
     assert (tmp_path / "token").stat().st_mode & 0o777 == 0o600
     (tmp_path / "token").chmod(0o644)
-    with pytest.raises(DeviceError, match="others can read it"):
+    with pytest.raises(DeviceError, match="other users can read it"):
         read_token(tmp_path)
 
 
@@ -368,7 +368,7 @@ def test_no_guard_serves_a_folder_in_which_anybody_may_put_a_socket(tmp_path: Pa
     operator_token(tmp_path / "run")
     (tmp_path / "run").chmod(0o777)
     for use in (operator_token, make_directory):
-        with pytest.raises(DeviceError, match=r"anybody may put a socket .* chmod 0700"):
+        with pytest.raises(DeviceError, match=r"any user may put a socket .* chmod 0700"):
             use(tmp_path / "run")
 
 

@@ -67,7 +67,7 @@ async def test_name_that_cannot_be_had_again_is_told_once_and_tried_on(tmp_path:
     async with served(path) as lost:
         shutil.rmtree(path.parent)
         path.parent.write_text("no folder")
-        assert "cannot be made" in await lost.get()
+        assert "cannot be created" in await lost.get()
         path.parent.unlink()
         assert await lost.get() == ""
         assert (await asyncio.to_thread(ask, path, {"request": "status"}))["ok"]

@@ -194,7 +194,7 @@ def test_a_fault_of_fdhil_itself_ends_the_daemon_and_is_told(
         raise ZeroDivisionError("made up")
 
     monkeypatch.setattr("fdhil.pipeline.AxisPipeline.feed", fail)
-    with pytest.raises(InternalError, match=r"ZeroDivisionError.*no guard was heard, nothing was sent") as error:
+    with pytest.raises(InternalError, match=r"ZeroDivisionError.*there was no guard, nothing was sent") as error:
         run(config, Machine(rapids(config, count=1)).open)
     assert error.value.exit_code == 3
     assert "made up" in capsys.readouterr().err

@@ -234,7 +234,7 @@ def test_where_the_answers_cannot_be_read_nothing_is_accepted(damage: bytes, wor
     store.mkdir(exist_ok=True)
     (store / ANSWERS_FILE).write_bytes(damage)
     before = file.read_bytes()
-    with pytest.raises(StoreError, match="an older offer would not be known"):
+    with pytest.raises(StoreError, match="older offers cannot be recognised"):
         accept(works.carried(), file, "Bert", may_loosen=False)
     assert file.read_bytes() == before
 
@@ -255,7 +255,7 @@ def test_answers_of_wrong_kinds_are_damage(tmp_path: Path) -> None:
 def test_an_answer_for_which_there_is_no_room_is_refused_and_those_before_it_stay(tmp_path: Path) -> None:
     first = Answer("a", 1, 1, "d", "accepted", "b", "", 1.5, "c")
     add_answer(tmp_path, first)
-    with pytest.raises(StoreError, match="no room for another answer"):
+    with pytest.raises(StoreError, match="no room for another decision"):
         add_answer(tmp_path, replace(first, reason="x" * LARGEST_ANSWERS))
     assert read_answers(tmp_path) == [first]
 

@@ -1,4 +1,4 @@
-"""A made trace written as people's programs write theirs: one dialect is one choice of each habit."""
+"""Writes a trace in the formats of other programs: a dialect is one choice of each habit."""
 
 from __future__ import annotations
 
@@ -15,8 +15,6 @@ ROWS = 60
 
 @dataclass(frozen=True)
 class Dialect:
-    """How a program writes: each field is a habit that some program has."""
-
     separator: str = ";"
     quotes: str = ""  # "", "names", "all", "needed"
     decimal: str = "."
@@ -39,7 +37,6 @@ class Dialect:
 
 
 def signals() -> dict[str, Float]:
-    """Return the signals (n,): what passes 1000, what is near zero, what is negative."""
     k = np.arange(ROWS)
     bell = np.sin(np.pi * k / (ROWS - 1)) ** 2
     return {
@@ -52,25 +49,21 @@ def signals() -> dict[str, Float]:
 
 
 def name_of(dialect: Dialect, signal: str) -> str:
-    """Return what stands above a column."""
     forms = {"plain": signal, "blanks": f"Axis {signal}", "unit": f"{signal} [x]", "comma": f"{signal}, actual"}
     return forms[dialect.names]
 
 
 def number(value: float, dialect: Dialect) -> str:
-    """Return a number as the dialect writes it."""
     text = format(value, f",{dialect.form}" if dialect.thousands else dialect.form)
     table: dict[str, str | int | None] = {",": dialect.thousands, ".": dialect.decimal, "-": dialect.minus}
     return text.translate(str.maketrans(table))
 
 
 def rows_kept(dialect: Dialect) -> list[int]:
-    """Return the rows that have every value."""
     return [k for k in range(ROWS) if not (dialect.lost and k in (20, 21))]
 
 
 def time_cell(k: int, dialect: Dialect) -> str:
-    """Return the time of row ``k`` at 1 kHz."""
     seconds = dialect.begins_s + k * 1e-3
     if dialect.time in ("clock", "date", "us date"):
         of_day = (23 * 3600 + 59 * 60 + 59.97 + k * 1e-3) % 86400
@@ -84,12 +77,10 @@ def time_cell(k: int, dialect: Dialect) -> str:
 
 
 def time_unit(dialect: Dialect) -> str:
-    """Return the unit of its times."""
     return dialect.time if dialect.time in ("ms", "us") else "s"
 
 
 def write(dialect: Dialect, values: dict[str, Float]) -> bytes:
-    """Return the file."""
     has_time = dialect.time != "none"
     names = [*(["Time"] if has_time else []), *(name_of(dialect, signal) for signal in values)]
     records = []
@@ -149,7 +140,6 @@ def _joined(cells: list[str], dialect: Dialect, is_name: bool = False) -> str:
 
 
 def column_map(dialect: Dialect) -> dict[str, Any]:
-    """Return the map of the file as a document."""
     of = dict(zip(("voltage_V", "current_A", "speed_rad_per_s", "position_m", "demand_m"), SIGNALS, strict=True))
     columns: dict[str, Any] = {
         signal: {"name": name_of(dialect, name), "unit": {"V": "V", "A": "A", "s": "rad/s", "m": "m"}[signal[-1]]}
@@ -164,5 +154,4 @@ def column_map(dialect: Dialect) -> dict[str, Any]:
 
 
 def written_values(dialect: Dialect, values: dict[str, Float]) -> dict[str, Float]:
-    """Return the signals rounded as the file has them."""
     return {name: np.array([float(format(v, dialect.form)) for v in column]) for name, column in values.items()}

@@ -1,4 +1,4 @@
-"""Stands for a library that a damaged file leads astray: the content says how, the child of the process under test."""
+"""A format library that fails as the file's content says, in the child of the process under test."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ TIME_S = np.arange(3.0)
 
 
 def read(content: bytes, source: str) -> RecordingTable:
-    """Do what the content says."""
     match content:
         case b"crash":
             ctypes.string_at(0)

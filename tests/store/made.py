@@ -1,4 +1,4 @@
-"""Windows, estimates and outcomes with known content, for the tests of what carries and keeps them."""
+"""Windows, estimates and outcomes with known content, for tests of transport and storage."""
 
 from __future__ import annotations
 
@@ -62,12 +62,10 @@ def window(n: int = 600, seed: int = 1, raw: bool = True, **changes: Any) -> Win
 
 
 def bits(values: Float | None) -> bytes | None:
-    """Return the bit pattern of an array; lost samples are one NaN."""
     return None if values is None else np.where(np.isnan(values), np.nan, values).tobytes()
 
 
 def same(a: Window, b: Window) -> bool:
-    """Whether two windows are identical bit by bit."""
     names = Window.__dataclass_fields__
     arrays = {"demand_mm", "position_mm", "speed_rad_s", "current_a", "voltage_v"}
     plain = all(repr(getattr(a, name)) == repr(getattr(b, name)) for name in names if name not in arrays)
@@ -75,7 +73,6 @@ def same(a: Window, b: Window) -> bool:
 
 
 def outcome(accepted: bool = True, of: Window | None = None, missing: str = "") -> WindowOutcome:
-    """Return an outcome with the bench's parameters."""
     values = np.array([math.nan if name == missing else getattr(BENCH, name) for name in PARAMETERS])
     reason = Reason("MissingStage(cruise)", "no plateau")
     estimate = Estimate(
@@ -91,7 +88,6 @@ def outcome(accepted: bool = True, of: Window | None = None, missing: str = "") 
 
 
 def published(revision: int = 1, axis: str = "X", parameters: Parameters = BENCH) -> ParameterSet:
-    """Return a parameter set with a covariance of its own."""
     root = np.random.default_rng(revision).normal(0, 1e-3, (6, 6))
     covariance = frozen(root @ root.T)
     digest, ticks = "0123456789abcdef", (12_345,)

@@ -1,4 +1,4 @@
-"""The audit: each line is chained to the one before, and every change of the file is seen."""
+"""The audit log: lines are chained, and every change of the file is detected."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ def written(tmp_path: Path) -> Path:
 
 
 def wrong(folder: Path) -> list[int]:
-    """Return the numbers of the lines that are not as they were written."""
     return [number for number, (_, fault) in enumerate(audit.entries(folder)) if fault]
 
 
@@ -123,7 +122,7 @@ def test_who_keeps_the_audit_locked_delays_it_and_then_it_is_told(
     monkeypatch.setattr(audit, "LOCKED_S", 0.05)
     with (written / audit.FILE_NAME).open() as reader:  # whoever may read it may lock it, too
         fcntl.flock(reader, fcntl.LOCK_EX)
-        with pytest.raises(StoreError, match="another process has kept it locked"):
+        with pytest.raises(StoreError, match="another process holds its lock"):
             audit.append(written, {"asked": "arm"})
     audit.append(written, {"asked": "arm"})
     assert len(list(audit.entries(written))) == len(ENTRIES) + 1

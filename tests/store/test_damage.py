@@ -1,4 +1,4 @@
-"""A bit that flips in what is kept: the same values, or it is told; never other values, never an undeclared error."""
+"""A flipped bit in stored data is harmless or reported; it never yields other values or undeclared errors."""
 
 from __future__ import annotations
 
@@ -31,7 +31,6 @@ FLIPS_PER_PAGE = 16
 
 
 def filled(folder: Path, wal: Path | None = None) -> bytes:
-    """A history of two axes, as its file's bytes after the daemon has ended; ``wal`` is given what a power cut left."""
     with History.open(folder) as history:
         for k in range(8):
             for axis in "XY":
@@ -54,7 +53,6 @@ def filled(folder: Path, wal: Path | None = None) -> bytes:
 
 
 def contents(history: History) -> dict[str, list[Any]]:
-    """All that can be read of a history."""
     return {
         "windows": history.windows(),
         "revisions": [(r.number, r.window_ids, r.stamp, r.set.axis, r.set.revision, r.set.parameters, r.set.windows,
@@ -68,7 +66,7 @@ def contents(history: History) -> dict[str, list[Any]]:
 
 
 def places(size: int, page: int, seed: int) -> list[tuple[int, int]]:
-    """Byte and bit: the file's header, then places all over every page, its head more densely than its payload."""
+    """Return byte and bit: the file's header, then positions in every page, denser in its head."""
     rng = random.Random(seed)
     found = [(byte, rng.randrange(8)) for byte in range(100)]
     for start in range(0, size, page):
@@ -135,7 +133,6 @@ def test_a_flipped_bit_of_the_log_after_a_power_cut_costs_the_newest_rows_at_mos
 
 
 def test_the_daemon_begins_anew_or_goes_on_whatever_bit_is_flipped(tmp_path: Path) -> None:
-    """A damaged row is put aside and told once, a damaged file kept under another name; what is added then is read."""
     whole = filled(tmp_path / "made")
     for byte, bit in places(len(whole), 4096, 2)[::37]:
         folder = tmp_path / f"{byte}-{bit}"
@@ -180,7 +177,6 @@ def test_a_damaged_revision_is_told_and_the_one_before_it_is_used(tmp_path: Path
 
 
 def test_a_row_of_an_older_schema_that_cannot_be_read_is_left_out(tmp_path: Path) -> None:
-    """It carries no digest yet; what is no JSON at all is seen all the same."""
     db = sqlite3.connect(tmp_path / FILE_NAME)
     db.executescript(schema._FIRST + "PRAGMA user_version = 1;")
     row = (1, "X", 1, 0.5, 0.005, 0.8, 0.075, 0.05, 5.0, "[[1.0", 3, "[]", "0123", 5, None, 1.0, "boot", 1)
@@ -213,7 +209,6 @@ def test_no_flipped_bit_of_a_window_changes_what_is_read(raw: bool) -> None:
 
 
 def parquet(columns: dict[str, Any], **options: Any) -> bytes:
-    """A file of these columns under the head of a window."""
     head = pq.ParquetFile(pa.BufferReader(encode_window(window(), "x"))).schema_arrow.metadata
     sink = io.BytesIO()
     pq.write_table(pa.table(columns).replace_schema_metadata(head), sink, **({"compression": "zstd"} | options))
@@ -221,7 +216,6 @@ def parquet(columns: dict[str, Any], **options: Any) -> bytes:
 
 
 def large_page(rows: int) -> bytes:
-    """A file whose footer declares few bytes, while a page's own header declares more than it was."""
     content = parquet({"tick": pa.array(np.arange(rows))}, use_dictionary=False)
     column = pq.ParquetFile(pa.BufferReader(content)).metadata.row_group(0).column(0)
     at = column.data_page_offset + 3  # after the page's type, field 1, and the head of field 2
@@ -237,10 +231,10 @@ ZEROS = np.zeros(400_000)
     ("content", "words"),
     [
         (parquet({name: np.zeros(600_000) for name in ("tick", "demand_mm")}), "declares 600000 rows"),
-        (parquet(dict.fromkeys(("tick", "demand_mm", "x1"), ZEROS)), "columns that no window has"),
+        (parquet(dict.fromkeys(("tick", "demand_mm", "x1"), ZEROS)), "columns unknown in windows"),
         (parquet({"tick": ZEROS}, use_dictionary=True), "has a dictionary"),
-        (parquet({"tick": pa.array(["a" * 1000] * 600)}, use_dictionary=False), "holds no plain numbers"),
-        (parquet({"tick": pa.array([[0.0] * 1000] * 600)}, use_dictionary=False), "columns that no window has"),
+        (parquet({"tick": pa.array(["a" * 1000] * 600)}, use_dictionary=False), "does not contain plain numbers"),
+        (parquet({"tick": pa.array([[0.0] * 1000] * 600)}, use_dictionary=False), "columns unknown in windows"),
         (large_page(40_000), "declares"),
     ],
     ids=["rows", "columns", "dictionary", "texts", "lists", "page"],

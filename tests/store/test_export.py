@@ -1,4 +1,4 @@
-"""An exported window is a recording: the same numbers, the same gaps."""
+"""A stored window is exported as a recording, exactly."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every recording format gives back what was written, to other programs too; a damaged file is one error."""
+"""Every recording format is lossless; damaged files are refused."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def test_a_file_that_declares_more_than_a_recording_has_is_refused_before_it_is_
     with h5py.File(path, "w") as file:
         file.create_dataset("current_A", shape=(1 << 40,), dtype="f8", chunks=(1 << 16,))
     assert path.stat().st_size < 1 << 20
-    with pytest.raises(RecordingError, match="more than a recording has"):
+    with pytest.raises(RecordingError, match="too many for a recording"):
         read_recording(path)
 
 

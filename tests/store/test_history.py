@@ -1,4 +1,4 @@
-"""The history keeps what was published, in the order it was published, whatever the clock says."""
+"""The history database: rows are read back, schemas upgraded, damage and refusals reported."""
 
 from __future__ import annotations
 
@@ -131,7 +131,6 @@ def test_another_schema_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
 
 
 def first_schema(folder: Path) -> None:
-    """A store as the first release wrote it, with one revision."""
     with History.open(folder) as history:
         history.add_revision(published(), [4], STAMP)
         (row,) = history._db.execute("SELECT * FROM revisions").fetchall()
@@ -146,7 +145,6 @@ def first_schema(folder: Path) -> None:
 
 @pytest.mark.fault("F19")
 def test_an_older_schema_is_brought_up_by_the_writer_and_read_as_it_is(tmp_path: Path) -> None:
-    """Nothing of it is lost; a reader changes nothing and misses what was not kept then."""
     first_schema(tmp_path)
     with History.read(tmp_path) as history:
         assert [r.set.revision for r in history.revisions()] == [1]
@@ -173,7 +171,6 @@ def test_a_new_history_keeps_no_copy_of_the_nothing_before_it(tmp_path: Path) ->
 def test_a_step_that_another_process_made_meanwhile_is_not_made_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two writers see the old schema; the second one finds the step done."""
     first_schema(tmp_path)
     seen = schema.version_of
     late = iter([True])
@@ -191,7 +188,6 @@ def test_a_step_that_another_process_made_meanwhile_is_not_made_twice(
 
 
 def comparison(rms_um: float = 24.2, program: str = "a" * 64) -> Comparison:
-    """What was predicted of a program."""
     zone = {"start_s": 0.1, "end_s": 0.3, "where": "X 1.0", "line": 2, "max_um": 98.5, "cause": "corner", "std_um": 0.5}
     used = {"X": UsedParameters(7, BENCH), "Y": UsedParameters(0, DRIFTED)}
     return Comparison(program, "part.ngc", "0123456789abcdef", used, rms_um, (zone,))

@@ -1,4 +1,4 @@
-"""A process that is killed at any step of a write: what was acknowledged is there, and the next one goes on."""
+"""Acknowledged rows survive a kill of the writer at any step."""
 
 from __future__ import annotations
 
@@ -19,10 +19,6 @@ STEPS = 14  # the folder: open and fsync of the one above; each window: open, wr
 
 
 def write_until_killed(folder: Path, nth: int) -> tuple[int, bool]:
-    """Write two windows in a process of its own that is killed before its nth call of the system.
-
-    Returns how many were acknowledged, and whether it was killed.
-    """
     told, tell = os.pipe()
     child = os.fork()
     if child == 0:
@@ -44,7 +40,6 @@ _write, _open, _fsync, _replace = os.write, os.open, os.fsync, Path.rename
 
 
 def _die_at(nth: int) -> None:
-    """Have this process killed before its nth open, write, fsync or rename; a write is done by half before that."""
     left = nth
 
     def killing(call: Callable[..., Any]) -> Callable[..., Any]:

@@ -1,4 +1,4 @@
-"""What passes taught is there after a restart, and what is damaged is learned anew."""
+"""Learned offsets survive a restart; damaged files are ignored."""
 
 from __future__ import annotations
 

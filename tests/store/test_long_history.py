@@ -1,4 +1,4 @@
-"""A history of years is opened as fast as one of a week, and nothing in it is lost or believed wrongly for that."""
+"""Reading a long history verifies only the rows that are needed."""
 
 from __future__ import annotations
 
@@ -21,13 +21,11 @@ ROWS = 60
 
 @pytest.fixture(autouse=True)
 def _few(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let few rows be those that are always looked at."""
     monkeypatch.setattr(module, "CHECKED", CHECKED)
 
 
 @pytest.fixture
 def looked_at(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
-    """Count the rows of each table whose digest is made."""
     counted, real = Counter[str](), schema.digest_of
 
     def digest(table: str, row: Any) -> str:
@@ -39,7 +37,6 @@ def looked_at(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
 
 def filled(folder: Path, rare: int = 3) -> History:
-    """Fill a history with rapids of X; only the row ``rare`` and the next are of Y, long ago."""
     history = History.open(folder)
     for k in range(ROWS):
         axis = "Y" if rare <= k < rare + 2 else "X"

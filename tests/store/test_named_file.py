@@ -1,4 +1,4 @@
-"""A name from outside opens a regular file of the one folder, or nothing."""
+"""A name from outside opens only regular files of one folder."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from fdhil.store.named_file import open_named
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with one file, beside a secret, and with all that may stand in a file's place."""
     top = tmp_path_factory.mktemp("store")
     (top / "secret").write_bytes(b"the key")
     inside = top / "windows"

@@ -1,4 +1,4 @@
-"""The newest set of an axis comes with the loops that its drive showed last, and not with those of earlier tuning."""
+"""The newest parameter set is returned with the regulators it belongs to."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ LATER = Stamp(STAMP.wall_s + 60.0, STAMP.boot, STAMP.monotonic_ns + 60 * 10**9)
 
 
 def found(*codes: str, accepted: bool = True) -> LoopEstimate:
-    """Return loops with a filter; with the code ``DIFFER`` they explain what the configured ones do not."""
     verdict = Verdict(accepted, None, (), 0.3, tuple(Reason(code, "72 um") for code in codes))
     return LoopEstimate("X", "p_pi_pi", ("speed_filter_s",), frozen([2e-3]), frozen(np.array([[1e-10]])), verdict)
 
@@ -75,7 +74,6 @@ def test_an_older_history_opens_and_its_set_is_used_with_the_loops_it_has(tmp_pa
 
 
 def before_loops(db: sqlite3.Connection) -> None:
-    """Take a history back to the schema whose sets have no loops."""
     db.row_factory = sqlite3.Row
     db.execute("ALTER TABLE revisions DROP COLUMN loops")
     for row in map(dict, db.execute("SELECT * FROM revisions").fetchall()):

@@ -1,4 +1,4 @@
-"""Files of MATLAB, HDF5, MDF 4 and Parquet as other programs lay them out, read by a column map."""
+"""MATLAB, MDF, HDF5 and Parquet files of other programs become recordings by a column map."""
 
 from __future__ import annotations
 
@@ -45,7 +45,6 @@ def _map(names: Mapping[str, str] | None = None, rate_hz: float | None = None, t
 
 
 def _table(path: Path, told: ColumnMap) -> RecordingTable:
-    """Read a file in this process; that a process of its own gives the same is tested once."""
     return mapped(READERS[path.suffix](path.read_bytes(), path.name), told, path.name)
 
 
@@ -64,7 +63,6 @@ def _matlab_5(path: Path, variables: Mapping[str, Any]) -> None:
 
 
 def _put(group: Any, name: str, value: Any) -> Any:
-    """Store a variable as MATLAB 7.3 does: transposed, texts as numbers, structures as groups."""
     if isinstance(value, dict):
         group = group.create_group(name)
         group.attrs["MATLAB_class"] = np.bytes_("struct")
@@ -159,7 +157,7 @@ def test_the_headers_of_a_matlab_7_3_file_are_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("variables", "words"),
     [
-        ({"meas": {"t": TIME, **VALUES, "u": VALUES["u"][1:]}}, "unlike lengths.*'voltage_V': 59"),
+        ({"meas": {"t": TIME, **VALUES, "u": VALUES["u"][1:]}}, "different lengths.*'voltage_V': 59"),
         ({"data": np.column_stack([TIME, *VALUES.values()])}, r"no column 't'; it has 'data\(:,1\)'"),
         ({"a": {"t": TIME, **VALUES}, "b": {"t": TIME}}, "'t' stands for a.t and b.t"),
         ({"note": "nothing else"}, "it has no columns of numbers"),
@@ -173,7 +171,7 @@ def test_what_a_matlab_file_lacks_is_named(variables: Any, words: str, write: An
 
 def test_complex_numbers_are_no_signal(tmp_path: Path) -> None:
     _matlab_5(tmp_path / "r.mat", {"t": TIME, **VALUES, "i": VALUES["i"] + 1j})
-    with pytest.raises(RecordingError, match="'i' is no vector of real numbers"):
+    with pytest.raises(RecordingError, match="'i' is not a vector of real numbers"):
         _table(tmp_path / "r.mat", _map())
 
 
@@ -225,7 +223,7 @@ def test_a_unit_of_an_mdf_channel_is_not_overruled(tmp_path: Path) -> None:
         units = {"i": "mA"}
         file.append([asammdf.Signal(v, TIME, name=n, unit=units.get(n, "")) for n, v in VALUES.items()])
         file.save(tmp_path / "r.mf4")
-    with pytest.raises(RecordingError, match="'i' in mA, the column map says A"):
+    with pytest.raises(RecordingError, match="'i' in mA, the column map has A"):
         _table(tmp_path / "r.mf4", _map(time=False))
 
 
@@ -241,7 +239,7 @@ def test_a_unit_of_a_dataset_or_a_field_is_not_overruled(tmp_path: Path) -> None
     fields = [field.with_metadata({"unit": "mA"}) if field.name == "i" else field for field in table.schema]
     pq.write_table(table.cast(pa.schema(fields)), tmp_path / "r.parquet")
     for name in ("r.h5", "r.parquet"):
-        with pytest.raises(RecordingError, match="'i' in mA, the column map says A"):
+        with pytest.raises(RecordingError, match="'i' in mA, the column map has A"):
             _table(tmp_path / name, _map())
 
 
@@ -254,7 +252,7 @@ def test_a_group_over_an_angle_or_over_nothing_has_no_time(kind: Mapping[str, in
         for key, value in kind.items():
             setattr(file.groups[0].channels[0], key, value)
         file.save(tmp_path / "r.mf4")
-    with pytest.raises(RecordingError, match="'time_s' is no time in this file"):
+    with pytest.raises(RecordingError, match="'time_s' is not a time"):
         _table(tmp_path / "r.mf4", _map(time=False))
     _assert_read(tmp_path / "r.mf4", _map(rate_hz=1000.0, time=False))
 
@@ -309,7 +307,7 @@ def test_every_type_of_time_of_parquet_is_read(kind: str, tmp_path: Path) -> Non
 
 def test_a_time_is_no_other_signal() -> None:
     table = RecordingTable({}, {"t": TIME, **VALUES}, frozenset({"t", "i"}))
-    with pytest.raises(RecordingError, match="'i' is a time, no current_A"):
+    with pytest.raises(RecordingError, match="'i' is a time, not current_A"):
         mapped(table, _map(), "trace")
 
 
@@ -336,8 +334,8 @@ def test_a_column_of_texts_of_parquet_is_named_by_its_type(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("rate_hz", "interruption", "words"),
     [
-        (None, "", "say in the column map which is time_s, or give sample_rate_hz"),
-        (1000.0, "line 9 between the rows is no row", "unknown how many samples are lost"),
+        (None, "", "name the column of time_s in the column map, or give sample_rate_hz"),
+        (1000.0, "line 9 between the rows is no row", "number of lost samples is unknown"),
         (-1.0, "", "sample_rate_hz of the column map must be a number above 0"),
     ],
 )
@@ -356,7 +354,7 @@ def test_a_counter_that_was_unwrapped_is_noted_in_the_headers() -> None:
     wrapped = (counts + 32768) % 65536 - 32768
     read = mapped(RecordingTable({}, {"t": TIME, **VALUES, "x": wrapped}), _map(), "trace")
     assert np.array_equal(read.columns["position_m"], counts)
-    assert read.headers[NOTES] == "x jumps by 2^16 as a counter of 16 bits does, and was unwrapped"
+    assert read.headers[NOTES] == "x wraps like a counter of 16 bits and was unwrapped"
 
 
 def test_two_names_of_one_column_are_refused() -> None:
@@ -381,9 +379,9 @@ def test_a_position_within_one_turn_goes_on_by_the_pitch_or_is_refused() -> None
     slope = {**VALUES, "x": np.fmod(TIME, 0.02)}
     read = mapped(RecordingTable({}, {"t": TIME, **slope}), _map(), "trace")
     np.testing.assert_allclose(read.columns["position_m"], np.arange(N) * 1e-3, atol=1e-9)
-    assert "x begins again each turn of the screw" in read.headers[NOTES]
+    assert "x wraps at each turn of the screw" in read.headers[NOTES]
     other = {**VALUES, "x": np.fmod(TIME, 0.03)}
-    with pytest.raises(RecordingError, match=r"'x' jumps by 0.029 and goes on, .* one turn is 0.02 by the column map"):
+    with pytest.raises(RecordingError, match=r"'x' jumps by 0.029, .* one turn is 0.02 by the column map"):
         mapped(RecordingTable({}, {"t": TIME, **other}), _map(), "trace")
 
 
@@ -392,5 +390,5 @@ def test_a_recording_of_a_wrong_unit_of_time_is_refused() -> None:
         (1e-3, "5.9e-05"),
         (1 / 86400, "6.83e-07"),
     ):  # seconds where ms are said; days of a spreadsheet
-        with pytest.raises(RecordingError, match=rf"lasts {lasts} s by its times.*correct the unit of time_s"):
+        with pytest.raises(RecordingError, match=rf"lasts only {lasts} s by its times.*correct the unit of time_s"):
             mapped(RecordingTable({}, {"t": TIME * factor, **VALUES}), _map(), "trace")

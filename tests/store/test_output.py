@@ -1,4 +1,4 @@
-"""A file that a command writes: there whole or not at all, and never in place of what is no regular file."""
+"""Output files are written completely or not at all."""
 
 from __future__ import annotations
 
@@ -38,10 +38,9 @@ def write_half(path: Path) -> None:
 
 
 def test_the_old_file_is_kept_where_writing_fails(tmp_path: Path) -> None:
-    """Half-way: the disk is full. A reader never sees half a file, and nothing is left behind."""
     old = tmp_path / "old.csv"
     old.write_bytes(b"old")
-    with pytest.raises(OutputError, match=r"No space left.*kept"):
+    with pytest.raises(OutputError, match=r"No space left.*unchanged"):
         write_half(old)
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"]
 
@@ -72,7 +71,6 @@ def test_what_is_no_regular_file_is_left_alone(kind: str, tmp_path: Path, monkey
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("name", ["/dev/stdout", "answer.txt", "/dev/null"])
 def test_standard_output_is_written_to_where_it_stands(name: str, tmp_path: Path) -> None:
-    """Also where it is the very file that is named; what was written before stays before it."""
     code = (
         "import sys; from pathlib import Path; from fdhil.store.output import open_output\n"
         "print('before')\nwith open_output(Path(sys.argv[1])) as file:\n    file.write(b'written\\n')\nprint('after')"

@@ -1,4 +1,4 @@
-"""What a damaged file does to the library that reads it, it does to a process of its own: the caller has a sentence."""
+"""Files are read in a child process, which damage may crash, block or fill."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_a_file_that_ends_its_reader_is_refused_and_the_next_one_read(name: str,
     bad, good = tmp_path / "bad.mat", tmp_path / f"good.{name}"
     bad.write_bytes((FOUND / "recording_mat" / "vector-of-unknown-type").read_bytes())
     export_table(table_of(window()), good, {"h5": "hdf5"}.get(name, name))
-    with pytest.raises(RecordingError, match=r"bad\.mat is no MATLAB file.*did not survive it; export it again"):
+    with pytest.raises(RecordingError, match=r"bad\.mat is not a readable MATLAB file.*crashed; export it again"):
         read_recording(bad)
     assert read_recording(good).axis == "X"
 
@@ -50,10 +50,10 @@ def test_a_file_that_ends_its_reader_is_refused_and_the_next_one_read(name: str,
 @pytest.mark.parametrize(
     ("does", "told"),
     [
-        ("crash", "survive"),
-        ("abort", "survive"),
-        ("fill", "survive"),
-        ("talk", "survive"),
+        ("crash", "crashed"),
+        ("abort", "crashed"),
+        ("fill", "crashed"),
+        ("talk", "crashed"),
         ("sleep", "within 0.3 s"),
         ("hang", "within 0.8 s of processor time"),
     ],
@@ -62,7 +62,7 @@ def test_a_reader_that_goes_astray_is_ended(does: str, told: str, monkeypatch: p
     with monkeypatch.context() as patch:
         if does == "sleep":
             patch.setattr(reading_process, "LONGEST_S", 0.3)
-        with pytest.raises(RecordingError, match=f"^r is no such file .*{told}.*; export it again$"):
+        with pytest.raises(RecordingError, match=f"^r is not a readable such file.*{told}.*; export it again$"):
             _asked(does.encode(), "r")
     assert _asked(b"", "the next") == "the next"
 
@@ -132,5 +132,5 @@ def test_a_missing_extra_is_told_as_such(tmp_path: Path, monkeypatch: pytest.Mon
 @pytest.mark.parametrize("program", ["/nowhere", "/bin/true"])
 def test_a_reader_that_cannot_be_started_is_no_fault_of_the_file(program: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", program)
-    with pytest.raises(RecordingError, match=r"^r was not read, .*cannot be started.*: free memory"):
+    with pytest.raises(RecordingError, match=r"^r was not read: .*cannot be started.*; free memory"):
         _asked(b"", "r")

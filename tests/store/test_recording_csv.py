@@ -1,4 +1,4 @@
-"""CSV recordings: what is read, and how each fault is told."""
+"""Recordings as CSV: what is read, and what is refused in one sentence."""
 
 from __future__ import annotations
 
@@ -82,9 +82,9 @@ def test_a_step_off_by_two_percent_is_a_gap() -> None:
         (_text(sample_rate_hz="fast"), "sample_rate_hz"),
         (_text(pitch_m_per_rev="-1"), "pitch_m_per_rev"),
         (_text(rapid_speed_m_per_s="nan"), "rapid_speed_m_per_s"),
-        (_text(pitch_m_per_rev="20"), "machines have 1e-05 to 0.8: correct it .is 20 in mm. then write 0.02"),
+        (_text(pitch_m_per_rev="20"), "outside the 1e-05 to 0.8 of machines: correct it .is 20 in mm. then write 0.02"),
         (_text(rapid_speed_m_per_s="500"), "is 500 in mm. then write 0.5"),
-        (_text(sample_rate_hz="1e-301"), "machines have 1 to 1e.06"),
+        (_text(sample_rate_hz="1e-301"), "outside the 1 to 1e.06"),
         (_text(sample_rate_hz="9" * 5000), "sample_rate_hz = '9999"),
         (_text().replace(",2.50000,", "," + "9" * 5000 + ","), "non-finite value '9999"),
         (_text().replace(",2.50000,", "," + "x" * 5000 + ","), "'xxxxx"),
@@ -92,13 +92,13 @@ def test_a_step_off_by_two_percent_is_a_gap() -> None:
         (_text().replace("time_s,", "time_s," + "x," * 50_000), "which no row has"),
         (
             _text(voltage_begin_s="0", voltage_period_s="0.005", voltage_samples_V="0 " * 9_000_000),
-            "more voltage samples than a recording has",
+            "too many voltage samples for a recording",
         ),
-        (_text() + "1e300,1,1,1,1,1\n", "a gap of 1e.300 s is no recording of one run"),
+        (_text() + "1e300,1,1,1,1,1\n", "a gap of 1e.300 s is too long for one run"),
         (_text().replace(",2.50000,", ",2.5x,"), "2.5x"),
         (_text().replace(",2.50000,", ",nan,"), "non-finite"),
         (_text().replace(",2.50000,", ",inf,"), "non-finite"),
-        (_text().replace("0.020000,", "0.019000,"), "time stands still"),
+        (_text().replace("0.020000,", "0.019000,"), "time does not rise"),
         (_text(sample_rate_hz="2000"), "correct the header"),
     ],
     ids=lambda value: value if len(value) < 40 else "text",
@@ -155,7 +155,6 @@ def test_damaged_samples_of_a_slow_sensor_are_refused(key: str, value: str) -> N
 def test_a_file_larger_than_any_recording_is_refused_before_it_is_taken_apart(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of an endless file no more than the limit is read; rows of nothing are counted before they are split."""
     monkeypatch.setattr(csv_text, "MAX_BYTES", 1 << 20)
     monkeypatch.setattr(csv_text, "MAX_ROWS", 1000)
     with pytest.raises(RecordingError, match="larger than 1 MiB or 1000 rows: cut it into parts"):
@@ -188,7 +187,7 @@ def test_a_recording_without_a_voltage_is_read_with_its_torque_constant() -> Non
     ("headers", "words"),
     [
         ({"torque_constant_nm_per_a": "0"}, "torque_constant_nm_per_a"),
-        ({"torque_constant_nm_per_a": "3000"}, "machines have 0.001 to 100: correct it$"),
+        ({"torque_constant_nm_per_a": "3000"}, "outside the 0.001 to 100 of machines: correct it$"),
         ({"speed_source": "guess"}, "sensor or difference or filtered"),
         ({"voltage_source": "mains"}, "terminals or command"),
     ],
@@ -215,9 +214,7 @@ def test_sensors_at_the_table_may_lack_rows_and_other_columns_may_not() -> None:
 
 def test_what_stands_twice_is_refused_and_empty_cells_of_a_spreadsheet_are_not() -> None:
     text = _text()
-    with pytest.raises(
-        RecordingError, match=r"header 'axis' = 'X' and again, in line \d+, 'Y': take out the wrong one"
-    ):
+    with pytest.raises(RecordingError, match=r"header 'axis' = 'X' and again, in line \d+, 'Y': remove the wrong one"):
         parse_recording(text.replace("# axis: X\n", "# axis: X\n# axis: Y\n"))
     with pytest.raises(RecordingError, match=r"'current_A' above #3 and #4 \(line \d+\)"):
         parse_recording(text.replace("current_A,speed", "current_A,current_A,speed"))
@@ -231,7 +228,6 @@ def test_a_recording_saved_with_other_separators_shows_what_it_has() -> None:
 
 
 def _angular(text: str) -> str:
-    """The same motor, its axis told as a rotary one of 12 degrees a turn."""
     text = text.replace("# pitch_m_per_rev: 0.02", "# pitch_deg_per_rev: 12\n# radius_m: 0.1")
     text = text.replace("# rapid_speed_m_per_s: 0.5", "# rapid_speed_deg_per_s: 300")
     return text.replace("position_m", "position_deg").replace("demand_m", "demand_deg")
@@ -255,18 +251,18 @@ def test_direct_drive_of_a_large_table_is_read() -> None:
     ("old", "new", "words"),
     [
         ("# radius_m: 0.1\n", "", "has no header radius_m: give the radius at which its angles count as path error"),
-        ("radius_m: 0.1", "radius_m: 100", "radius_m = 100, machines have 0.01 to 10"),
-        ("pitch_deg_per_rev: 12", "pitch_deg_per_rev: 720", "pitch_deg_per_rev = 720, machines have 0.001 to 360"),
+        ("radius_m: 0.1", "radius_m: 100", "radius_m = 100, outside the 0.01 to 10"),
+        ("pitch_deg_per_rev: 12", "pitch_deg_per_rev: 720", "pitch_deg_per_rev = 720, outside the 0.001 to 360"),
         (
             "# axis",
             "# pitch_m_per_rev: 0.02\n# axis",
-            "has pitch_m_per_rev and pitch_deg_per_rev: keep that of its axis",
+            "has pitch_m_per_rev and pitch_deg_per_rev: keep the one for its axis",
         ),
         ("demand_deg", "demand_m", "has no column demand_deg"),
         (
             "# pitch_deg_per_rev: 12",
             "# pitch_m_per_rev: 0.02",
-            "has position_deg and demand_deg, and no header pitch_deg_per_rev",
+            "has position_deg and demand_deg, but no header pitch_deg_per_rev",
         ),
     ],
 )

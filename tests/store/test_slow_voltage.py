@@ -1,4 +1,4 @@
-"""A window with the voltage of a slow sensor comes out of its file as it went in."""
+"""A window with the voltage of a slow sensor is stored exactly."""
 
 from __future__ import annotations
 
@@ -76,5 +76,5 @@ def test_when_each_value_of_a_meter_was_true_is_kept_too() -> None:
 @pytest.mark.parametrize("late", ["0.001", "nonsense", "0.009 " * 500])
 def test_times_that_do_not_fit_the_values_are_refused(late: str) -> None:
     lines = [line for line in _lines(asked_windows()[0]) if not line.startswith("# voltage_late_s")]
-    with pytest.raises(RecordingError, match="do not fit its voltage samples"):
+    with pytest.raises(RecordingError, match="invalid voltage_late_s for its voltage samples"):
         parse_recording("\n".join([f"# voltage_late_s: {late}", *lines]) + "\n")

@@ -1,4 +1,4 @@
-"""A recording in any dialect of text reads back equal, or is refused: never as other numbers."""
+"""A recording in any text dialect is read back equal or refused, never as other numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Heads as oscilloscopes, drives and programs write them: which names and places a column map can use."""
+"""File heads of oscilloscopes, drives and programs: which names a column map can use."""
 
 from __future__ import annotations
 
@@ -121,9 +121,9 @@ def test_the_names_of_an_instrument_stand_for_its_columns(instrument: str) -> No
 @pytest.mark.parametrize(
     ("head", "name", "words"),
     [
-        ("Time;Axis X;;Axis Y;\n;U;I;U;I\n", "U", "stands above #2 and #4"),
-        ("X;CH1;CH2;Start;Increment;More\n", "CH1", "stands among the 6 cells of line 1, the rows have 5"),
-        ("Time, s;Voltage\n", "Voltage", "stands among the 2 cells of line 1, the rows have 5"),
+        ("Time;Axis X;;Axis Y;\n;U;I;U;I\n", "U", "names #2 and #4"),
+        ("X;CH1;CH2;Start;Increment;More\n", "CH1", "is one of the 6 cells of line 1, the rows have 5"),
+        ("Time, s;Voltage\n", "Voltage", "is one of the 2 cells of line 1, the rows have 5"),
     ],
 )
 def test_a_name_without_one_column_is_doubted(head: str, name: str, words: str) -> None:
@@ -134,15 +134,18 @@ def test_a_name_without_one_column_is_doubted(head: str, name: str, words: str) 
 @pytest.mark.parametrize(
     ("row", "words"),
     [
-        (lambda k: f"{k},{_comma(f'{U[k]:.2f}')},{_comma(f'{I[k]:.2f}')}", "decimal commas too"),
-        (lambda k: f"{k};{k + 1}.125;{k + 2}.250", "may be decimal or stand between thousands"),
-        (lambda k: f"{k};{U[k]};{I[k]}" if k != 9 else "9;1.5", "2 cells in line 10 where the other rows have 3"),
-        (lambda k: f"{k};{U[k]};{I[k]}" if k != 9 else "9;1;5;2", "4 cells in line 10 where the other rows have 3"),
-        (lambda k: f"{k},{U[k]}," if k != 9 else "9,1,051.5,", "4 cells in line 10 where the other rows have 3"),
-        (lambda k: f"{k},{U[k]},OK," if k != 9 else "9,1,051.5,OK,", "5 cells in line 10 where the other rows have 4"),
-        (lambda k: f"{k},{U[k]},," if k != 9 else "9,1,051.5,", "3 cells in line 10 where the other rows have 2"),
-        (lambda k: f"{k} {U[k]} {I[k]}" + ("\noverrun" if k == 9 else ""), "line 11, 'overrun'"),
-        (lambda k: f"{k if k < 20 else 'late'};{U[k]};{I[k]}", "line 21, .*, and 20 rows of numbers follow"),
+        (lambda k: f"{k},{_comma(f'{U[k]:.2f}')},{_comma(f'{I[k]:.2f}')}", "decimal commas"),
+        (lambda k: f"{k};{k + 1}.125;{k + 2}.250", "may be decimal or separate thousands"),
+        (lambda k: f"{k};{U[k]};{I[k]}" if k != 9 else "9;1.5", "2 cells in line 10, the other rows have 3"),
+        (lambda k: f"{k};{U[k]};{I[k]}" if k != 9 else "9;1;5;2", "4 cells in line 10, the other rows have 3"),
+        (lambda k: f"{k},{U[k]}," if k != 9 else "9,1,051.5,", "4 cells in line 10, the other rows have 3"),
+        (lambda k: f"{k},{U[k]},OK," if k != 9 else "9,1,051.5,OK,", "5 cells in line 10, the other rows have 4"),
+        (lambda k: f"{k},{U[k]},," if k != 9 else "9,1,051.5,", "3 cells in line 10, the other rows have 2"),
+        (
+            lambda k: f"{k} {U[k]} {I[k]}" + ("\noverrun" if k == 9 else ""),
+            "line 11 is not a row of numbers: 'overrun'",
+        ),
+        (lambda k: f"{k if k < 20 else 'late'};{U[k]};{I[k]}", "line 21 is .*, and 20 rows of numbers follow"),
         (lambda k: f"{k} ms;{U[k]} V;{I[k]} A", "no rows of numbers"),
     ],
 )
@@ -160,14 +163,14 @@ def test_a_text_among_numbers_is_doubted_where_its_column_is_used() -> None:
 @pytest.mark.parametrize(
     ("row", "words"),
     [
-        (lambda k: f"{k};{U[k]};{2 * k};{I[k]}", "is a time beside each channel"),
-        (lambda k: f"{k};{U[k]};{k};{I[k]}", "stands above #1 and #3"),
+        (lambda k: f"{k};{U[k]};{2 * k};{I[k]}", "is a separate time of each channel"),
+        (lambda k: f"{k};{U[k]};{k};{I[k]}", "names #1 and #3"),
     ],
 )
 def test_times_beside_each_channel_must_agree(row: Row, words: str) -> None:
     read = _parsed("Name;U;Name;I\n", row)
     assert words in read.doubts.get("#1", read.doubts["Name"])
-    assert ("#1" in read.doubts) == ("beside" in words)
+    assert ("#1" in read.doubts) == ("separate" in words)
 
 
 def test_a_text_in_the_first_row_is_no_head() -> None:
@@ -199,10 +202,10 @@ def test_an_empty_line_after_each_row_is_no_interruption() -> None:
     [
         (b"MDF     3.30    ", "version 3 or older: save it as MDF 4"),
         (b"MDF     4.10    ", "an MDF 4 file: name it .mf4"),
-        (b"PK\x03\x04", "workbook of Excel is: save the sheet as CSV"),
+        (b"PK\x03\x04", "Excel workbook: save the sheet as CSV"),
         (b"PAR1", "a Parquet file: name it .parquet"),
     ],
 )
 def test_a_file_that_is_no_text_is_named(begins: bytes, words: str) -> None:
-    with pytest.raises(RecordingError, match=f"is no text but .*{words}"):
+    with pytest.raises(RecordingError, match=f"is not a text but .*{words}"):
         parse_trace(begins + bytes(range(256)), TraceText(), "trace")

@@ -1,4 +1,4 @@
-"""What goes into a window file comes out bit by bit, and what is damaged is never taken for a window."""
+"""Window files are exact to the bit; a damaged file is never read as a window."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A certificate for 127.0.0.1 as a shop makes one for itself."""
+"""A self-signed certificate for 127.0.0.1."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from cryptography.x509.oid import NameOID
 
 
 def write_certificate(certificate: Path, key: Path) -> None:
-    """Write a certificate that signs itself, and its key, as PEM."""
     private = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "mill")])
     now = datetime.datetime.now(datetime.UTC)

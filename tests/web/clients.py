@@ -1,4 +1,4 @@
-"""Clients of the pages without a network: the real application, asked as a browser, a script or a stranger asks."""
+"""HTTP clients of the application without a network: a browser, a script, a client without login."""
 
 from __future__ import annotations
 
@@ -27,12 +27,10 @@ OWN = {"X-Fdhil": "1"}
 
 @cache
 def user(role: Role) -> User:
-    """Return a user of a role; all have one password, hashed once."""
     return hashed(PASSWORD, role)
 
 
 def machine_of(folder: Path, users: bool = True, **web: Any) -> MachineConfig:
-    """Return the bench's configuration with its pages; with ``users`` a "watcher" and an "operator" may log in."""
     if users:
         write_users(folder / "users.json", {"watcher": user("watch"), "operator": user("operate")})
         web = {"users_file": "users.json", **web}
@@ -41,7 +39,6 @@ def machine_of(folder: Path, users: bool = True, **web: Any) -> MachineConfig:
 
 @asynccontextmanager
 async def client_of(app: FastAPI, name: str = "", **headers: str) -> AsyncIterator[httpx.AsyncClient]:
-    """Yield a client; with a ``name`` it has logged in."""
     transport = httpx.ASGITransport(app, raise_app_exceptions=False)
     async with httpx.AsyncClient(transport=transport, base_url="http://localhost", headers=headers) as client:
         if name:
@@ -50,13 +47,12 @@ async def client_of(app: FastAPI, name: str = "", **headers: str) -> AsyncIterat
 
 
 def token_for(app: FastAPI, name: str) -> str:
-    """Return a token as a login gives it, without the tenth of a second that the password takes."""
+    """Return a token like a login, without the tenth of a second of the password check."""
     access: Access = app.state.context.access
     return access.begin(name, user("operate" if name == "operator" else "watch"))[0]
 
 
 async def log_in(client: httpx.AsyncClient, name: str, password: str = PASSWORD) -> str:
-    """Return a token."""
     answer = await client.post("/api/session", json={"name": name, "password": password}, headers=OWN)
     assert answer.status_code == 200, answer.text
     return str(answer.json()["token"])
@@ -66,7 +62,6 @@ async def log_in(client: httpx.AsyncClient, name: str, password: str = PASSWORD)
 async def daemon_that(
     config: MachineConfig, answer: Callable[[Mapping[str, Any]], Any], abandon: Callable[[], object] = lambda: None
 ) -> AsyncIterator[list[Mapping[str, Any]]]:
-    """Serve the daemon's own socket with answers of the test's; yield the requests that came."""
     asked: list[Mapping[str, Any]] = []
 
     async def handle(request: Mapping[str, Any], peer: Peer) -> Mapping[str, Any]:
@@ -81,5 +76,4 @@ async def daemon_that(
 
 
 def app_of(folder: Path, **web: Any) -> FastAPI:
-    """Return the application of a machine with users, none of whose daemons runs."""
     return make_app(machine_of(folder, **web))

@@ -1,4 +1,4 @@
-"""What the browser's tests share: the stage with all its processes, chromium, and an empty tab."""
+"""Fixtures of the browser tests: all processes, chromium, and an empty tab."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope="package")
 def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
-    """Twin, guard, daemon and ``fdhil web`` as processes; the NC is on, weeks of history are behind them."""
     from tests.web.stage import opened
 
     with opened(tmp_path_factory.mktemp("stage"), RAPIDS) as stage:
@@ -28,7 +27,6 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
 
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Browser]:
-    """Debian's chromium without a window."""
     from playwright.sync_api import sync_playwright
 
     from tests.web.tab import started
@@ -41,7 +39,6 @@ def chromium() -> Iterator[Browser]:
 
 @pytest.fixture
 def tab(stage: Stage, chromium: Browser) -> Iterator[Tab]:
-    """An empty tab of a wide window; what it asked for and said is looked at when it closes."""
     from tests.web.tab import opened
 
     with opened(chromium, stage.url) as tab:

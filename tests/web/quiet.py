@@ -1,4 +1,4 @@
-"""A process that says all to a log: no thread reads it, so that it may end and begin within a test."""
+"""A process that writes to a log file, without a thread that reads it, so that tests may start and end it."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ ENDING_S = 120.0
 
 
 class Quiet:
-    """A command of fdhil as a child process."""
-
     def __init__(self, name: str, arguments: list[str], log: Path) -> None:
         self.name, self._log = name, log
         with log.open("ab") as said:
@@ -22,17 +20,14 @@ class Quiet:
 
     @property
     def pid(self) -> int:
-        """Process identifier."""
         return self._child.pid
 
     def check(self) -> None:
-        """Raise ConnectError when the process has ended by itself."""
         if self._child.poll() is not None:
             last = self._log.read_text("utf-8", "replace").strip().splitlines()[-1:]
             raise ConnectError(self.name, f"ended with exit code {self._child.returncode}: {last}")
 
     def stop(self) -> int:
-        """Ask the process to end (SIGTERM), insist after two minutes, and return its exit code."""
         if self._child.poll() is None:
             self._child.terminate()
         try:

@@ -1,7 +1,7 @@
-"""The stage of the browser's tests: twin, guard, daemon and ``fdhil web`` as processes, weeks of history behind them.
+"""The processes of the browser tests: simulator, guard, daemon and ``fdhil web``, with weeks of history.
 
-The twin is the machine that the weeks tell of, so a program can be armed at once. It runs in real time, at its own pace
-on a busy host; all of fdhil counts SYNC.
+The simulator is the machine of that history, so that a program can be armed at once. It runs in real time, slower on a
+busy host; fdhil counts SYNC.
 """
 
 from __future__ import annotations
@@ -45,8 +45,6 @@ MEANWHILE_S = 0.05
 
 @dataclass
 class Stage:
-    """The processes that run, and where."""
-
     folder: Path
     config_path: Path
     config: MachineConfig
@@ -56,56 +54,46 @@ class Stage:
 
     @property
     def program(self) -> Path:
-        """A corner that may be armed."""
         return self.folder / PROGRAMS / "corner.ngc"
 
     def _start(self, name: str, *arguments: str) -> None:
-        """Start a process of fdhil on this machine's configuration."""
         self.processes[name] = Quiet(name, [*arguments, str(self.config_path)], self.folder / f"{name}.log")
 
     def start_guard(self) -> None:
-        """Start the guard and wait until it answers."""
         self._start("guard", "fdhil.cli.guard")
         self.wait((self.config.guard_directory / "guard.sock").exists)
 
     def start_daemon(self) -> None:
-        """Start the daemon and wait until it hears the machine."""
         self._start("daemon", "fdhil", "run")
         self.wait(lambda: self.status() is not None)
         self.status_when(lambda told: told["source"]["state"] == "listening")
 
     def start_web(self) -> None:
-        """Start ``fdhil web`` and wait until it listens; ``url`` is its address then."""
         web = Process("web", ["fdhil", "web", "--json", str(self.config_path)], self.folder / "web.log")
         self.processes["web"] = web
         self.url = str(web.event("ready")["url"]).rstrip("/")
 
     def ask(self, path: str, body: bytes | None = None, token: str = "") -> Any:
-        """Ask ``fdhil web`` as a program would: GET, or POST of a body; return the document."""
         headers = {"Content-Type": "application/json", "X-Fdhil": "1", "Authorization": f"Bearer {token}"}
         with urlopen(Request(self.url + path, body, headers), timeout=500.0) as answer:
             return json.load(answer)
 
     def token(self, user: str) -> str:
-        """Log a user in; return the token."""
         login = {"name": user, "password": PASSWORDS[user]}
         return str(self.ask("/api/session", json.dumps(login).encode())["token"])
 
     def forecast(self, token: str) -> str:
-        """Have the program judged, wait until that is done, and return its digest."""
         dropped = self.ask(f"/api/program?name={self.program.name}", self.program.read_bytes(), token)
         path = f"/api/program/{dropped['digest']}"
         self.wait(lambda: self.ask(path, None, token)["state"] == "done")
         return str(dropped["digest"])
 
     def rapid(self, accepted: bool) -> str:
-        """Return the path of the first rapid of X that was accepted, or refused."""
         with History.read(self.config.store.directory) as history:
             number = next(window.number for window in history.windows("X") if window.accepted == accepted)
         return f"/rapids/X/{number}"
 
     def paths(self, token: str) -> dict[str, str]:
-        """Return the path of every page, and of what each of them links to."""
         return {
             "machine": "/machine",
             "axis": "/machine/X",
@@ -121,25 +109,21 @@ class Stage:
         }
 
     def stop(self, name: str) -> int:
-        """End one of them; return its exit code."""
         return self.processes.pop(name).stop()
 
     def wait(self, done: Callable[[], object]) -> None:
-        """Wait for what the processes bring about; ConnectError as soon as one of them has ended."""
         while not done():
             for process in (self.twin, *self.processes.values()):
                 process.check()
             time.sleep(MEANWHILE_S)
 
     def status(self) -> dict[str, Any] | None:
-        """Return the daemon's status, None while none runs."""
         try:
             return ask(self.config.run_directory / "daemon.sock", {"request": "status"}, timeout_s=500.0)
         except ConnectError:
             return None
 
     def status_when(self, ready: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
-        """Return the first status for which ``ready`` holds."""
         found: dict[str, Any] = {}
 
         def done() -> bool:
@@ -151,11 +135,9 @@ class Stage:
         return found
 
     def settled(self) -> None:
-        """Wait until the guard has seen enough good SYNC to be armed."""
         self.status_when(lambda told: told["guard"].get("good_for", 0) > SETTLED_CYCLES)
 
     def arm(self) -> None:
-        """Arm the program by the daemon's own socket, as ``fdhil arm`` does."""
         self.settled()
         request = {"request": "arm", "program": str(self.program), "method": None}
         token = read_token(self.config.run_directory)
@@ -163,17 +145,14 @@ class Stage:
         assert answer["ok"], answer
 
     def nc(self, on: bool) -> None:
-        """Switch the NC: with it come SYNC, NMT and enabled drives."""
         self.twin.command("nc", on=on)
         self.twin.event("nc")
 
     def play(self, program: Path) -> None:
-        """Let the NC play a program to its end."""
         self.twin.play(program)
 
 
 def document() -> dict[str, Any]:
-    """Return the configuration of the machine, all ports to be chosen."""
     found = bench_document()
     found["machine"] |= {"name": "bench mill", "sync_period_s": PERIOD_S}
     sim = {"pace": "realtime", "thermal": {"rise_c": 0.5}}
@@ -187,7 +166,6 @@ def document() -> dict[str, Any]:
 
 @contextmanager
 def opened(folder: Path, rapids: int = 84, acting: bool = True) -> Iterator[Stage]:
-    """Start twin, guard, daemon and web; the NC is on. All of them end with the block."""
     asked = document()
     (folder / "twin.toml").write_text(to_toml(asked), "utf-8")
     with Twin(folder / "twin.toml", folder / "twin.log") as twin:
@@ -207,7 +185,6 @@ def opened(folder: Path, rapids: int = 84, acting: bool = True) -> Iterator[Stag
 
 
 def _joined(asked: dict[str, Any], twin: Twin, acting: bool) -> dict[str, Any]:
-    """Return the configuration of who joins the twin; its sensors tell the slide-ways' temperature."""
     bus = {key: value for key, value in twin.ready["buses"]["can0"].items() if value is not None}
     sensors = {axis: {"temperature": {**place, "period_s": 0.5}} for axis, place in twin.ready["modbus"].items()}
     axes = {name: {**axis, **sensors.get(name, {})} for name, axis in asked["axis"].items()}
@@ -216,7 +193,6 @@ def _joined(asked: dict[str, Any], twin: Twin, acting: bool) -> dict[str, Any]:
 
 
 def _prepare(stage: Stage, rapids: int) -> None:
-    """Commission the drives, leave weeks of history, a program and its lesson, and the users."""
     with patient():
         for axis in stage.config.axis:
             save_record(commission(stage.config, axis), stage.config.store.directory)

@@ -1,4 +1,4 @@
-"""A page in a real browser, with all that it asked for and said; what it must never do is looked at when it closes."""
+"""A page in a real browser; its requests and console messages are checked when it closes."""
 
 from __future__ import annotations
 
@@ -48,13 +48,12 @@ WIDER = """() => {
 
 
 def started(playwright: Playwright) -> Browser:
-    """Start Debian's chromium."""
     return playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"], timeout=PATIENCE_MS)
 
 
 @dataclass
 class Tab:
-    """A page at ``base``; ``expected`` are patterns of what it may write to the console as an error."""
+    """A page at ``base``; ``expected`` are patterns of allowed console errors."""
 
     page: Page
     base: str
@@ -74,29 +73,23 @@ class Tab:
             self.errors.append(f"{message.type}: {message.text} ({message.location.get('url', '')})")
 
     def open(self, path: str) -> None:
-        """Go to a page and wait until its content is there."""
         self.page.goto(self.base + path)
         self.ready()
 
     def ready(self) -> None:
-        """Wait until the content of the page is there."""
         self.page.locator(READY).filter(has_not_text=LOADING).wait_for()
 
     def log_in(self, token: str) -> None:
-        """Let every page that is opened from now on have this login."""
         self.page.add_init_script(f"sessionStorage.setItem({TOKEN_KEY!r}, {token!r})")
 
     def word(self, key: str, **values: str) -> str:
-        """Return what the page says for a key of its words."""
         told = f"import('/static/text.js').then((m) => m.t({json.dumps(key)}, {json.dumps(values)}))"
         return str(self.page.evaluate(told))
 
     def says(self, where: str, text: str) -> None:
-        """Wait until the place ``where`` (a selector) says ``text``."""
         self.page.locator(where).filter(has_text=text).first.wait_for()
 
     def slow(self, bytes_per_s: int, latency_ms: int = 300) -> None:
-        """Let the page have a network of this kind from now on; 0 is one without bounds."""
         session = self.page.context.new_cdp_session(self.page)
         session.send("Network.enable")
         bound = bytes_per_s or -1
@@ -105,7 +98,7 @@ class Tab:
         session.send("Network.emulateNetworkConditions", {**conditions, **speeds})
 
     def tab_to(self, name: str) -> None:
-        """Press Tab until the button, link or field of that name has the focus, and can be seen to have it."""
+        """Press Tab until the button, link or field of that name has a visible focus."""
         for _ in range(MOST_TABS):
             self.page.keyboard.press("Tab")
             found = self.page.evaluate(FOCUS)
@@ -115,11 +108,9 @@ class Tab:
         raise AssertionError(f"Tab does not come to {name!r}")
 
     def labels(self) -> set[str]:
-        """Return the headings, heads of tables, buttons and labels that can be seen."""
         return set(self.page.evaluate(LABELS))
 
     def violations(self, *rules: str) -> list[str]:
-        """Return what axe finds against the page, or what these of its rules do, one line each with the places."""
         self.page.evaluate(AXE.read_text("utf-8"))
         only = {"type": "rule", "values": rules} if rules else {"type": "tag", "values": TAGS}
         options = json.dumps({"runOnly": only, "resultTypes": ["violations"]})
@@ -127,24 +118,20 @@ class Tab:
         return [f"{one['id']}: {one['help']}: {[node['html'][:160] for node in one['nodes']][:4]}" for one in found]
 
     def wider(self) -> list[str]:
-        """Return what stands out to the right of the window; empty where nobody has to scroll to both sides."""
         found = self.page.evaluate(WIDER)
         return [*found["told"], *([f"the page by {found['page']} px"] if found["page"] > 1 else [])]
 
     def foreign(self) -> list[str]:
-        """Return the requests that left the server's own address."""
         home = urlsplit(self.base).netloc
         local = ("data:", "blob:", "about:")
         return [url for url in self.asked if not url.startswith(local) and urlsplit(url).netloc != home]
 
     def unexpected(self) -> list[str]:
-        """Return what was written to the console as error or warning, but for what is ``expected``."""
         return [error for error in self.errors if not any(re.search(known, error) for known in self.expected)]
 
 
 @contextmanager
 def opened(browser: Browser, base: str, size: tuple[int, int] = WIDE, **options: Any) -> Iterator[Tab]:
-    """Open an empty page with a storage of its own; closing it asserts what no page may do."""
     with browser.new_context(viewport={"width": size[0], "height": size[1]}, **options) as context:
         tab = Tab(context.new_page(), base)
         yield tab

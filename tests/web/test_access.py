@@ -1,4 +1,4 @@
-"""Who may ask for what: the parts, without HTTP."""
+"""Logins, tokens and throttling, without HTTP."""
 
 from __future__ import annotations
 
@@ -27,8 +27,6 @@ from tests.web.clients import PASSWORD, user
 
 
 class Clock:
-    """A clock that stands until it is moved."""
-
     def __init__(self) -> None:
         self.now_s = 1000.0
 
@@ -151,13 +149,13 @@ async def test_guesses_are_slowed_down_by_user_and_by_address(
 
     monkeypatch.setattr("fdhil.web.access.matches", fits)
     for k in range(FREE_GUESSES):
-        with pytest.raises(Refused, match="name or password is wrong"):
+        with pytest.raises(Refused, match="wrong name or password"):
             await access.log_in("op", f"guess {k}", "192.0.2.1")
     with pytest.raises(Refused, match="too many logins failed") as told:
         await access.log_in("ann", PASSWORD, "192.0.2.1")  # the same place, another user
     assert told.value.status == 429
     assert len(looked) == FREE_GUESSES  # a refused one costs nothing
-    with pytest.raises(Refused, match="name or password is wrong"):
+    with pytest.raises(Refused, match="wrong name or password"):
         await access.log_in("op", "guess", "192.0.2.2")  # elsewhere, the same user: one guess, and no more
     with pytest.raises(Refused, match="too many"):
         await access.log_in("op", "guess", "192.0.2.2")
@@ -192,12 +190,12 @@ async def test_a_stranger_does_not_lock_out_who_has_logged_in_where_he_is(
     monkeypatch.setattr("fdhil.web.access.matches", lambda _, password: password == PASSWORD)
     await access.log_in("op", PASSWORD, "192.0.2.1")
     for k in range(FREE_GUESSES):
-        with pytest.raises(Refused, match="name or password is wrong"):
+        with pytest.raises(Refused, match="wrong name or password"):
             await access.log_in("op", "a guess", f"198.51.100.{k}")
     await access.log_in("op", PASSWORD, "198.51.100.77")  # where he never was, and nobody guessed
     await access.log_in("op", PASSWORD, "192.0.2.1")
     for _ in range(FREE_GUESSES):
-        with pytest.raises(Refused, match="name or password is wrong"):
+        with pytest.raises(Refused, match="wrong name or password"):
             await access.log_in("op", "a guess", "192.0.2.1")
     with pytest.raises(Refused, match="too many"):
         await access.log_in("op", PASSWORD, "192.0.2.1")  # but where he is it is guessed no faster than elsewhere
@@ -245,10 +243,10 @@ async def test_one_computer_is_one_place_however_many_addresses_it_has(
 ) -> None:
     monkeypatch.setattr("fdhil.web.access.matches", lambda *_: False)
     for k in range(FREE_GUESSES):
-        with pytest.raises(Refused, match="name or password is wrong"):
+        with pytest.raises(Refused, match="wrong name or password"):
             await access.log_in(f"name{k}", "a guess", f"2001:db8::{k}")
     with pytest.raises(Refused, match="too many"):
         await access.log_in("another", "a guess", "2001:db8::ffff")
-    with pytest.raises(Refused, match="name or password is wrong"):
+    with pytest.raises(Refused, match="wrong name or password"):
         await access.log_in("another", "a guess", "2001:db8:0:1::1")
     assert place_of("::ffff:192.0.2.1") == "192.0.2.1"

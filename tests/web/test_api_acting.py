@@ -1,4 +1,4 @@
-"""Acting: what is shown is what is armed, by whom is told, and what does not fit is refused."""
+"""Arming by the API: exactly the shown plan is armed, with the user's name; mismatches are refused."""
 
 from __future__ import annotations
 
@@ -39,7 +39,6 @@ def config(tmp_path: Path) -> MachineConfig:
 
 
 def granting(request: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Answer as a daemon does to whom nothing is wrong."""
     if request["request"] == "arm":
         return ARMED
     return {"ok": True, "state": "OFF", "text": "guard: OFF, offset 0"} | (
@@ -48,7 +47,6 @@ def granting(request: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 async def confirmed(client: httpx.AsyncClient) -> dict[str, Any]:
-    """Return the request to arm what the plan shows."""
     plan = (await client.get(PLAN)).json()
     return {"program": plan["program"]["name"], "method": plan["method"], "confirm": plan["confirm"]}
 
@@ -97,13 +95,12 @@ async def test_a_program_that_changed_while_it_was_armed_is_disarmed(config: Mac
 
 
 async def test_what_the_daemon_refuses_is_told_with_all_its_reasons(config: MachineConfig) -> None:
-    """A real daemon that has learnt nothing yet."""
     async with serving(config, Machine()), client_of(make_app(config), "operator") as client:
         answer = await client.post("/api/machine/arm", json=await confirmed(client), headers=OWN)
         disarmed = await client.post("/api/machine/disarm", headers=OWN)
     told = answer.json()
     assert (answer.status_code, told["ok"], told["code"]) == (409, False, "ModelNotValidated")
-    assert told["advice"] == "let the machine make a few rapids of this axis"
+    assert told["advice"] == "run a few rapids of this axis"
     assert told["refused"]
     assert disarmed.json()["code"] == "GuardAbsent"
 
@@ -205,7 +202,6 @@ async def test_a_user_who_is_removed_while_a_program_is_checked_has_nothing_arme
 
 
 async def _posting(app: Any, client: httpx.AsyncClient, document: dict[str, Any], gone: asyncio.Event) -> None:
-    """Post as a browser that goes away at the event: the transport says so to the application."""
     body = json.dumps(document).encode()
     headers = {**client.headers, **OWN, "host": "localhost", "content-type": "application/json"}
     first = True

@@ -1,4 +1,4 @@
-"""The API against what nobody meant to send: every answer is one that the schema tells, and none a fault of fdhil."""
+"""The API against arbitrary requests: every answer conforms to the schema, and none is an internal error."""
 
 from __future__ import annotations
 
@@ -40,7 +40,6 @@ OPERATIONS = {found.ok().label: found.ok() for found in SCHEMA.get_all_operation
 
 @pytest.fixture(scope="module")
 def app(tmp_path_factory: pytest.TempPathFactory) -> FastAPI:
-    """A machine with something stored, where an operator may act; no daemon runs."""
     config = machine_of(tmp_path_factory.mktemp("machine"), acting=True)
     with History.open(config.store.directory) as history:
         history.add_window(outcome(), "", STAMP)
@@ -59,12 +58,10 @@ def session(app: FastAPI) -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def replaying(app: FastAPI, session: Any) -> None:
-    """Have the process that replays, and the thread that waits for its end, run before the first test."""
     session.get("http://localhost/api/rapids/X/1/signals", headers=own(app, "operator"))
 
 
 def own(app: FastAPI, name: str) -> dict[str, str]:
-    """Return the headers of a page of ours, and of a login."""
     return {**OWN, **({"Authorization": f"Bearer {token_for(app, name)}"} if name else {})}
 
 
@@ -94,7 +91,6 @@ def test_whatever_is_sent_is_answered_as_described(label: str, app: FastAPI, ses
 
 
 def _end_forecasts(session: Any, headers: dict[str, str]) -> None:
-    """End the processes that forecast what was sent as a program, and return when they have ended."""
     for program in session.get("http://localhost/api/program", headers=headers).json()["programs"]:
         session.post(f"http://localhost/api/program/{program['digest']}/cancel", headers=headers)
 

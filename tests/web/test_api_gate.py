@@ -1,4 +1,4 @@
-"""Every route, as the application itself lists them: who may ask for it, from where, by which name, and how much."""
+"""Every route of the application: required login, origin, host name and size."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ NOT_ACTING = ("/api/program",)
 
 
 def listed(*, writing: bool) -> list[tuple[str, str]]:
-    """Return method and path of the routes that read, or those that write, without the login itself."""
     found = [route for router in page_routers() for route in router.routes if isinstance(route, APIRoute)]
     named = [(m, re.sub(r"\{[^}]*\}", "1", route.path)) for route in found for m in sorted(route.methods or ())]
     return [(m, p) for m, p in named if p != OPEN and (m not in READING) is writing]
@@ -31,7 +30,6 @@ WRITES, READS = listed(writing=True), listed(writing=False)
 
 
 def kind_of(path: str) -> str:
-    """Return what a write does: it computes, it disarms, or it acts."""
     return "computes" if path.startswith(NOT_ACTING) else "disarms" if path == DISARM else "acts"
 
 
@@ -42,7 +40,6 @@ def app(tmp_path_factory: pytest.TempPathFactory) -> FastAPI:
 
 @pytest.fixture(scope="module")
 def careful(tmp_path_factory: pytest.TempPathFactory) -> FastAPI:
-    """Users, and all else by default."""
     return app_of(tmp_path_factory.mktemp("careful"))
 
 
@@ -147,7 +144,7 @@ async def test_a_read_needs_a_login_where_there_are_users(stranger: httpx.AsyncC
 
 
 async def test_what_a_stranger_sees_tells_nothing_of_the_machine(stranger: httpx.AsyncClient, app: FastAPI) -> None:
-    """The words of docs/how-to/browser.md on it: the shell, its scripts, and that a login is needed."""
+    """As stated in docs/how-to/browser.md: the shell, its scripts, and that a login is needed."""
     seen = []
     for path in ("/", "/machine", "/live", "/static/app.js", "/static/uplot/uPlot.min.css", OPEN, "/nothing", "/api/x"):
         answer = await stranger.get(path)

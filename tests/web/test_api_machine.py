@@ -1,4 +1,4 @@
-"""What the page of the machine asks for: from a real daemon, from a store, and while the daemon is silent."""
+"""The data of the page Machine: from a running daemon, from the store, and while the daemon is silent."""
 
 from __future__ import annotations
 
@@ -88,7 +88,6 @@ async def test_many_browsers_ask_the_daemon_no_more_than_one_does(tmp_path: Path
 
 
 async def test_half_a_character_and_a_number_that_is_none_end_no_answer(tmp_path: Path) -> None:
-    """As a program's name that is no UTF-8 has it; in what is told, and in what is refused."""
     config = machine_of(tmp_path)
     told = {**STATUS, "text": "b\udcf6hlen.ngc", "ratio": math.nan}
     async with (
@@ -106,11 +105,11 @@ async def test_half_a_character_and_a_number_that_is_none_end_no_answer(tmp_path
     ("changes", "troubles", "light", "words"),
     [
         ({}, [], "good", "in order"),
-        ({"drive_state": "Fault"}, [], "bad", "the drive is in Fault"),
+        ({"drive_state": "Fault"}, [], "bad", "the drive is in state Fault"),
         ({}, ["NodeNeverHeard: it is silent"], "bad", "NodeNeverHeard"),
-        ({"samples_s_ago": None}, [], "none", "no samples came yet"),
+        ({"samples_s_ago": None}, [], "none", "no samples yet"),
         ({"samples_s_ago": 9.0}, [], "none", "no samples for 9 s"),
-        ({"parameters": None}, [], "none", "let the NC make a few rapids"),
+        ({"parameters": None}, [], "none", "run a few rapids"),
         ({"parameters": None, "refused_by": {"A": 1, "B": 2}}, [], "none", "2 rapids were refused because of B"),
         ({"last_window": {"accepted": False, "reasons": ["Low: no"]}}, [], "warn", "was refused: Low: no"),
         ({"warnings": ["W: w"]}, [], "warn", "W: w"),
@@ -139,14 +138,14 @@ def _lost() -> Iterator[tuple[dict[str, Any], str, bool]]:
     yield {"state": "FROZEN", **stands}, "then run fdhil adopt", True
     yield {"guard": {"cause": {"code": "SyncLost", "text": "t", "advice": "a"}}}, "a", False
     yield {"source": {"state": "silent"}}, "switch the machine on", False
-    yield {"source": {"state": "reconnecting"}}, "it is opened again by itself", False
-    yield {"store": {"fault": "full"}}, "nothing is armed meanwhile", False
+    yield {"source": {"state": "reconnecting"}}, "it is reopened automatically", False
+    yield {"store": {"fault": "full"}}, "nothing can be armed meanwhile", False
     yield {"troubles": [{"axis": "X", "code": "C", "text": "what; then do"}]}, "then do", False
     yield {"axes": {"X": CALM | {"parameters": None}}}, "a few rapids (G0)", False
     yield {"unacknowledged": {"count": 2, "MAJOR": 1}}, "see the page Events", False
     yield {"alarms": {"active": 1}}, "see the page Events", False
     yield {"armed": {"program": "p"}}, "start the program at the NC", False
-    yield {"state": "OFF(SHADOW)"}, "start fdhil-guard to correct", False
+    yield {"state": "OFF(SHADOW)"}, "start fdhil-guard", False
     yield {}, "fdhil arm CONFIG PROGRAM", False
 
 
@@ -159,4 +158,4 @@ def test_what_to_do_next_is_always_said(changes: dict[str, Any], advice: str, ur
 
 def test_what_was_ordered_is_no_fault_to_mend() -> None:
     ordered = {"guard": {"cause": {"code": "Disarmed", "text": "disarmed", "advice": "arm again"}}}
-    assert [step.text for step in steps(STATUS | ordered, acting=True)] == ["All is in order."]
+    assert [step.text for step in steps(STATUS | ordered, acting=True)] == ["Everything is in order."]

@@ -1,4 +1,4 @@
-"""Who may act, and how, in a real browser: by login and role, by the keyboard alone, and disarmed by one click."""
+"""Arming in a real browser: by login and role, by keyboard, and disarming by one click."""
 
 from __future__ import annotations
 
@@ -19,14 +19,12 @@ pytestmark = [pytest.mark.debian, pytest.mark.timeout(900)]
 
 @pytest.fixture
 def operator(stage: Stage, chromium: Browser) -> Iterator[Tab]:
-    """A tab of someone who may act."""
     with opened(chromium, stage.url) as tab:
         tab.log_in(stage.token("operator"))
         yield tab
 
 
 def log_in_by_keyboard(tab: Tab, name: str, password: str) -> None:
-    """Log in without a mouse."""
     tab.tab_to(tab.word("login"))
     tab.page.keyboard.press("Enter")
     tab.page.get_by_role("dialog").wait_for()
@@ -37,7 +35,6 @@ def log_in_by_keyboard(tab: Tab, name: str, password: str) -> None:
 
 
 def choose_by_keyboard(tab: Tab) -> None:
-    """Choose program and method in the dialogue of arming."""
     for label, chosen in ((tab.word("arm.program"), "corner"), (tab.word("arm.method"), "inverse")):
         tab.tab_to(label)
         tab.page.keyboard.type(chosen)

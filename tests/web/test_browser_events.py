@@ -1,4 +1,4 @@
-"""Notices, their acknowledgement and the black boxes in Debian's chromium, with the real daemon and twin behind it."""
+"""Notices, acknowledgement and black boxes in chromium, with a running daemon and simulator."""
 
 from __future__ import annotations
 
@@ -19,14 +19,12 @@ pytestmark = [pytest.mark.debian, pytest.mark.timeout(900)]
 
 @contextmanager
 def tab_of(name: str, stage: Stage, chromium: Browser) -> Iterator[Tab]:
-    """Yield a tab in which somebody has logged in."""
     with opened(chromium, stage.url) as tab:
         tab.log_in(stage.token(name))
         yield tab
 
 
 def waiting(stage: Stage) -> set[int]:
-    """Return the numbers of the notices that wait for somebody: others may come at any time."""
     kinds = stage.ask("/api/events", None, stage.token("watcher"))["waiting"]
     return {number for kind in kinds for number in kind["numbers"]}
 
@@ -69,7 +67,7 @@ def test_the_list_is_filtered_by_its_address(stage: Stage, chromium: Browser) ->
 def test_a_black_box_is_shown_and_given_as_a_file(stage: Stage, chromium: Browser) -> None:
     with tab_of("watcher", stage, chromium) as tab:
         tab.open("/events")
-        tab.page.get_by_role("button", name="Show what the drives did").first.click()
+        tab.page.get_by_role("button", name="Show the drives' signals").first.click()
         tab.page.locator("#black-box").wait_for()
         assert tab.violations() == []
         with tab.page.expect_download() as saved:

@@ -1,4 +1,4 @@
-"""The page of all machines in Debian's chromium, with a real database behind it."""
+"""The fleet page in chromium, with a real database."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ DAYS = 20
 
 @pytest.fixture(scope="module")
 def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """``fdhil fleet web`` of nine machines, the third of which wears, and the fifth of which is unlike the others."""
     folder = tmp_path_factory.mktemp("works")
     begin = datetime.now(UTC) - timedelta(days=DAYS + 1)
     with postgres() as database:

@@ -1,4 +1,4 @@
-"""The page live in a real browser: frozen, enlarged to single samples and read off, by the keyboard alone."""
+"""The live page in a real browser: frozen, zoomed to single samples and read, by keyboard."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ CURRENT = "figure.chart:has(figcaption:has-text('Current'))"
 
 @pytest.fixture
 def phone(stage: Stage, chromium: Browser) -> Iterator[Tab]:
-    """A tab of someone who may look, on the screen of a telephone."""
     with opened(chromium, stage.url, NARROW) as tab:
         tab.log_in(stage.token("watcher"))
         yield tab

@@ -1,4 +1,4 @@
-"""Each page in Debian's chromium, with the real daemon and twin behind it: everyone can read it, on any screen."""
+"""Each page in chromium, with a running daemon and simulator: accessible on any screen."""
 
 from __future__ import annotations
 
@@ -24,19 +24,16 @@ AT_400_PERCENT: ViewportSize = {"width": WIDE[0] // 4, "height": 256}  # WCAG 2.
 
 @pytest.fixture(scope="module")
 def token(stage: Stage) -> str:
-    """The login of someone who may look."""
     return stage.token("watcher")
 
 
 @pytest.fixture(scope="module")
 def paths(stage: Stage, token: str) -> dict[str, str]:
-    """The path of every page."""
     return stage.paths(token)
 
 
 @pytest.fixture
 def reader(stage: Stage, chromium: Browser, token: str) -> Iterator[Tab]:
-    """A tab of someone who may look."""
     with opened(chromium, stage.url) as tab:
         tab.log_in(token)
         yield tab
@@ -48,13 +45,12 @@ def test_every_page_is_looked_at(paths: dict[str, str]) -> None:
 
 
 def without_digits(labels: Set[str]) -> set[str]:
-    """Return labels without what counts."""
     return {re.sub(r"\d", "", label) for label in labels}
 
 
 @pytest.mark.parametrize("page", PAGES)
 def test_a_page_is_for_everyone(page: str, paths: dict[str, str], reader: Tab) -> None:
-    """axe finds nothing in light and in dark, nothing is lost at 400 %, no scrolling to both sides, no motion."""
+    """axe reports nothing in light and dark mode; at 400 % nothing is lost, without scrolling sideways or motion."""
     reader.page.emulate_media(reduced_motion="reduce")
     reader.open(paths[page])
     reader.page.locator("#standing .state").filter(has_text=re.compile(".")).wait_for(state="attached")

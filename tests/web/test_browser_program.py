@@ -1,4 +1,4 @@
-"""A program judged in a browser: dropped, looked at by wheel, pinch and keys, led to by address; and the panel."""
+"""A program judged in a browser: dropped, examined by wheel, pinch and keys, opened by address; and the panel."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ def token(stage: Stage) -> str:
 
 @pytest.fixture(params=[(1280, 800), NARROW], ids=["wide", "narrow"])
 def judged(request: pytest.FixtureRequest, stage: Stage, chromium: Browser, token: str) -> Iterator[Tab]:
-    """A tab with the forecast of the stage's corner."""
     with opened(chromium, stage.url, request.param, has_touch=True) as tab:
         tab.log_in(token)
         tab.open("/program")
@@ -37,12 +36,10 @@ def judged(request: pytest.FixtureRequest, stage: Stage, chromium: Browser, toke
 
 
 def seen(tab: Tab) -> Any:
-    """Return what the maps show, as pixels that are compared."""
     return tab.page.evaluate("[...document.querySelectorAll('canvas.map')].map((map) => map.toDataURL())")
 
 
 def changed(tab: Tab, before: Any) -> None:
-    """Wait until both maps show something else."""
     for _ in range(round(PATIENCE_MS / LOOK_MS)):
         if all(now != then for now, then in zip(seen(tab), before, strict=True)):
             return
@@ -58,7 +55,7 @@ def test_a_corner_is_looked_at_by_wheel_pinch_and_keys(judged: Tab) -> None:
     judged.says("dl.readout", "line")
     page.wait_for_url("**?line=4")
     assert page.locator(".listing [aria-current]").inner_text().split() == ["4", "G1", "Y40"]
-    judged.says("main", "Dashed: where the table will be")
+    judged.says("main", "Dashed: predicted table path")
     for key in ("+", "Shift+ArrowLeft", "-", "0"):
         before = seen(judged)
         page.locator("canvas.map").first.press(key)
@@ -82,7 +79,6 @@ def test_a_corner_is_looked_at_by_wheel_pinch_and_keys(judged: Tab) -> None:
 
 
 def pinch(tab: Tab, x: float, y: float) -> None:
-    """Part two fingers on the map."""
     session = tab.page.context.new_cdp_session(tab.page)
     for kind, apart in (("touchStart", 20), ("touchMove", 40), ("touchMove", 80), ("touchEnd", 0)):
         points = [{"x": x + apart, "y": y, "id": 1}, {"x": x - apart, "y": y, "id": 2}] if apart else []

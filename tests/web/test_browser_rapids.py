@@ -1,4 +1,4 @@
-"""The rapids in a real browser: chosen, opened, looked into by the keyboard, compared, saved."""
+"""The rapids in a real browser: filtered, opened, examined by keyboard, compared, saved."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ pytestmark = [pytest.mark.debian, pytest.mark.timeout(900)]
 
 @pytest.fixture
 def reader(stage: Stage, chromium: Browser) -> Iterator[Tab]:
-    """A tab of someone who may look."""
     with opened(chromium, stage.url) as tab:
         tab.log_in(stage.token("watcher"))
         yield tab
@@ -77,7 +76,7 @@ def test_two_are_marked_and_compared(reader: Tab) -> None:
     page.wait_for_url(f"**/rapids/{one}?with={other}")
     table = page.get_by_role("table", name=reader.word("rapid.numbers"))
     table.wait_for()
-    assert f"{other} at most" in table.inner_text()
+    assert f"{other} maximum" in table.inner_text()
     reader.says("main", reader.word("rapid.compared.mirrored"))  # they went to and fro
     assert reader.violations() == []
     page.get_by_role("link", name=reader.word("rapid.compare.end")).click()

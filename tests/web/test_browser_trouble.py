@@ -1,4 +1,4 @@
-"""What the pages say, in a real browser, while the daemon is away, and on a network that is slow."""
+"""The pages in a real browser without a daemon, and on a slow network."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ CRAWLING = 3_000
 
 @pytest.fixture
 def reader(stage: Stage, chromium: Browser) -> Iterator[Tab]:
-    """A tab of someone who may look."""
     with opened(chromium, stage.url) as tab:
         tab.log_in(stage.token("watcher"))
         yield tab

@@ -1,4 +1,4 @@
-"""Strangers who hold connections: they keep nobody from being heard, least of all who disarms."""
+"""Clients that exhaust connections cannot block other users, least of all disarming."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 @asynccontextmanager
 async def served(folder: Path, users: bool = True) -> AsyncIterator[int]:
-    """Serve the pages as the command does, and yield the port."""
     began = asyncio.Event()
     server = serving.server_of(make_app(machine_of(folder, users)), None, began.set)
     with socket.create_server(("127.0.0.1", 0)) as listener:
@@ -38,7 +37,6 @@ async def served(folder: Path, users: bool = True) -> AsyncIterator[int]:
 
 @asynccontextmanager
 async def held(port: int, number: int, sent: bytes = b"") -> AsyncIterator[list[Stream]]:
-    """Open connections that send no more than that."""
     streams = [await asyncio.open_connection("127.0.0.1", port) for _ in range(number)]
     try:
         for _, writer in streams:
@@ -50,7 +48,6 @@ async def held(port: int, number: int, sent: bytes = b"") -> AsyncIterator[list[
 
 
 async def status_line(port: int) -> bytes:
-    """Return what a browser that comes now is answered."""
     reader, writer = await asyncio.open_connection("127.0.0.1", port)
     writer.write(b"GET /api/session HTTP/1.1\r\nHost: localhost\r\n\r\n")
     line = await asyncio.wait_for(reader.readline(), WAIT_S)
@@ -83,7 +80,6 @@ async def test_sockets_that_never_end_keep_nobody_out(tmp_path: Path, monkeypatc
 
 
 async def closed(reader: asyncio.StreamReader) -> bytes:
-    """Return what came until the connection ended."""
     with contextlib.suppress(ConnectionError):
         return await asyncio.wait_for(reader.read(), WAIT_S)
     return b""

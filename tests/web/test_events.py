@@ -1,4 +1,4 @@
-"""What waits to be acknowledged, acknowledging it through the daemon, and the black boxes, as a browser has them."""
+"""Alarms, acknowledgement through the daemon, and black boxes, by the API."""
 
 from __future__ import annotations
 
@@ -37,7 +37,6 @@ NOTICES = (
 
 @pytest.fixture
 def machine(tmp_path: Path) -> MachineConfig:
-    """A machine with some notices, of which the last was acknowledged, and with users that may act."""
     config = machine_of(tmp_path, acting=True)
     with History.open(config.store.directory) as history:
         numbers = [history.add_notice(notice, Stamp(1.7e9 + k * DAY_S, "boot", k)) for k, notice in enumerate(NOTICES)]
@@ -47,7 +46,6 @@ def machine(tmp_path: Path) -> MachineConfig:
 
 @pytest.fixture
 async def client(machine: MachineConfig) -> AsyncIterator[httpx.AsyncClient]:
-    """A browser in which an operator has logged in."""
     async with client_of(make_app(machine), "operator", **OWN) as client:
         yield client
 

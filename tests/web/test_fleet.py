@@ -1,4 +1,4 @@
-"""The page of many machines: its routes behind the same gate, with answers that a test gives."""
+"""The fleet application: its routes behind the same gate, with answers of the test."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ from tests.web.clients import OWN, client_of, log_in, user
 
 
 class Asked:
-    """Keeps what was asked."""
-
     def __init__(self) -> None:
         self.questions: list[tuple[str, dict[str, str | None]]] = []
 

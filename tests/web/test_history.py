@@ -1,4 +1,4 @@
-"""How the drives moved, as a browser has it, over a store that the daemon's own pipeline wrote."""
+"""Parameter trends by the API, over a store written by the daemon's own pipeline."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ RAPIDS = 26
 
 @pytest.fixture(scope="module")
 def machine(tmp_path_factory: pytest.TempPathFactory) -> MachineConfig:
-    """A machine with one axis that wore and was loaded, and one that never moved."""
     folder = tmp_path_factory.mktemp("history")
     weeks.fill(config_of(folder, "X"), RAPIDS)
     return config_of(folder, "XY")
@@ -32,7 +31,6 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> MachineConfig:
 
 @pytest.fixture
 async def client(machine: MachineConfig) -> AsyncIterator[httpx.AsyncClient]:
-    """A browser on this computer."""
     async with client_of(make_app(machine)) as client:
         yield client
 

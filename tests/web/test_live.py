@@ -1,4 +1,4 @@
-"""The page live over real sockets: the daemon's stream behind it, what a browser is told, and who may be told."""
+"""The live page over real sockets: the daemon's stream, the browser's messages, and their access rights."""
 
 from __future__ import annotations
 
@@ -36,7 +36,6 @@ PASSWORD = "a password of tests"
 
 @asynccontextmanager
 async def daemon(config: MachineConfig) -> AsyncIterator[LiveStream]:
-    """Serve the daemon's side of the stream at its socket."""
     stream = LiveStream(config)
 
     async def handle(_request: Any, _peer: Any) -> Any:
@@ -49,8 +48,6 @@ async def daemon(config: MachineConfig) -> AsyncIterator[LiveStream]:
 
 
 class Server(uvicorn.Server):
-    """A server that tells when it listens."""
-
     def __init__(self, settings: uvicorn.Config) -> None:
         super().__init__(settings)
         self.listens = asyncio.Event()
@@ -62,7 +59,6 @@ class Server(uvicorn.Server):
 
 @asynccontextmanager
 async def pages(config: MachineConfig) -> AsyncIterator[str]:
-    """Serve the pages on a free port; yield host and port."""
     settings = uvicorn.Config(
         make_app(config), port=0, log_config=None, ws="websockets-sansio", lifespan="on", timeout_graceful_shutdown=1
     )
@@ -77,21 +73,17 @@ async def pages(config: MachineConfig) -> AsyncIterator[str]:
 
 
 def stream_of(place: str, query: str = "seconds=1&columns=100", **more: Any) -> connect:
-    """Return the socket of the stream."""
     given = {"subprotocols": ["fdhil"], "open_timeout": WAIT_S, **more}
     return connect(f"ws://{place}/api/live/stream?{query}", **given)
 
 
 class Browser:
-    """What a browser has been told; it says that it has drawn each message, unless it is slow."""
-
     def __init__(self, socket: ClientConnection) -> None:
         self.socket = socket
         self.header: dict[str, Any] = {}
         self.parts: list[tuple[dict[str, Any], Any]] = []
 
     async def until(self, ready: Callable[[], bool], draw: bool = True) -> None:
-        """Take messages until something is so."""
         while not ready():
             message = await asyncio.wait_for(self.socket.recv(), WAIT_S)
             assert isinstance(message, bytes)
@@ -101,24 +93,20 @@ class Browser:
                 await self.draw()
 
     async def draw(self) -> None:
-        """Say that the newest message has been drawn."""
         await self.socket.send(json.dumps({"drawn": self.header["number"]}))
 
     @property
     def told(self) -> int:
-        """How many ticks it was told of."""
         return sum(part["columns"] * part["per_column"] for part, _ in self.parts)
 
 
 async def heard_out(socket: ClientConnection, told: list[object] | None = None) -> None:
-    """Take messages until the server closes; ConnectionClosed."""
     told = [] if told is None else told
     while True:
         told.append(await asyncio.wait_for(socket.recv(), WAIT_S))
 
 
 async def begun(socket: ClientConnection) -> tuple[dict[str, Any], Browser]:
-    """Return the first message, and a browser once the daemon's stream is open."""
     begin = json.loads(await asyncio.wait_for(socket.recv(), WAIT_S))
     browser = Browser(socket)
     await browser.until(lambda: browser.header.get("trouble") == "")
@@ -126,7 +114,6 @@ async def begun(socket: ClientConnection) -> tuple[dict[str, Any], Browser]:
 
 
 def feed(stream: LiveStream, first: int, blocks: int) -> None:
-    """Let so many blocks of the axis X pass."""
     for k in range(blocks):
         stream.take(block(np.arange(first + k * BLOCK, first + (k + 1) * BLOCK)))
 
@@ -256,7 +243,7 @@ async def test_browsers_that_never_draw_make_room_for_one_that_does(
             await socket.recv()
         async with stream_of(place) as third:
             assert json.loads(await third.recv())["axes"] == ["X"]
-            with pytest.raises(ConnectionClosed, match="another browser has this place"):
+            with pytest.raises(ConnectionClosed, match="another browser took this place"):
                 await heard_out(first)
 
 
@@ -299,13 +286,13 @@ async def test_a_stranger_is_told_nothing_and_a_login_that_ends_ends_the_stream(
             assert socket.subprotocol == "fdhil"  # the token is not said back
             await asyncio.wait_for(socket.recv(), WAIT_S)
             await client.delete("/api/session", headers={"Authorization": f"Bearer {token}"})
-            with pytest.raises(ConnectionClosed, match="the login has ended"):
+            with pytest.raises(ConnectionClosed, match="the login has expired"):
                 await heard_out(socket)
         token = (await client.post("/api/session", json={"name": "ann", "password": PASSWORD})).json()["token"]
         async with stream_of(place, subprotocols=["fdhil", f"bearer.{token}"]) as socket:
             await socket.recv()
             write_users(tmp_path / "users.json", {})
             told: list[object] = []
-            with pytest.raises(ConnectionClosed, match="the login has ended"):
+            with pytest.raises(ConnectionClosed, match="the login has expired"):
                 await heard_out(socket, told)
             assert len(told) <= 1  # which was on its way

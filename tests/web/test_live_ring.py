@@ -1,4 +1,4 @@
-"""What is kept of the daemon's stream, and how it is drawn together for a browser: the parts, without a socket."""
+"""Rings, envelopes and messages of the live page, without a socket."""
 
 from __future__ import annotations
 
@@ -22,12 +22,10 @@ PERIOD_S = 0.001
 
 
 def rows(ticks: Any) -> Any:
-    """Return signals (7, n) that tell their tick: k times the tick, k = 1 to 7."""
     return np.outer(np.arange(1, 1 + len(SIGNALS)), np.asarray(ticks)).astype(np.float32)
 
 
 def filled(capacity: int, *parts: Any) -> Ring:
-    """Return a ring that was given these ticks, part by part."""
     ring = Ring(capacity)
     for part in parts:
         ring.put(np.asarray(part, np.int64), rows(part))
@@ -79,7 +77,6 @@ def test_temperature_holds_and_a_sensor_of_its_own_is_laid_on_the_rows() -> None
 
 
 def decoded(message: bytes) -> tuple[dict[str, Any], list[Any]]:
-    """Return a message's header and the least values of each part."""
     (length,) = struct.unpack_from("<I", message)
     header, place, low = json.loads(message[4 : 4 + length]), 4 + length, []
     assert place % 4 == 0
@@ -134,12 +131,10 @@ def test_json_has_no_number_where_there_is_none() -> None:
 
 
 def feed_of(axes: str = "XY") -> LiveFeed:
-    """Return a feed whose rings are filled by hand."""
     return LiveFeed(Path("/nowhere"), dict.fromkeys(axes), PERIOD_S)
 
 
 def line(axis: str, ticks: Any) -> dict[str, Any]:
-    """Return a line of the daemon."""
     ticks = np.asarray(ticks)
     whole = int(ticks[-1] - ticks[0]) == ticks.size - 1
     holes = {} if whole else {"ticks": packed(ticks - ticks[0], "<i4")}

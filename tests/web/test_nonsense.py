@@ -1,4 +1,4 @@
-"""What answers the pages nonsense, or never: it is told, and what serves the pages goes on."""
+"""Invalid or missing answers of other processes are reported, and the web server continues."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ NONSENSE = [
 
 @asynccontextmanager
 async def listening(path: Path, *answers: str | None) -> AsyncIterator[list[str]]:
-    """Answer each connection with the next of these, the last for ever; None is silence. Yield what was asked."""
+    """Answer each connection with the next of these, the last forever; None is silence. Yields the requests."""
     asked: list[str] = []
 
     ended = asyncio.Event()

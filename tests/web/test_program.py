@@ -1,4 +1,4 @@
-"""A program that is dropped in a browser: forecast in a process of its own, and told in parts that lose nothing."""
+"""Dropped programs: forecast in a child process, and returned in parts without loss."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> MachineConfig:
 
 
 class Client:
-    """Asks the application in a loop that lives as long as a module's tests do; forecasts go on while one asks."""
+    """Asks the application in a loop that lives as long as a module's tests; forecasts go on meanwhile."""
 
     def __init__(self, app: FastAPI) -> None:
         self._runner = asyncio.Runner()
@@ -88,7 +88,6 @@ def drop(client: Client, name: str, content: bytes) -> str:
 
 
 def over(client: Client, digest: str, part: str = "") -> dict[str, Any]:
-    """Ask as the page does, until the forecast, or a part that is asked for later, is over."""
     end = time.monotonic() + LONG_ENOUGH_S
     while time.monotonic() < end:
         told: dict[str, Any] = client.get(f"/api/program/{digest}").json()
@@ -268,8 +267,6 @@ async def test_programs_that_are_still_being_sent_take_no_places_and_those_that_
 
 
 class AnyRefusal:
-    """Equals a refusal of one class."""
-
     def __init__(self, code: str) -> None:
         self._code = code
 

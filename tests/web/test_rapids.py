@@ -1,4 +1,4 @@
-"""The rapids as a browser has them, over a store that the daemon's own pipeline wrote."""
+"""The rapids by the API, over a store written by the daemon's own pipeline."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ RAPIDS = 18  # of each axis; those of 6 and 15 are refused
 
 @pytest.fixture(scope="module", autouse=True)
 def _busy_host() -> Iterator[None]:
-    """The bound on a replay ends what hangs, not what a busy host has not come to yet."""
+    """The time limit of a replay is for hanging replays, not for a busy host."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(replayer, "LONGEST_S", 500.0)
         yield
@@ -50,7 +50,6 @@ def _busy_host() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def machine(tmp_path_factory: pytest.TempPathFactory) -> MachineConfig:
-    """A machine with two axes and nine days of rapids."""
     config = config_of(tmp_path_factory.mktemp("rapids"), "XY")
     weeks.fill(config, RAPIDS)
     return config
@@ -58,13 +57,11 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> MachineConfig:
 
 @pytest.fixture(scope="module")
 def app(machine: MachineConfig) -> FastAPI:
-    """The pages of that machine."""
     return make_app(machine)
 
 
 @pytest.fixture
 async def client(app: FastAPI) -> AsyncIterator[httpx.AsyncClient]:
-    """A browser on this computer."""
     async with _client(app) as client:
         yield client
     await replayer_of(app).close()
@@ -298,7 +295,7 @@ def test_a_rapid_whose_recording_the_disk_refused_says_so(tmp_path: Path) -> Non
         history.add_window(outcome(), "", STAMP)
     fault = json.loads(Replays(config, config.digest).answer({"axis": "X", "number": 1})[1:])
     assert (fault["status"], fault["code"]) == (404, "NotKept")
-    assert "was not kept" in fault["text"]
+    assert "was not stored" in fault["text"]
 
 
 async def test_a_row_that_is_damaged_is_left_out(tmp_path: Path) -> None:
@@ -321,7 +318,6 @@ async def test_before_anything_was_recorded_it_says_so(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def rapid(machine: MachineConfig) -> Window:
-    """A rapid of the nominal drive."""
     return nominal_rapid("X", machine.axis["X"], machine.machine.sync_period_s)
 
 

@@ -1,4 +1,4 @@
-"""What is served to browsers as it stands: complete, of one piece, and from here alone."""
+"""The static files: complete, consistent, and without requests to other servers."""
 
 from __future__ import annotations
 
@@ -41,7 +41,6 @@ def test_each_word_that_is_used_is_written_down_once() -> None:
 
 
 def sentences(*paths: Path) -> dict[str, set[str]]:
-    """Return by key what is filled into each sentence of these files."""
     found = re.findall(
         r'^\s*"([\w.()]+)": "(.*)",?$', "\n".join(path.read_text("utf-8") for path in paths), re.MULTILINE
     )

@@ -1,4 +1,4 @@
-"""``fdhil web`` and ``fdhil web-user``: where they listen, what they refuse, and that no secret leaves."""
+"""``fdhil web`` and ``fdhil web-user``: addresses, refusals, and that no secret leaks."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ def test_beyond_this_computer_it_takes_tls_and_users_or_a_word(host: str) -> Non
         with pytest.raises(ConfigError) as told:
             serving.check_reach(Web(host=host, **given))
         assert len(told.value.faults) == missing
-        assert "can be reached from other computers" in str(told.value) or "users_file" in str(told.value)
+        assert "other computers can reach" in str(told.value) or "users_file" in str(told.value)
     serving.check_reach(Web(host=host, **TLS, **USERS))
     serving.check_reach(Web(host=host, unprotected=True))
-    with pytest.raises(ConfigError, match="who acts sends a password"):  # no word helps against that
+    with pytest.raises(ConfigError, match="operators send passwords"):  # no word helps against that
         serving.check_reach(Web(host=host, unprotected=True, acting=True, users_file=Path("u")))
 
 
@@ -75,7 +75,6 @@ def written(folder: Path, **web: Any) -> Path:
 
 
 def given(password: str, *arguments: str | Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> tuple[int, str]:
-    """Run a command with a password on standard input; return its exit code and what it said."""
     monkeypatch.setattr("sys.stdin", io.StringIO(password + "\n"))
     code, out, err = fdhil(*arguments, capsys=capsys)
     return code, out + err
@@ -119,7 +118,6 @@ def test_what_cannot_be_listened_at_is_told(tmp_path: Path, capsys: Capture) -> 
 def test_served_by_tls_it_tells_no_secret_and_ends_in_order(
     tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A process as systemd starts it; the canaries are a password, a token, the operator's token and the key."""
     write_certificate(tmp_path / "web.crt", tmp_path / "web.key")
     files = {"users_file": "u.json", "tls_certificate_file": "web.crt", "tls_key_file": "web.key"}
     path = written(tmp_path, port=0, acting=True, **files)

@@ -1,6 +1,6 @@
-"""A made-up store of weeks: rapids of drives that wear and warm, through the daemon's own pipeline into its own store.
+"""A store of simulated weeks: rapids of drives that wear and warm, through the daemon's own pipeline and store.
 
-Nothing is timed by a clock: the last rapid is as old as the caller says, each other half a day older than the next.
+Independent of the clock: the caller sets the time of the last rapid, each earlier one is half a day older.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ FRAMES = "".join(f"({k * 1e-3:.6f}) can0 {can_id}#{k % 256:02X}00\n" for k in ra
 
 
 def fill(config: MachineConfig, rapids: int = 84, last: Stamp | None = None) -> None:
-    """Write ``rapids`` of each axis, what followed from them, notices and a black box; the newest is ``last`` (now).
+    """Write ``rapids`` of each axis with their results, notices and a black box; the newest is ``last`` (now).
 
-    At the end every drive is what its configuration calls nominal, so that a twin without changes is that machine.
+    At the end every drive has its configuration's nominal values, so that an unchanged simulator is that machine.
     """
     last = last or Stamp.now()
     rng = np.random.default_rng(16)
@@ -70,7 +70,6 @@ def fill(config: MachineConfig, rapids: int = 84, last: Stamp | None = None) -> 
 
 @contextmanager
 def daemons_store(config: MachineConfig) -> Iterator[tuple[OutcomeStore, dict[str, Stamp]]]:
-    """Open the daemon's store with a clock that is set by hand."""
     clock: dict[str, Stamp] = {}
 
     class SetByHand(Stamp):
@@ -89,13 +88,11 @@ def daemons_store(config: MachineConfig) -> Iterator[tuple[OutcomeStore, dict[st
 
 
 def earlier(stamp: Stamp, seconds: float) -> Stamp:
-    """Return the stamp of so long before; before the boot of ``stamp`` it is that of another."""
     monotonic_ns = stamp.monotonic_ns - round(seconds * 1e9)
     return Stamp(stamp.wall_s - seconds, stamp.boot if monotonic_ns >= 0 else "earlier", abs(monotonic_ns))
 
 
 def black_box(config: MachineConfig, at: Stamp) -> Notice:
-    """Leave the frames before the trip, in a file of that time, and return what is told of it."""
     folder = config.store.directory / blackbox.FOLDER
     folder.mkdir()
     stamp = datetime.fromtimestamp(at.wall_s, UTC).strftime("%Y%m%dT%H%M%S.%fZ")
@@ -105,7 +102,6 @@ def black_box(config: MachineConfig, at: Stamp) -> Notice:
 
 
 def rapid(name: str, config: MachineConfig, k: int, rapids: int, celsius: float, seed: int) -> Window:
-    """Return the k-th of ``rapids`` to and fro; some are as no rapid should be, and are refused."""
     worn = worn_axis(config.axis[name], (k + 1) / rapids, celsius)
     window = nominal_rapid(name, worn, config.machine.sync_period_s, 1 if k % 2 == 0 else -1, seed)
     window = replace(window, start_tick=k * TICKS_APART, temperature_c=round(celsius, 2), source="inferred")
@@ -115,7 +111,6 @@ def rapid(name: str, config: MachineConfig, k: int, rapids: int, celsius: float,
 
 
 def worn_axis(axis: Axis, share: float, celsius: float) -> Axis:
-    """Return an axis as it was at this ``share`` of the weeks: ft grows, Cd falls with warmth, a table joined."""
     nominal = axis.nominal
     was: Mapping[str, Any] = {
         "ft": nominal.ft * (1 - WEAR * (1 - share)),
@@ -126,7 +121,6 @@ def worn_axis(axis: Axis, share: float, celsius: float) -> Axis:
 
 
 def spoiled(window: Window, kind: int) -> Window:
-    """Return a rapid with a cutting load, or with a voltage that hangs at one value."""
     assert window.stages.cruise is not None
     assert window.voltage_v is not None
     begin, end = window.stages.cruise
@@ -139,7 +133,6 @@ def spoiled(window: Window, kind: int) -> Window:
 
 
 def teach(config: MachineConfig, program_digest: str, rows: int) -> None:
-    """Leave what three passes of a program of ``rows`` taught."""
     offset = frozen(0.05 * np.sin(np.arange(rows) / 300.0))
     lesson = Lesson(dict.fromkeys(config.axis, offset), 10.3, 0.7, (3.4, 1.6, 0.9))
     write_lesson(lesson_path(config.store.directory / "lessons", program_digest, config.digest), lesson)

@@ -1,1 +1,1 @@
-"""Forecasts of programs dropped in a browser: computed in a process of their own, kept while the pages are served."""
+"""Forecasts programs dropped in a browser: computed in a child process, kept while the pages are served."""

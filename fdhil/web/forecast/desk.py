@@ -1,7 +1,7 @@
-"""Takes programs that are dropped in a browser, has them forecast one after another, and keeps the newest.
+"""Queues programs dropped in a browser, has them forecast one after another, and keeps the newest.
 
-What is kept lives as long as the process that serves the pages, under the digest of the program's bytes. Its name is
-shown and never a path.
+Programs are kept as long as the process that serves the pages, under the digest of their bytes. Their name is displayed
+and never used as a path.
 """
 
 import asyncio
@@ -24,20 +24,20 @@ from fdhil.web.forecast.kept import Forecast, read_advice
 MAKER = "fdhil.web.forecast.process"
 KEPT = 6
 MOST_WAITING = 3
-LONGEST_S = 600.0  # beside a busy machine; processor time is bounded by the process itself
+LONGEST_S = 600.0  # on a busy PC; the process limits its own processor time
 LONGEST_NAME = 100
 STATES = Literal["waiting", "computing", "done", "failed", "cancelled"]
 ADVICE = {
-    "ProgramError": "mend the program, then drop it again",
+    "ProgramError": "correct the program, then drop it again",
     "RecordingError": "record or export the demand again, then drop it again",
-    "ConfigError": "mend the configuration or identify the axis, then drop the program again",
-    "StoreError": "see the history's own fault in fdhil status, then drop the program again",
+    "ConfigError": "correct the configuration or identify the axis, then drop the program again",
+    "StoreError": "see the history's fault in fdhil status, then drop the program again",
 }
 
 
 @dataclass(slots=True)
 class Work:
-    """What one process computes: how far it is, and why it has failed. ``tolerance_um`` None: the forecast itself."""
+    """One child process' computation: its progress and its failure. ``tolerance_um`` None: the forecast itself."""
 
     tolerance_um: float | None = None
     state: STATES = "waiting"
@@ -47,17 +47,15 @@ class Work:
 
     @property
     def over(self) -> bool:
-        """Whether nothing more will come of it."""
         return self.state in ("done", "failed", "cancelled")
 
     def fail(self, code: str, text: str, advice: str, line: int | None = None) -> None:
-        """End it with why."""
         self.state, self.fault = "failed", {"code": code, "text": text, "advice": advice, "line": line}
 
 
 @dataclass(slots=True)
 class Job:
-    """One program: its name, where its files are, what is computed of it, and what that has found."""
+    """One program: its name, its files, its computations and their results."""
 
     digest: str
     name: str
@@ -70,12 +68,10 @@ class Job:
 
     @property
     def works(self) -> list[Work]:
-        """What is or was computed."""
         return [self.forecasting, *([self.advising] if self.advising else [])]
 
     @property
     def over(self) -> bool:
-        """Whether nothing more will come of it."""
         return all(work.over for work in self.works)
 
 
@@ -90,14 +86,13 @@ class Desk:
 
     @property
     def jobs(self) -> list[Job]:
-        """The programs that are kept, the newest first."""
         return list(reversed(self._jobs.values()))
 
     def job(self, digest: str) -> Job:
-        """Return a program; Refused where it is not kept (any more)."""
+        """Return a program; Refused if it is not kept (any more)."""
         job = self._jobs.get(digest)
         if job is None:
-            text = "this program is not kept here (any more), the newest are, until fdhil web ends"
+            text = "this program is not kept (any more): only the newest are, until fdhil web ends"
             raise Refused(404, "NotFound", text, "drop its file again")
         return job
 
@@ -111,9 +106,9 @@ class Desk:
         return job.forecast
 
     async def take(self, name: str, content: AsyncIterable[bytes]) -> Job:
-        """Take a program's bytes and have it forecast; the same bytes again are forecast anew, unless they are now.
+        """Store a program's bytes and have it forecast; known bytes are forecast again, unless that is in progress.
 
-        Refused where too many wait, or what came is empty. One that is still being sent takes no place of others.
+        Refused if too many wait, or for an empty file. A program that is still being uploaded does not displace others.
         """
         self._check_room()
         suffix = ".csv" if name.lower().endswith(".csv") else ".ngc"
@@ -130,8 +125,8 @@ class Desk:
             program = folder / f"program{suffix}"
             part.rename(program)
         except OSError as error:
-            text = f"the program cannot be kept ({error.strerror or error}), nothing was computed"
-            raise Refused(507, "DiskFault", text, "free the disk of the temporary files") from None
+            text = f"the program cannot be stored ({error.strerror or error}), nothing was computed"
+            raise Refused(507, "DiskFault", text, "free space on the disk of temporary files") from None
         finally:
             part.unlink(missing_ok=True)
         job = self._jobs[digest] = Job(digest, shown(name), folder, program)
@@ -141,7 +136,7 @@ class Desk:
         return job
 
     def advise(self, digest: str, tolerance_um: float) -> Job:
-        """Have the feeds found that keep a program's path within a tolerance; Refused while there is no forecast."""
+        """Compute the feeds that keep a program's path within a tolerance; Refused while there is no forecast."""
         job = self.job(digest)
         self.forecast(digest)
         if job.advising is None or job.advising.over:
@@ -152,7 +147,7 @@ class Desk:
 
     def _check_room(self) -> None:
         if sum(not work.over for job in self._jobs.values() for work in job.works) > MOST_WAITING:
-            text = f"{MOST_WAITING} programs wait for their turn already, this one was not taken"
+            text = f"{MOST_WAITING} programs are waiting already, this one was not accepted"
             raise Refused(429, "TooMany", text, "wait for one of them, or cancel it")
 
     def _start(self, job: Job, work: Work) -> None:
@@ -170,17 +165,16 @@ class Desk:
                 shutil.rmtree(job.folder, ignore_errors=True)
 
     async def cancel(self, digest: str) -> Job:
-        """End what is computed of a program; what is over stays as it is."""
+        """Cancel the computations of a program; completed ones are kept."""
         job = self.job(digest)
         for work in job.works:
             if work.task is not None and not work.over:
                 work.task.cancel()
                 await asyncio.wait([work.task])
-                work.state = "cancelled"  # one that had not even begun
+                work.state = "cancelled"  # also if it had not begun
         return job
 
     async def close(self) -> None:
-        """End what runs, and drop everything."""
         tasks = [work.task for job in self._jobs.values() for work in job.works if work.task is not None]
         for task in tasks:
             task.cancel()
@@ -197,22 +191,22 @@ class Desk:
                 async with asyncio.timeout(LONGEST_S):
                     await self._compute(job, work)
         except TimeoutError:
-            text = f"{job.name} took longer than {LONGEST_S:.0f} s, nothing is known of it"
-            work.fail("TooLong", text, "cut the program, or use the command line")
+            text = f"{job.name} took longer than {LONGEST_S:.0f} s, there is no result"
+            work.fail("TooLong", text, "shorten the program, or use the command line")
         except OSError as error:
             text = f"the forecast cannot be started ({error.strerror or error})"
             work.fail("InternalError", text, "free memory and processes, then try again")
         except (ValueError, LookupError, TypeError):
-            text = f"the forecast of {job.name} said what is not understood"
+            text = f"the forecast of {job.name} returned an invalid result"
             work.fail("InternalError", text, "report it with the program")
         except asyncio.CancelledError:
             work.state = "cancelled"
 
     async def _compute(self, job: Job, work: Work) -> None:
-        def take(told: Mapping[str, Any]) -> None:
-            if "progress" in told:
-                work.progress = told["progress"]
-            elif error := told.get("error"):
+        def take(message: Mapping[str, Any]) -> None:
+            if "progress" in message:
+                work.progress = message["progress"]
+            elif error := message.get("error"):
                 work.fail(error["code"], error["text"], ADVICE.get(error["code"], ""), error.get("line"))
 
         request = {
@@ -228,7 +222,6 @@ class Desk:
 
 
 async def _conclude(job: Job, work: Work, code: int) -> None:
-    """Take up what the process has left; one that died has left nothing."""
     try:
         if code != 0:
             raise ValueError(code)
@@ -239,15 +232,14 @@ async def _conclude(job: Job, work: Work, code: int) -> None:
         work.state = "done"
     except (OSError, ValueError):
         if code in (-signal.SIGXCPU, -signal.SIGKILL):
-            text = f"{job.name} takes more processor time or memory than a program in a browser may"
-            work.fail("TooLong", text, "cut the program, or use the command line")
+            text = f"{job.name} needs more processor time or memory than allowed for the browser"
+            work.fail("TooLong", text, "shorten the program, or use the command line")
             return
         text = f"the forecast ended with exit code {code} and no result"
-        work.fail("InternalError", text, "see the log of fdhil web, then report it")
+        work.fail("InternalError", text, "check the log of fdhil web, then report it")
 
 
 async def _written(part: Path, content: AsyncIterable[bytes]) -> str:
-    """Write what comes into a file, and return its digest; Refused for nothing."""
     digest, size = hashlib.sha256(), 0
     with part.open("xb") as file:
         async for piece in content:
@@ -260,7 +252,7 @@ async def _written(part: Path, content: AsyncIterable[bytes]) -> str:
 
 
 def shown(name: str) -> str:
-    """Return a file's name as it is shown: its last part, printable, and not too long."""
+    """Return a file name for display: its last part, printable, of limited length."""
     last = name.replace("\\", "/").rpartition("/")[2]
-    kept = "".join(letter for letter in last if letter.isprintable())[:LONGEST_NAME].strip()
-    return kept or "program"
+    printable = "".join(letter for letter in last if letter.isprintable())[:LONGEST_NAME].strip()
+    return printable or "program"

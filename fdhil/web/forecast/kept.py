@@ -1,4 +1,4 @@
-"""A forecast as its process leaves it in a folder: what is told of the whole as JSON, and its rows as arrays."""
+"""The files of a forecast, written by its process: a JSON document, and its rows as arrays."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ BEFORE, AFTER = 0, 1
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """The rows of a program, one a SYNC period: without its correction (``BEFORE``) and with it (``AFTER``).
+    """The rows of a program, one per SYNC period: without correction (``BEFORE``) and with it (``AFTER``).
 
-    ``path_mm`` (n, d) is what the NC will order, ``error_um`` (2, n, d) predicted less ordered of each axis,
-    ``contour_um`` (2, n) the contour error, ``line`` (n,) the program's line, 0 where there is none.
+    ``path_mm`` (n, d) is the NC's demand, ``error_um`` (2, n, d) predicted less demanded position of each axis,
+    ``contour_um`` (2, n) the contour error, ``line`` (n,) the program's line, 0 without one.
     """
 
     document: dict[str, Any]
@@ -32,26 +32,24 @@ class Forecast:
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """The axes, in the order of the columns."""
         return tuple(self.document["axes"])
 
     @property
     def dt_s(self) -> float:
-        """The time from one row to the next."""
         return float(self.document["sync_period_s"])
 
     def actual_mm(self, case: int, rows: slice) -> Float:
-        """Return where the table will be (m, d)."""
+        """Return the predicted table position (m, d)."""
         return np.asarray(self.path_mm[rows] + self.error_um[case, rows] * 1e-3)
 
     def feed_mm_min(self, rows: slice) -> Float:
-        """Return the ordered speed along the path (m,), from each row to the next."""
+        """Return the demanded speed along the path (m,), from each row to the next."""
         first, last, _ = rows.indices(len(self.path_mm))
         return np.asarray(np.linalg.norm(_steps(self.path_mm, first, last), axis=1) / self.dt_s * 60.0)
 
     @staticmethod
     def read(folder: Path) -> Forecast:
-        """Map what a process has left; OSError or ValueError where that is not whole."""
+        """Map the files in a folder. Raises OSError or ValueError if they are incomplete."""
         document = json.loads((folder / DOCUMENT).read_text("utf-8"))
         arrays = (np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in _NAMES)
         return Forecast(document, *arrays)
@@ -61,14 +59,14 @@ _NAMES = ("path_mm", "error_um", "contour_um", "line")
 
 
 def _steps(path_mm: Float, first: int, last: int) -> Float:
-    """Return the way from each row to the next (last - first, d); the last row of all has none to go."""
+    """Return the way from each row to the next (last - first, d); 0 for the last row of all."""
     part = path_mm[first : last + 1]
     steps = np.diff(part, axis=0)
     return steps if len(steps) == last - first else np.vstack([steps, np.zeros((1, part.shape[1]))])
 
 
 def write(folder: Path, document: dict[str, Any], planned: Correction) -> None:
-    """Leave a forecast in a folder, its document last; OSError."""
+    """Write a forecast into a folder, its document last. Raises OSError."""
     cases = (planned.before, planned.after)
     reference = planned.before.reference
     arrays = {
@@ -84,11 +82,11 @@ def write(folder: Path, document: dict[str, Any], planned: Correction) -> None:
 
 
 def write_advice(folder: Path, tolerance_um: float, lines: list[dict[str, Any]]) -> None:
-    """Leave the feeds that keep a tolerance beside the forecast; OSError."""
+    """Write the feeds that keep a tolerance next to the forecast. Raises OSError."""
     (folder / ADVICE).write_text(json.dumps({"tolerance_um": tolerance_um, "lines": lines}, allow_nan=False), "utf-8")
 
 
 def read_advice(folder: Path) -> list[dict[str, Any]]:
-    """Return what was left; OSError or ValueError where that is not whole."""
+    """Return the stored feeds. Raises OSError or ValueError if they are incomplete."""
     lines: list[dict[str, Any]] = json.loads((folder / ADVICE).read_text("utf-8"))["lines"]
     return lines

@@ -1,4 +1,4 @@
-"""What programs have learned, what the daemon measured of the last passes, and the history of all passes."""
+"""Learning curves of programs, the daemon's measurements of the last passes, and the stored passes."""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -15,39 +15,39 @@ _PASS = re.compile(
     rf"pass (\d+) of (.+?): contour error measured {_NUMBER} um RMS, {_NUMBER} at most "
     rf"\(predicted (?:at most {_NUMBER.strip('()')}[^,]*, )?{_NUMBER}[^;]*; without correction {_NUMBER} predicted"
 )
-"""How ``fdhil.arming.passes`` reports a pass: its notice is what the history keeps of it."""
+"""The report of a pass by ``fdhil.arming.passes``, which the history stores as a notice."""
 
 
 def lessons(config: MachineConfig, names: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Return the curve of every program that has learned on this very machine, the newest first.
+    """Return the learning curve of every program that has learned on this machine, the newest first.
 
-    ``names`` are those of known programs by digest. ``curve_um`` is the RMS of the contour error that each pass
-    measured, ``without_um`` that of the last one in which nothing learned was in force.
+    ``names`` maps digests to names of known programs. ``curve_um`` is the measured RMS contour error of each pass,
+    ``without_um`` that of the last pass without learned offsets.
     """
-    told = []
-    for stamp_s, program, lesson in kept_lessons(config.store.directory / "lessons", config.digest)[:SHOWN]:
+    curves = []
+    for stamp_s, program, learned in kept_lessons(config.store.directory / "lessons", config.digest)[:SHOWN]:
         name = next((name for digest, name in names.items() if digest.startswith(program)), None)
-        told.append(
+        curves.append(
             {
                 "program": program,
                 "name": name,
                 "last_s": stamp_s,
-                "passes": len(lesson.curve_um),
-                "curve_um": list(lesson.curve_um),
-                "without_um": lesson.without_um,
-                "gain": lesson.gain,
+                "passes": len(learned.curve_um),
+                "curve_um": list(learned.curve_um),
+                "without_um": learned.without_um,
+                "gain": learned.gain,
             }
         )
-    return told
+    return curves
 
 
 def passes(status: Mapping[str, Any] | None) -> Sequence[Mapping[str, Any]]:
-    """Return the passes that the running daemon has measured, oldest first; none where no daemon runs."""
+    """Return the passes that the running daemon has measured, oldest first; none without a daemon."""
     return [] if status is None else status.get("passes", [])
 
 
 def jobs(notices: Iterable[StoredNotice]) -> Iterator[dict[str, Any]]:
-    """Yield the passes that the history keeps, in the order of its notices; errors in um, RMS but ``max_um``."""
+    """Yield the stored passes in the order of their notices; errors in um, RMS except ``max_um``."""
     for stored in notices:
         found = _PASS.match(stored.notice.text) if stored.notice.code == "PassMeasured" else None
         if found is not None:

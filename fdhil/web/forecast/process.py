@@ -1,8 +1,8 @@
-"""Forecasts a program that came from a browser: its path error without and with the correction, or feeds for it.
+"""Forecasts a program from the browser: its path error without and with correction, or advised feeds.
 
-A process of its own (``python -m fdhil.web.forecast.process``, one JSON request on stdin), at low priority and with
-bounded time, memory and disk: whatever the program is, neither the daemon nor the pages wait for it. It reads the
-history and writes into the folder that it is given; nothing is sent to any machine.
+Runs as a child process (``python -m fdhil.web.forecast.process``, one JSON request on stdin), at low priority and with
+limited time, memory and disk, so that no program can delay the daemon or the pages. It reads the history and writes
+into the given folder; nothing is sent to any machine.
 """
 
 import itertools
@@ -33,7 +33,7 @@ from fdhil.store.newest_sets import read_newest_sets
 from fdhil.web.forecast import kept
 
 MOST_ROWS = 600_000
-"""Ten minutes at 1 kHz: they take six seconds and half a gigabyte; the unit of the pages has one."""
+"""Ten minutes at 1 kHz, which take six seconds and half a gigabyte; the systemd unit allows one."""
 MOST_ZONES = 20
 NICENESS = 15
 LIMITS = {resource.RLIMIT_CPU: 300, resource.RLIMIT_AS: 6 << 30, resource.RLIMIT_FSIZE: 1 << 30}
@@ -41,17 +41,17 @@ LIMITS = {resource.RLIMIT_CPU: 300, resource.RLIMIT_AS: 6 << 30, resource.RLIMIT
 Tell = Callable[[Mapping[str, Any]], None]
 
 
-def forecast(program: Path, name: str, config: MachineConfig, folder: Path, tell: Tell) -> None:
-    """Read, predict and correct one program with the newest parameters, and leave the result in ``folder``.
+def forecast(program: Path, name: str, config: MachineConfig, folder: Path, report_progress: Tell) -> None:
+    """Read, predict and correct one program with the newest parameters, and write the result into ``folder``.
 
-    FdhilError where it cannot be judged; OSError where the result cannot be written.
+    Raises FdhilError if it cannot be judged, OSError if the result cannot be written.
     """
-    tell({"step": "read"})
+    report_progress({"step": "read"})
     reference = load(program, name, config)
     models, parameters, config = newest_models(reference, config)
-    tell({"step": "correct", "rows": reference.time_s.size})
+    report_progress({"step": "correct", "rows": reference.time_s.size})
     planned = correction.plan(reference, models, config)
-    predicted = known_gain(planned, models, config, any(told["revision"] for told in parameters.values()))
+    predicted = known_gain(planned, models, config, any(state["revision"] for state in parameters.values()))
     document = correction_document(name, planned, predicted, models) | {
         "rows": reference.time_s.size,
         "sync_period_s": reference.dt_s,
@@ -64,12 +64,14 @@ def forecast(program: Path, name: str, config: MachineConfig, folder: Path, tell
         "zones_in_all": len(planned.before.zones),
         "scale": _scale(planned),
     }
-    tell({"step": "write"})
+    report_progress({"step": "write"})
     kept.write(folder, document, planned)
 
 
-def advice(program: Path, name: str, config: MachineConfig, tolerance_um: float, tell: Tell) -> list[dict[str, Any]]:
-    """Return the lines that leave a tolerance, with the feeds that keep it, as ``fdhil advise --json`` has them."""
+def advice(
+    program: Path, name: str, config: MachineConfig, tolerance_um: float, report_progress: Tell
+) -> list[dict[str, Any]]:
+    """Return the lines that exceed a tolerance with the feeds that keep it, as in ``fdhil advise --json``."""
     reference = load(program, name, config)
     models, _, config = newest_models(reference, config)
     motions = None if program.suffix == ".csv" else list(interpret(_lines(program), Budget.of(config.nc)))
@@ -77,7 +79,7 @@ def advice(program: Path, name: str, config: MachineConfig, tolerance_um: float,
 
     def telling(source: Source) -> Source:
         def at(shares: Mapping[int, float]) -> Trajectory:
-            tell({"step": "advise", "trial": next(trials)})
+            report_progress({"step": "advise", "trial": next(trials)})
             return source.at(shares)
 
         return replace(source, at=at)
@@ -88,15 +90,15 @@ def advice(program: Path, name: str, config: MachineConfig, tolerance_um: float,
 
 
 def load(program: Path, name: str, config: MachineConfig) -> Trajectory:
-    """Return what the NC will order; FdhilError for a program that is faulty or too long.
+    """Return the NC's demand. Raises FdhilError if the program is faulty or too long.
 
-    An NC program is read as lines of text, by which it has no folder: no word in it opens another file.
+    An NC program is read as lines of text, without a folder, so that it cannot open other files.
     """
     if program.suffix == ".csv":
         reference = read_demand_csv(program, config)
         if reference.time_s.size > MOST_ROWS:
             minutes = MOST_ROWS * config.machine.sync_period_s / 60
-            text = f"{name} lasts longer than the {minutes:.0f} minutes that are judged in a browser"
+            text = f"{name} lasts longer than the {minutes:.0f} minutes allowed in the browser"
             raise ProgramError(0, "", f"{text}; use fdhil correct")
         return reference
     return planner.plan(interpret(_lines(program), Budget.of(config.nc)), config, MOST_ROWS)
@@ -110,30 +112,30 @@ def _lines(program: Path) -> Iterator[str]:
 def newest_models(
     reference: Trajectory, config: MachineConfig
 ) -> tuple[dict[str, Parameters], dict[str, dict[str, Any]], MachineConfig]:
-    """Return the model of each axis, what is known of it, and the configuration with the loops it was validated with.
+    """Return the model of each axis, its revision and age, and the configuration with its validated regulators.
 
     The models are the history's newest, else the data sheet's values.
     """
     given = nominal_models(config)
-    told: dict[str, dict[str, Any]] = {axis: {"revision": 0, "age_s": None} for axis in config.axis}
+    states: dict[str, dict[str, Any]] = {axis: {"revision": 0, "age_s": None} for axis in config.axis}
     newest, source = read_newest_sets(config.store.directory, config.axis), str(config.store.directory)
     for axis, revision in newest.items():
-        told[axis] = {"revision": revision.set.revision, "age_s": round(revision.stamp.age_s(), 1)}
+        states[axis] = {"revision": revision.set.revision, "age_s": round(revision.stamp.age_s(), 1)}
     models, config = validated_models({axis: revision.set for axis, revision in newest.items()}, config, source)
-    return models_for(reference, given | models, config, source), told, config
+    return models_for(reference, given | models, config, source), states, config
 
 
 def zones(planned: Correction) -> list[dict[str, Any]]:
-    """Return the largest zones, the worst first; ``place`` numbers those that the map names, in the path's order."""
+    """Return the largest zones, the worst first; ``place`` numbers those labelled in the map, in path order."""
     before, after = planned.before, planned.after
     reference = before.reference
     numbers = {row: k for k, (_, row) in enumerate(worst_places(before), 1)}
     largest = sorted(before.zones, key=lambda zone: -zone.max_um)
     listed = [zone for k, zone in enumerate(largest) if k < MOST_ZONES or before.worst_row(zone) in numbers]
-    told = []
+    documents = []
     for zone in listed:
         row = before.worst_row(zone)
-        told.append(
+        documents.append(
             {
                 "place": numbers.get(row),
                 "row": row,
@@ -148,7 +150,7 @@ def zones(planned: Correction) -> list[dict[str, Any]]:
                 "after_um": float(after.contour_um[before.rows(zone)].max()),
             }
         )
-    return told
+    return documents
 
 
 def _feed_mm_min(reference: Trajectory, row: int) -> float:
@@ -157,7 +159,6 @@ def _feed_mm_min(reference: Trajectory, row: int) -> float:
 
 
 def _scale(planned: Correction) -> dict[str, float | None]:
-    """Return one scale of colours for both; ``least_um`` where it is logarithmic."""
     largest_um, least_um = common_scale([planned.before.contour_um, planned.after.contour_um])
     return {"largest_um": max(largest_um, LEAST_UM), "least_um": least_um}
 
@@ -167,14 +168,13 @@ def _reach(reference: Trajectory) -> dict[str, list[float]]:
 
 
 def _single(reference: Trajectory) -> list[tuple[str, str]]:
-    """Return the plane of a path in which at most one axis moves."""
     moving = max(reference.table_axes, key=lambda axis: float(np.ptp(reference.position_mm[axis])))
     other = next((axis for axis in reference.table_axes if axis != moving), moving)
     return [(moving, other)]
 
 
 def main() -> None:
-    """Answer the one request; each line that is written is a JSON object, the last one is the answer."""
+    """Answer one request; each output line is a JSON object, the last one is the answer."""
     limit_process(NICENESS, LIMITS)
     request = receive_request()
     program, name = Path(request["program"]), str(request["name"])
@@ -183,18 +183,18 @@ def main() -> None:
         config = MachineConfig.model_validate(request["config"])
         tolerance_um = request["tolerance_um"]
         if tolerance_um is None:
-            forecast(program, name, config, Path(request["folder"]), lambda told: report({"progress": told}))
+            forecast(program, name, config, Path(request["folder"]), lambda progress: report({"progress": progress}))
         else:
-            lines = advice(program, name, config, tolerance_um, lambda told: report({"progress": told}))
+            lines = advice(program, name, config, tolerance_um, lambda progress: report({"progress": progress}))
             kept.write_advice(Path(request["folder"]), tolerance_um, lines)
     except FdhilError as error:
         line = getattr(error, "line", None)
         report({"error": {"code": type(error).__name__, "text": str(error).replace(str(program), name), "line": line}})
     except MemoryError:
-        text = f"{name} takes more memory than a browser's program may; cut it"
+        text = f"{name} needs more memory than allowed for the browser; shorten it"
         report({"error": {"code": "TooLarge", "text": text}})
     except OSError as error:
-        text = f"the result cannot be written ({error.strerror or error}); free the disk"
+        text = f"the result cannot be written ({error.strerror or error}); free disk space"
         report({"error": {"code": "DiskFault", "text": text}})
 
 

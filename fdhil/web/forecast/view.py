@@ -1,4 +1,4 @@
-"""What a browser draws of a forecast: the whole or a part of its path, by as few points as tell the same."""
+"""Reduces a forecast to what a browser draws: all or a part of its path, by the fewest points that look the same."""
 
 import heapq
 from collections.abc import Mapping, Sequence
@@ -13,19 +13,19 @@ from fdhil.records import Bool, Float, Int
 from fdhil.web.forecast.kept import AFTER, BEFORE, Forecast
 
 MOST_POINTS = 5000
-WHOLE_ROWS = 3000  # up to which every row is told, with where the table will be
-MOST_ROWS = 400_000  # that are looked at in one view
-STRETCH = 4096  # rows that are looked at as one
-FINE = 1 / 1500  # of the view: nobody sees less
-SHADE = 0.03  # of the scale of colours
+WHOLE_ROWS = 3000  # up to which every row is sent, with the predicted table path
+MOST_ROWS = 400_000  # examined in one view
+STRETCH = 4096  # rows simplified at once
+FINE = 1 / 1500  # of the view: the smallest visible distance
+SHADE = 0.03  # of the colour scale
 FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-SEEN = 0.15  # of the view that the largest error may take
-BESIDE = 0.1  # of the view, around it
+SEEN = 0.15  # of the view, for the largest error
+BESIDE = 0.1  # of the view, as a margin around it
 MOST_COURSE = 1500
 
 
 class Box(NamedTuple):
-    """A part of a plane, mm."""
+    """A rectangle in a plane, mm."""
 
     left: float
     right: float
@@ -34,17 +34,17 @@ class Box(NamedTuple):
 
 
 def plane_of(forecast: Forecast, asked: Sequence[str]) -> tuple[int, int]:
-    """Return the columns of a plane; ValueError where it is none of this machine's."""
+    """Return the columns of a plane's axes. Raises ValueError for an unknown axis."""
     across, along = (forecast.axes.index(axis) for axis in asked)
     return across, along
 
 
 def view(forecast: Forecast, plane: tuple[int, int], box: Box | None, factor: float) -> dict[str, Any]:
-    """Return the path inside ``box`` (None: all of it) as runs of points, each with what follows it until the next.
+    """Return the path inside ``box`` (None: all of it) as runs of points, each with the figures up to the next.
 
-    A run's ``before_um`` and ``after_um`` are the largest contour errors of each piece. Where few rows are inside they
-    are all told, ``whole``, and with them where the table will be, its distance from the path ``factor`` times as far:
-    0 for as far as the view has room for.
+    A run's ``before_um`` and ``after_um`` are the largest contour errors of each piece. With few rows inside, all are
+    returned (``whole``) together with the predicted table path, its distance from the path enlarged by ``factor`` (0:
+    as far as the view has room).
     """
     flat = _flat(forecast, plane)
     inside = _inside(flat, box)
@@ -58,15 +58,14 @@ def view(forecast: Forecast, plane: tuple[int, int], box: Box | None, factor: fl
         rows = np.arange(first, last)[::step]
         most = max(8, MOST_POINTS * rows.size * step // max(1, count))
         points = rows if whole else rows[knots(_seen(forecast, flat, rows, size_mm), most)]
-        told = _run(forecast, flat, points, last)
+        run = _run(forecast, flat, points, last)
         if whole:
-            told |= {"table": [_table(forecast, plane, slice(first, last), case, factor) for case in (BEFORE, AFTER)]}
-        runs.append(told)
+            run |= {"table": [_table(forecast, plane, slice(first, last), case, factor) for case in (BEFORE, AFTER)]}
+        runs.append(run)
     return {"rows": count, "whole": whole, "factor": factor, "runs": runs}
 
 
 def _fitting(forecast: Forecast, inside: Bool, size_mm: float) -> float:
-    """Return how many times as far the table may be drawn from the path, so that the largest error is seen."""
     largest_mm = float(np.max(forecast.contour_um[BEFORE], where=inside, initial=0.0)) * 1e-3
     return float(max(f for f in FACTORS if f == 1 or f * largest_mm <= SEEN * size_mm))
 
@@ -79,27 +78,25 @@ def _flat(forecast: Forecast, plane: tuple[int, int]) -> Float:
 
 
 def _inside(flat: Float, box: Box | None) -> Bool:
-    """Return the rows (n,) inside a box and a little around it."""
     if box is None:
         return np.ones(len(flat), dtype=np.bool_)
     across, along = BESIDE * (box.right - box.left), BESIDE * (box.top - box.bottom)
     low = np.array([box.left - across, box.bottom - along])
     high = np.array([box.right + across, box.top + along])
     inside = np.asarray(np.all((flat >= low) & (flat <= high), axis=1))
-    # a step that crosses the edge of the view is drawn to its other end
+    # a step across the edge of the view is drawn completely
     inside[:-1] |= inside[1:].copy()
     inside[1:] |= inside[:-1].copy()
     return inside
 
 
 def _runs(inside: Bool) -> list[tuple[int, int]]:
-    """Return first row and end of each run of rows that are inside."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(np.int8)))
     return [(int(first), int(last)) for first, last in edges.reshape(-1, 2)]
 
 
 def _seen(forecast: Forecast, flat: Float, rows: Int, size_mm: float) -> Float:
-    """Return the rows (m, 4) as they are seen, place and both colours, in units of the least that anyone sees."""
+    """Return the rows (m, 4), position and both colours, in units of the smallest visible difference."""
     scale = forecast.document["scale"]
     least_um, largest_um = scale["least_um"], max(scale["largest_um"], 1e-6)
     errors = np.asarray(forecast.contour_um[:, rows], dtype=np.float64)
@@ -113,30 +110,30 @@ def _seen(forecast: Forecast, flat: Float, rows: Int, size_mm: float) -> Float:
 
 
 def knots(seen: Float, most: int) -> Int:
-    """Return the rows (k,) at which a path (m, d) is cut into straight pieces that are off by less than 1 nowhere.
+    """Return the rows (k,) that divide a path (m, d) into straight pieces with deviations below 1.
 
-    The path is taken over its way. The piece that is farthest off is cut first, so that ``most`` points are the best
-    that so few can tell [Douglas, Peucker 1973, with the way as the parameter].
+    The path is parametrised by its length. The piece with the largest deviation is divided first, so that ``most``
+    points are the best possible [Douglas, Peucker 1973, with the length as the parameter].
     """
     end = len(seen) - 1
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(seen[:, :2], axis=0).T))])
-    kept = {0, end, *range(STRETCH, end, STRETCH)}
-    starts = sorted(kept)
+    knot_rows = {0, end, *range(STRETCH, end, STRETCH)}
+    starts = sorted(knot_rows)
     waiting = [_worst(seen, way, first, last) for first, last in pairwise(starts)]
     heapq.heapify(waiting)
-    while waiting and len(kept) < most:
+    while waiting and len(knot_rows) < most:
         off, first, at, last = heapq.heappop(waiting)
         if -off < 1.0:
             break
-        kept.add(at)
+        knot_rows.add(at)
         for begin, stop in ((first, at), (at, last)):
             if stop - begin > 1:
                 heapq.heappush(waiting, _worst(seen, way, begin, stop))
-    return np.array(sorted(kept))
+    return np.array(sorted(knot_rows))
 
 
 def _worst(seen: Float, way: Float, first: int, last: int) -> tuple[float, int, int, int]:
-    """Return how far a piece is off at most, below 0 for a heap, its first row, where that is, and its last row."""
+    """Return the negative of a piece's largest deviation (for a heap), its first row, that row, and its last row."""
     length = way[last] - way[first]
     share = (way[first : last + 1] - way[first]) / length if length > 0 else np.linspace(0, 1, last - first + 1)
     chord = seen[first] + share[:, None] * (seen[last] - seen[first])
@@ -146,7 +143,6 @@ def _worst(seen: Float, way: Float, first: int, last: int) -> tuple[float, int, 
 
 
 def _run(forecast: Forecast, flat: Float, points: Int, last: int) -> dict[str, Any]:
-    """Return points of the path, with the largest errors and the largest feed until the next of them."""
     first = int(points[0])
     starts = points - first
     before, after = (
@@ -167,7 +163,6 @@ def _run(forecast: Forecast, flat: Float, points: Int, last: int) -> dict[str, A
 def _table(
     forecast: Forecast, plane: tuple[int, int], rows: slice, case: int, factor: float
 ) -> Mapping[str, list[float]]:
-    """Return where the table will be, its distance from the path enlarged."""
     margin = round(WINDOW_S / forecast.dt_s)
     around = slice(max(0, rows.start - margin), rows.stop + margin)
     actual = forecast.actual_mm(case, rows)
@@ -180,7 +175,7 @@ def _table(
 
 
 def course(forecast: Forecast, first: int, last: int) -> dict[str, Any]:
-    """Return the contour errors and the feed over time, the largest of each of at most ``MOST_COURSE`` stretches."""
+    """Return contour errors and feed over time, the largest of each of at most ``MOST_COURSE`` intervals."""
     starts = np.arange(0, last - first, max(1, -(-(last - first) // MOST_COURSE)))
     before, after = (
         np.maximum.reduceat(np.asarray(forecast.contour_um[case, first:last]), starts) for case in (BEFORE, AFTER)
@@ -194,7 +189,7 @@ def course(forecast: Forecast, first: int, last: int) -> dict[str, Any]:
 
 
 def line_place(forecast: Forecast, line: int) -> dict[str, Any] | None:
-    """Return where a line of the program has its largest error, and how far it goes; None where it orders nothing."""
+    """Return where a program line has its largest error, and its extent; None if it orders no motion."""
     rows = np.flatnonzero(np.asarray(forecast.line) == line)
     if rows.size == 0:
         return None
@@ -215,5 +210,5 @@ def line_place(forecast: Forecast, line: int) -> dict[str, Any] | None:
 
 
 def rounded(values: npt.ArrayLike, decimals: int) -> list[float]:
-    """Return values as JSON has them, no longer than they are worth."""
+    """Return values as JSON data, without excess digits."""
     return [float(value) for value in (np.round(np.asarray(values, dtype=np.float64), decimals) + 0.0).tolist()]

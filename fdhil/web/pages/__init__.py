@@ -1,1 +1,1 @@
-"""What the pages ask for, one file a page: its ``router`` (under /api/NAME) and the documents that it answers with."""
+"""The API of the pages, one file a page: its ``router`` (under /api/NAME) and its documents."""

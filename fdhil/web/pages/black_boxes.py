@@ -1,4 +1,4 @@
-"""The black boxes as the browser has them: which there are, and the envelope of what the drives did in one."""
+"""The black boxes for the browser: their list, and the envelope of the drives' signals in one of them."""
 
 import math
 from pathlib import Path
@@ -12,14 +12,14 @@ from fdhil.daemon.blackbox import FOLDER, kept
 from fdhil.drivers.cia402.candump_samples import LARGEST_LOG, samples_of_log
 from fdhil.records import AxisSamples, Float
 from fdhil.store.named_file import open_named
+from fdhil.web.pages.rapid_signals import round_digits
 
 COLUMNS = 400
-"""Of an envelope: of each the least and the greatest are kept, so that no peak is lost."""
-DIGITS = 6
+"""Columns of an envelope: minimum and maximum of each are kept, so that no peak is lost."""
 
 
 class BlackBox(BaseModel):
-    """The frames of the seconds around a trip: its file, when it was written, what the trip's class was."""
+    """The frames of the seconds around a trip: its file, its time, and the trip's code."""
 
     name: str
     time: str
@@ -28,7 +28,7 @@ class BlackBox(BaseModel):
 
 
 class Signal(BaseModel):
-    """The least and the greatest value of each column of time; null where no sample came."""
+    """The minimum and maximum in each column of time; null without samples."""
 
     name: str
     unit: str
@@ -37,7 +37,7 @@ class Signal(BaseModel):
 
 
 class AxisEnvelope(BaseModel):
-    """What one axis did; ``time_s`` is before the end of the log."""
+    """The signals of one axis; ``time_s`` is relative to the end of the log."""
 
     axis: str
     time_s: list[float]
@@ -47,14 +47,14 @@ class AxisEnvelope(BaseModel):
 
 
 class Envelope(BaseModel):
-    """What the drives did in a black box."""
+    """The drives' signals in a black box."""
 
     name: str
     axes: list[AxisEnvelope]
 
 
 def listed(store: Path) -> list[BlackBox]:
-    """Return the black boxes of a store, newest first; a file of another name is none."""
+    """Return the black boxes of a store, newest first; files with other names are ignored."""
     return [
         BlackBox(
             name=box.path.name,
@@ -67,12 +67,12 @@ def listed(store: Path) -> list[BlackBox]:
 
 
 def opened(store: Path, name: str) -> BinaryIO:
-    """Open a black box by a name from outside. StoreError when it is none."""
+    """Open a black box by a name from outside. Raises StoreError if it is none."""
     return open_named(store / FOLDER, name)
 
 
 def envelope(store: Path, name: str, config: MachineConfig) -> Envelope:
-    """Return what the drives did in a black box. StoreError, RecordingError."""
+    """Return the drives' signals in a black box. Raises StoreError, RecordingError."""
     with opened(store, name) as file:
         found = samples_of_log(file.read(LARGEST_LOG + 1), config)
     last = max((int(samples.tick[-1]) for samples in found.values()), default=0)
@@ -96,7 +96,7 @@ def _axis(samples: AxisSamples, last_tick: int, period_s: float) -> AxisEnvelope
     time_s: Float = np.asarray((first + column[starts] * per - last_tick) * period_s, np.float64)
     return AxisEnvelope(
         axis=samples.axis,
-        time_s=_short(time_s),
+        time_s=round_digits(time_s),
         samples=samples.tick.size,
         lost_frames=samples.lost,
         signals=[
@@ -107,10 +107,6 @@ def _axis(samples: AxisSamples, last_tick: int, period_s: float) -> AxisEnvelope
 
 
 def _least(values: Float, starts: Any, sign: float) -> list[float | None]:
-    """Return the least (``sign`` 1) or the greatest (-1) of each column."""
+    """Return the minimum (``sign`` 1) or the maximum (-1) of each column."""
     least: Float = np.fmin.reduceat(sign * values, starts)
-    return _short(sign * least)
-
-
-def _short(values: Float) -> list[Any]:
-    return [float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None for value in values.tolist()]
+    return round_digits(sign * least)

@@ -1,4 +1,4 @@
-"""Alarms and notices as the browser has them: active alarms first, each with cause, effect and next action."""
+"""Alarms and notices for the browser: active alarms first, each with cause, effect and next action."""
 
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -16,7 +16,7 @@ Severity = Literal["info", "minor", "MAJOR"]
 
 
 class Acknowledged(BaseModel):
-    """Who answered for a notice, when, and what was remarked."""
+    """Who acknowledged a notice, when, and with which note."""
 
     who: str
     time: str
@@ -24,7 +24,7 @@ class Acknowledged(BaseModel):
 
 
 class Event(BaseModel):
-    """A notice: what happened, its cause alone, what it means for the machine, what to do next."""
+    """A notice: its text, and separately its cause, its effect on the machine, and the next action."""
 
     number: int
     time: str
@@ -48,7 +48,7 @@ class Earlier(BaseModel):
 
 
 class Waiting(BaseModel):
-    """An alarm that is active or waits: its newest notice, the ``numbers`` of those that wait, what the others said.
+    """An alarm that is active or unacknowledged: its newest notice, the unacknowledged ``numbers``, earlier ones.
 
     ``until`` is when its cause ended, null while it is active; it was raised ``count`` times since ``first_time``.
     """
@@ -63,10 +63,10 @@ class Waiting(BaseModel):
 
 
 class Events(BaseModel):
-    """Alarms that are active or wait, the most urgent first; a page of the other notices, newest first.
+    """Active and unacknowledged alarms, the most urgent first; a page of the other notices, newest first.
 
-    The end of an alarm is no notice of its own here, but where severity info is asked for. ``older_before`` asks for
-    the next page, null at the oldest.
+    The end of an alarm is listed as a notice only with severity info. ``older_before`` requests the next page, null at
+    the oldest.
     """
 
     waiting: list[Waiting]
@@ -80,16 +80,16 @@ class Events(BaseModel):
 
 
 def event(stored: StoredNotice, until: Stamp | None = None) -> Event:
-    """Return a notice with the words that explain it, and when its cause ended."""
+    """Return a notice with its explanation, and when its cause ended."""
     effect, action = words_of(stored.notice)
     text = stored.notice.text
-    cause = text.partition(f"; {effect}")[0] if effect else text  # the guard's own sentence tells all three
+    cause = text.partition(f"; {effect}")[0] if effect else text  # the guard's own text contains all three
     ended = None if until is None else date_of(until)
     return Event(**notice_document(stored), cause=cause, effect=effect, action=action, until=ended)
 
 
 def page(notices: Sequence[StoredNotice], *, limit: int, before: int | None = None, **only: Any) -> Events:
-    """Return the notices that are as ``only`` says (axis, code, severity; None: any), oldest first as they are given.
+    """Return the notices that match ``only`` (axis, code, severity; None: any); ``notices`` are oldest first.
 
     Without a severity those of severity info are left out.
     """
@@ -116,7 +116,9 @@ def page(notices: Sequence[StoredNotice], *, limit: int, before: int | None = No
 
 def _together(alarm: Alarm) -> Waiting:
     documents = [notice_document(stored) for stored in list(alarm.raised)[::-1]]
-    earlier = [{key: told[key] for key in ("number", "time", "text")} for told in documents[1 : MOST_EARLIER + 1]]
+    earlier = [
+        {key: document[key] for key in ("number", "time", "text")} for document in documents[1 : MOST_EARLIER + 1]
+    ]
     return Waiting(
         newest=event(alarm.newest),
         state=alarm.state,
@@ -124,7 +126,7 @@ def _together(alarm: Alarm) -> Waiting:
         count=alarm.count,
         numbers=sorted(alarm.waiting, reverse=True)[:MOST_TOGETHER],
         first_time=date_of(alarm.first),
-        earlier=[Earlier(**told) for told in earlier],
+        earlier=[Earlier(**document) for document in earlier],
     )
 
 

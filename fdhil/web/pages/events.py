@@ -1,4 +1,4 @@
-"""Alarms with cause, effect and next action, who acknowledged them, and the black boxes."""
+"""Alarms with cause, effect and next action, their acknowledgements, and the black boxes."""
 
 from typing import Annotated
 
@@ -9,7 +9,7 @@ from pydantic import BaseModel, Field
 from fdhil.daemon.notice_book import MOST_NOTE
 from fdhil.store.history import RECENT_NOTICES
 from fdhil.web.answers import granted
-from fdhil.web.context import Asking, Here
+from fdhil.web.context import MachineDependency, PrincipalDependency
 from fdhil.web.file_answer import FileAnswer
 from fdhil.web.pages.black_boxes import BlackBox, Envelope, envelope, listed, opened
 from fdhil.web.pages.event_list import MOST_PAGE, Events, Severity, page
@@ -20,7 +20,7 @@ Number = Annotated[int, Field(ge=1, le=LARGEST_NUMBER)]
 
 
 class Acknowledgement(BaseModel):
-    """Which notices somebody has seen: by their numbers, or all that wait up to one."""
+    """The notices to acknowledge: by their numbers, or all unacknowledged ones up to a number."""
 
     notices: Annotated[list[Number], Field(max_length=1000)] | None = None
     up_to: Number | None = None
@@ -28,7 +28,7 @@ class Acknowledgement(BaseModel):
 
 
 class Done(BaseModel):
-    """What was acknowledged now, in words and by number."""
+    """What was acknowledged, as text and by number."""
 
     ok: bool
     text: str
@@ -37,39 +37,39 @@ class Done(BaseModel):
 
 @router.get("")
 def events(
-    here: Here,
+    context: MachineDependency,
     axis: Annotated[str | None, Query(max_length=32)] = None,
     code: Annotated[str | None, Query(max_length=64)] = None,
     severity: Severity | None = None,
     before: Annotated[int | None, Query(ge=1, le=LARGEST_NUMBER)] = None,
     limit: Annotated[int, Query(ge=1, le=MOST_PAGE)] = 50,
 ) -> Events:
-    """Return the newest notices, those that wait to be acknowledged in front."""
-    with here.history() as history:
+    """Return the newest notices, the unacknowledged ones first."""
+    with context.history() as history:
         notices = history.notices(limit=RECENT_NOTICES)
     return page(notices, limit=limit, before=before, axis=axis, code=code, severity=severity)
 
 
 @router.post("/acknowledge")
-async def acknowledge(wanted: Acknowledgement, here: Here, asking: Asking) -> Done:
-    """Tell the daemon that somebody has seen notices: who is logged in, and the time, are kept with them."""
-    request = {"request": "acknowledge", **wanted.model_dump(exclude_none=True), "by": asking.name}
-    return Done.model_validate(granted(await here.daemon.ask(request)))
+async def acknowledge(wanted: Acknowledgement, context: MachineDependency, principal: PrincipalDependency) -> Done:
+    """Acknowledge notices; the daemon stores the user and the time."""
+    request = {"request": "acknowledge", **wanted.model_dump(exclude_none=True), "by": principal.name}
+    return Done.model_validate(granted(await context.daemon.ask(request)))
 
 
 @router.get("/black-boxes")
-def black_boxes(here: Here) -> list[BlackBox]:
-    """Return which black boxes are kept, newest first."""
-    return listed(here.config.store.directory)
+def black_boxes(context: MachineDependency) -> list[BlackBox]:
+    """Return the stored black boxes, newest first."""
+    return listed(context.config.store.directory)
 
 
 @router.get("/black-boxes/{name}")
-def black_box(name: str, here: Here) -> Envelope:
-    """Return the envelope of what the drives did in a black box."""
-    return envelope(here.config.store.directory, name, here.config)
+def black_box(name: str, context: MachineDependency) -> Envelope:
+    """Return the envelope of the drives' signals in a black box."""
+    return envelope(context.config.store.directory, name, context.config)
 
 
 @router.get("/black-boxes/{name}/file", response_class=Response)
-def black_box_file(name: str, here: Here) -> Response:
-    """Return a black box as it is: a log that candump's tools read."""
-    return FileAnswer(opened(here.config.store.directory, name), name, "text/plain; charset=us-ascii")
+def black_box_file(name: str, context: MachineDependency) -> Response:
+    """Return a black box as a file: a log for candump's tools."""
+    return FileAnswer(opened(context.config.store.directory, name), name, "text/plain; charset=us-ascii")

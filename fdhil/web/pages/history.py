@@ -1,4 +1,4 @@
-"""How the drives are and how their parameters moved: against time and temperature, with intervals and limits."""
+"""The drives' state and parameter trends: over time and temperature, with intervals and limits."""
 
 from collections.abc import Callable
 from typing import Annotated, Any
@@ -8,7 +8,7 @@ from fastapi import APIRouter, Depends, Request
 from fdhil.report.history_reading import read_axes, read_notices
 from fdhil.report.history_verdict import Refusals
 from fdhil.web.answers import Refused
-from fdhil.web.context import Context, Here
+from fdhil.web.context import Context, MachineDependency
 from fdhil.web.pages.history_courses import axis_document, axis_line, newest_first
 
 router = APIRouter(prefix="/api/history")
@@ -25,45 +25,42 @@ async def _documents(request: Request) -> Documents:
     return found
 
 
-Made = Annotated[Documents, Depends(_documents)]
-"""By axis (None: all of them) the rows of the history and the document that was made of them."""
+DocumentCache = Annotated[Documents, Depends(_documents)]
+"""Cached documents by axis (None: all of them), with the newest row numbers that they were made from."""
 
 
 @router.get("")
-def axes(here: Here, made: Made) -> dict[str, Any]:
-    """Return how each axis is, in a few words."""
-    return _kept(here, made, None, lambda: _overview(here))
+def axes(context: MachineDependency, cache: DocumentCache) -> dict[str, Any]:
+    """Return the state of each axis in a few words."""
+    return _kept(context, cache, None, lambda: _overview(context))
 
 
 @router.get("/{axis}")
-def course(axis: str, here: Here, made: Made) -> dict[str, Any]:
-    """Return all that the history tells of one axis: its courses, limits, changes, published sets and notices."""
-    return _kept(here, made, axis, lambda: _of_axis(here, axis))
+def course(axis: str, context: MachineDependency, cache: DocumentCache) -> dict[str, Any]:
+    """Return the history of one axis: its trends, limits, changes, published sets and notices."""
+    return _kept(context, cache, axis, lambda: _of_axis(context, axis))
 
 
-def _kept(here: Context, made: Documents, about: str | None, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """Return a document; one that was made of the same rows is not made again. StoreError."""
-    with here.history() as history:
+def _kept(context: Context, cache: Documents, about: str | None, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    with context.history() as history:
         rows = history.newest_rows()
-    known = made.get(about)
+    known = cache.get(about)
     if known is None or known[0] != rows:
         known = rows, make()
-        made[about] = known  # of axes that there are: others are refused in ``make``
+        cache[about] = known  # only of existing axes: others are refused in ``make``
     return known[1]
 
 
-def _overview(here: Context) -> dict[str, Any]:
-    histories, refused = read_axes(here.config)
+def _overview(context: Context) -> dict[str, Any]:
+    histories, refused = read_axes(context.config)
     return {"axes": [axis_line(history, refused.get(history.axis, Refusals())) for history in histories]}
 
 
-def _of_axis(here: Context, axis: str) -> dict[str, Any]:
-    histories, refused = read_axes(here.config, axis, NEWEST_REVISIONS)
+def _of_axis(context: Context, axis: str) -> dict[str, Any]:
+    histories, refused = read_axes(context.config, axis, NEWEST_REVISIONS)
     names = [history.axis for history in histories]
     if axis not in names:
-        raise Refused(
-            404, "NoSuchAxis", f"nothing is known of an axis {axis[:32]!r}", f"it is one of {', '.join(names)}"
-        )
+        raise Refused(404, "NoSuchAxis", f"there is no axis {axis[:32]!r}", f"use one of {', '.join(names)}")
     history, of_axis = histories[names.index(axis)], refused.get(axis, Refusals())
-    notices = newest_first(read_notices(here.config, axis), MOST_NOTICES)
-    return {"axes": names, **axis_document(here.config, history, of_axis), "notices": notices}
+    notices = newest_first(read_notices(context.config, axis), MOST_NOTICES)
+    return {"axes": names, **axis_document(context.config, history, of_axis), "notices": notices}

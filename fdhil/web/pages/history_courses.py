@@ -1,4 +1,4 @@
-"""What the browser shows of the drives' history: how each is, and the course of each parameter. Reads only."""
+"""The drives' history for the browser: the state of each axis, and the trend of each parameter. Reads only."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
@@ -16,21 +16,21 @@ MOST_REVISIONS = 50
 MOST_ESTIMATES = 50
 LINE_COLOUR = 3
 LATEST = ("parameter", "latest", "unit", "nominal", "beside_nominal", "since_first", "may_change_by", "limit")
-"""What each cell of :func:`fdhil.report.history_verdict.latest_rows` is."""
+"""The names of the cells of :func:`fdhil.report.history_verdict.latest_rows`."""
 State = Literal["good", "warn", "bad", "none"]
 
 
 def state_of(history: AxisHistory, refused: Refusals) -> State:
-    """Return how an axis is in one word: in order, to be looked at, at a limit, or not known."""
+    """Return the state of an axis: good, to be checked, at a limit, or unknown."""
     limits = (history.told or {}).get("limits", {})
     if any(limit["reached"] for limit in limits.values()):
         return "bad"
-    said = sentences(history, refused)
-    return "good" if said == [IN_ORDER] else "none" if said == [UNKNOWN] else "warn"
+    findings = sentences(history, refused)
+    return "good" if findings == [IN_ORDER] else "none" if findings == [UNKNOWN] else "warn"
 
 
 def axis_line(history: AxisHistory, refused: Refusals) -> dict[str, Any]:
-    """Return an axis in a few words."""
+    """Return the summary of an axis."""
     windows = (history.told or {}).get("windows", ())
     return {
         "axis": history.axis,
@@ -44,7 +44,7 @@ def axis_line(history: AxisHistory, refused: Refusals) -> dict[str, Any]:
 
 
 def axis_document(machine: MachineConfig, history: AxisHistory, refused: Refusals) -> dict[str, Any]:
-    """Return all that is told of one axis."""
+    """Return the complete document of an axis."""
     health = history.told or {}
     return {
         **axis_line(history, refused),
@@ -71,7 +71,6 @@ def _limit(name: str, limit: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _slopes(health: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return how each parameter moves with temperature and time, as text with its interval; null where unknown."""
     found = []
     for name in DISPLAY:
         lines = {key: health.get(of, {}).get(name) for key, of in (("per_kelvin", "slopes"), ("per_day", "trends"))}
@@ -86,7 +85,6 @@ def _change(change: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _course(history: AxisHistory, name: str) -> dict[str, Any]:
-    """Return a parameter's charts, and the newest estimates as the table that says the same."""
     unit, factor = DISPLAY[name]
     warming = over_temperature(history, name)
     return {
@@ -101,7 +99,7 @@ def _course(history: AxisHistory, name: str) -> dict[str, Any]:
 
 
 def _chart(chart: Chart) -> dict[str, Any]:
-    """Return a chart as the browser draws it: colours are numbers there, so that they fit a dark page too."""
+    """Return a chart for the browser: colours are numbers, so that they suit a dark page too."""
     document = told(chart)
     for trace in (trace for panel in document["panels"] for trace in panel["traces"]):
         trace["colour"] = COLOURS.index(trace["colour"]) + 1 if trace["colour"] in COLOURS else LINE_COLOUR
@@ -134,5 +132,5 @@ def _revision(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def newest_first(notices: Sequence[Mapping[str, Any]], most: int) -> list[Mapping[str, Any]]:
-    """Return notices with those that wait in front, else the newest in front."""
+    """Return notices with unacknowledged ones first, then the newest first."""
     return sorted(notices, key=lambda notice: (notice["acknowledged"] is not None, -notice["number"]))[:most]

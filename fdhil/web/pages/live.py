@@ -1,4 +1,4 @@
-"""The page *live*: the signals of every axis as they pass, and single samples of what has just passed."""
+"""The page *live*: the signals of every axis as they arrive, and single samples of the recent past."""
 
 import asyncio
 import json
@@ -16,18 +16,18 @@ from starlette.websockets import WebSocketDisconnect
 from fdhil.daemon.control import SOCKET_NAME
 from fdhil.web.access import place_of
 from fdhil.web.answers import Refused
-from fdhil.web.context import Asking, Here
+from fdhil.web.context import MachineDependency, PrincipalDependency
 from fdhil.web.gate import token_of
 from fdhil.web.live_feed import KEPT_S, MAX_BROWSERS, LiveFeed, Viewer
 from fdhil.web.live_ring import DRAWN, UNITS
 from fdhil.web.live_view import View, finite
 
-TELL_S = 0.1
+SEND_S = 0.1
 ALIVE_S = 1.0
 LEAST_S, MOST_S = 0.5, 60.0
 POLICY, TRY_LATER = 1008, 1013  # RFC 6455, 7.4.1 and the registry of close codes
 
-Axes = Annotated[str, Query(description="names of axes with commas between them; left out: all", max_length=200)]
+Axes = Annotated[str, Query(description="names of axes, separated by commas; default: all", max_length=200)]
 Columns = Annotated[int, Query(ge=10, le=4000)]
 
 
@@ -61,7 +61,7 @@ router = APIRouter(prefix="/api/live", tags=["live"], lifespan=_reading)
 
 
 class Signal(BaseModel):
-    """One signal of one axis in columns: the least and the greatest, null where no sample came."""
+    """One signal of one axis in columns: minimum and maximum, null without samples."""
 
     unit: str
     low: list[float | None]
@@ -69,29 +69,29 @@ class Signal(BaseModel):
 
 
 class Samples(BaseModel):
-    """A stretch of what is kept; with ``ticks_per_column`` 1 these are the samples themselves."""
+    """A section of the stored samples; with ``ticks_per_column`` 1 the samples themselves."""
 
     ok: Literal[True] = True
     sync_period_s: float
-    first_tick: int = Field(description="of the stream's own count, which the browser learnt from the stream")
+    first_tick: int = Field(description="in the stream's own count, which the stream reports")
     ticks_per_column: int
     axes: dict[str, dict[str, Signal]]
 
 
 @router.get("/samples")
-async def samples(  # in the loop, where the rings are written: what is read is whole
-    here: Here,
+async def samples(  # a coroutine: in the loop, which also writes the rings
+    context: MachineDependency,
     feed: Feed,
     first_tick: Annotated[int, Query(ge=0, le=2**53)],
     end_tick: Annotated[int, Query(ge=0, le=2**53)],
     columns: Columns = 1000,
     axes: Axes = "",
 ) -> Samples:
-    """Tell the samples from one tick to before another, drawn together when there are more than ``columns``.
+    """Return the samples from one tick to before another, combined if there are more than ``columns``.
 
-    Where nothing is kept there is null: the last five minutes are, and while somebody looks on.
+    Missing samples are null: the last five minutes are stored, and only while a browser watches.
     """
-    named = _axes_of(here, axes)
+    named = _axes_of(context, axes)
     end = max(first_tick + 1, end_tick)
     first = max(first_tick, end - feed.rings[named[0]].capacity)
     per_column = max(1, -(-(end - first) // columns))
@@ -110,52 +110,52 @@ async def samples(  # in the loop, where the rings are written: what is read is 
     )
 
 
-def _axes_of(here: Here, axes: str) -> list[str]:
-    named = list(dict.fromkeys(axes.split(","))) if axes else list(here.config.axis)
-    if unknown := [axis for axis in named if axis not in here.config.axis]:
+def _axes_of(context: MachineDependency, axes: str) -> list[str]:
+    named = list(dict.fromkeys(axes.split(","))) if axes else list(context.config.axis)
+    if unknown := [axis for axis in named if axis not in context.config.axis]:
         text = f"there is no axis {unknown[0]!r}"
-        raise Refused(404, "NoSuchAxis", text, f"ask for {', '.join(here.config.axis)}")
+        raise Refused(404, "NoSuchAxis", text, f"use {', '.join(context.config.axis)}")
     return named
 
 
 @router.websocket("/stream")
 async def stream(
     socket: WebSocket,
-    here: Here,
-    asking: Asking,
+    context: MachineDependency,
+    principal: PrincipalDependency,
     feed: Feed,
     seconds: Annotated[float, Query(ge=LEAST_S, le=MOST_S)] = 20.0,
     columns: Columns = 800,
     axes: Axes = "",
 ) -> None:
-    """Tell a browser the newest samples as columns, as fast as it draws them, until it leaves or its login ends."""
+    """Send the newest samples as columns, as fast as the browser draws them, until it leaves or its login ends."""
     offered = socket.scope.get("subprotocols", [])
     await socket.accept("fdhil" if "fdhil" in offered else None)
     try:
-        named = _axes_of(here, axes)
+        named = _axes_of(context, axes)
     except Refused as refused:
         await socket.close(POLICY, refused.document["text"])
         return
-    owner = asking.name or place_of(socket.client.host if socket.client else "")
+    owner = principal.name or place_of(socket.client.host if socket.client else "")
     if not feed.make_room(owner):
-        await socket.close(TRY_LATER, f"{MAX_BROWSERS} browsers look on already; close one of them")
+        await socket.close(TRY_LATER, f"{MAX_BROWSERS} browsers are watching already; close one of them")
         return
     view = View(named, seconds, columns, feed.period_s)
-    travel = {axis: here.config.axis[axis].screw_pitch_mm / math.tau for axis in named}
+    travel = {axis: context.config.axis[axis].screw_pitch_mm / math.tau for axis in named}
     signals = [{"name": name, "unit": UNITS[name]} for name in DRAWN]
     begin = {"sync_period_s": feed.period_s, "axes": named, "signals": signals, "ticks_per_column": view.per_column}
     viewer = Viewer(owner, time.monotonic())
     async with feed.watched(viewer):
-        with suppress(WebSocketDisconnect):  # it left
+        with suppress(WebSocketDisconnect):  # the browser left
             await socket.send_json({**begin, "kept_s": KEPT_S, "mm_per_rad": travel})
-            await socket.close(POLICY, await _converse(socket, view, viewer, feed, here))
+            await socket.close(POLICY, await _converse(socket, view, viewer, feed, context))
 
 
-async def _converse(socket: WebSocket, view: View, viewer: Viewer, feed: LiveFeed, here: Here) -> str:
-    """Send samples and receive what was drawn; return why that is over. WebSocketDisconnect if the browser left."""
+async def _converse(socket: WebSocket, view: View, viewer: Viewer, feed: LiveFeed, context: MachineDependency) -> str:
+    """Send samples and receive acknowledgements; return why it ended. WebSocketDisconnect if the browser left."""
     tasks = [
         asyncio.create_task(_hear(socket, view, viewer)),
-        asyncio.create_task(_tell(socket, view, viewer, feed, here)),
+        asyncio.create_task(_tell(socket, view, viewer, feed, context)),
     ]
     try:
         over, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -167,32 +167,33 @@ async def _converse(socket: WebSocket, view: View, viewer: Viewer, feed: LiveFee
 
 
 async def _hear(socket: WebSocket, view: View, viewer: Viewer) -> str:
-    """Take in what the browser has drawn, until it says anything else."""
     while True:
         try:
-            told: Any = json.loads(await socket.receive_text())
+            message: Any = json.loads(await socket.receive_text())
         except (ValueError, RecursionError, KeyError):
-            told = None
-        if not isinstance(told, dict) or type(told.get("drawn")) is not int:
-            return 'what came is not understood; send {"drawn": the number of the newest message that was drawn}'
-        if view.drawn(told["drawn"]):
+            message = None
+        if not isinstance(message, dict) or type(message.get("drawn")) is not int:
+            return 'invalid message; send {"drawn": number of the newest drawn message}'
+        if view.drawn(message["drawn"]):
             viewer.drawn_s = time.monotonic()
 
 
-async def _tell(socket: WebSocket, view: View, viewer: Viewer, feed: LiveFeed, here: Here) -> str:
-    """Send what is new, some ten times a second, as fast as the browser draws; a word of life when nothing is.
+async def _tell(socket: WebSocket, view: View, viewer: Viewer, feed: LiveFeed, context: MachineDependency) -> str:
+    """Send new columns about ten times a second, as fast as the browser draws; a sign of life without any.
 
-    The login is checked each time: a user who was removed receives no further sample.
+    The login is checked each time: a removed user receives no further sample.
     """
-    told_s, token = 0.0, token_of(socket.headers)
+    sent_s, token = 0.0, token_of(socket.headers)
     while True:
-        await asyncio.sleep(TELL_S)
-        if here.access.asker(token) is None:
-            return "the login has ended; log in again"
+        await asyncio.sleep(SEND_S)
+        if context.access.asker(token) is None:
+            return "the login has expired; log in again"
         if viewer.replaced:
-            return "another browser has this place: this one drew nothing, or its user has more; close one of them"
+            return (
+                "another browser took this place: this one drew nothing, or its user has more open; close one of them"
+            )
         now_s = time.monotonic()
-        if view.may_send() and (view.has_news(feed.rings) or now_s - told_s > ALIVE_S):
-            told_s = now_s
+        if view.may_send() and (view.has_news(feed.rings) or now_s - sent_s > ALIVE_S):
+            sent_s = now_s
             about = {"trouble": feed.trouble, "skipped_lines": feed.skipped_lines}
             await socket.send_bytes(view.message(feed.rings, about))

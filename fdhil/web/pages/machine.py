@@ -1,4 +1,4 @@
-"""The machine: what its daemon says, how the axes are, and what to do next."""
+"""The machine: the daemon's status, the state of the axes, and what to do next."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
@@ -13,16 +13,16 @@ from fdhil.store.history import History
 from fdhil.store.rows import Revision
 from fdhil.store.set_document import parameters_status
 from fdhil.web.answers import Fault, document_of
-from fdhil.web.context import Asking, Here
+from fdhil.web.context import MachineDependency, PrincipalDependency
 from fdhil.web.pages.machine_lights import AxisLight, Light, Step, axis_light, change_light, steps
 
 router = APIRouter(prefix="/api/machine")
 COURSE = 40
-START = Step(text="The daemon does not answer.", advice="start it with fdhil run CONFIG, and look at its log")
+START = Step(text="The daemon does not answer.", advice="start it with fdhil run CONFIG, and check its log")
 
 
 class Machine(BaseModel):
-    """The machine now. Without an answer of the daemon ``status`` is null and ``fault`` says why: that is no error."""
+    """The machine now. If the daemon does not answer, ``status`` is null and ``fault`` says why; that is no error."""
 
     ok: Literal[True] = True
     machine: str
@@ -62,7 +62,7 @@ class Published(BaseModel):
 
 
 class AllPublished(BaseModel):
-    """What the store knows of every axis; ``fault`` where it cannot be read, or is not there yet."""
+    """The stored parameters of every axis; ``fault`` if the store cannot be read or does not exist yet."""
 
     ok: Literal[True] = True
     axes: Mapping[str, Published]
@@ -70,37 +70,37 @@ class AllPublished(BaseModel):
 
 
 @router.get("")
-async def machine(here: Here, asking: Asking) -> Machine:
-    """Return the daemon's status document, at most half a second old, and what is to be said of it."""
+async def machine(context: MachineDependency, principal: PrincipalDependency) -> Machine:
+    """Return the daemon's status document, at most half a second old, and its assessment."""
     try:
-        status = await here.daemon.status()
+        status = await context.daemon.status()
     except DeviceError as error:
         fault = Fault.model_validate(document_of(error))
-        silent = dict.fromkeys(here.config.axis, AxisLight(light="none", text="not known: the daemon does not answer"))
-        return Machine(machine=here.config.machine.name, axes=silent, next=[START], status=None, fault=fault)
-    acting = here.config.web.acting and asking.role == "operate"
+        silent = dict.fromkeys(context.config.axis, AxisLight(light="none", text="unknown: the daemon does not answer"))
+        return Machine(machine=context.config.machine.name, axes=silent, next=[START], status=None, fault=fault)
+    acting = context.config.web.acting and principal.role == "operate"
     return Machine(
         machine=str(status["machine"]), axes=lights(status), next=list(steps(status, acting)), status=dict(status)
     )
 
 
 def lights(status: Mapping[str, Any]) -> dict[str, AxisLight]:
-    """Return how each axis of a status document is."""
+    """Return the state of each axis in a status document."""
     troubles: dict[str, list[str]] = {axis: [] for axis in status["axes"]}
     for trouble in status["troubles"]:
         troubles.get(trouble["axis"], []).append(f"{trouble['code']}: {trouble['text']}")
-    return {axis: axis_light(told, troubles[axis]) for axis, told in status["axes"].items()}
+    return {axis: axis_light(state, troubles[axis]) for axis, state in status["axes"].items()}
 
 
 @router.get("/parameters")
-def parameters(here: Here) -> AllPublished:
+def parameters(context: MachineDependency) -> AllPublished:
     """Return the newest published parameters, also while no daemon runs."""
     try:
-        with here.history() as history:
-            found = {axis: _published(history, axis, here.config) for axis in here.config.axis}
+        with context.history() as history:
+            found = {axis: _published(history, axis, context.config) for axis in context.config.axis}
     except StoreError as error:
         return AllPublished(axes={}, fault=Fault.model_validate(document_of(error)))
-    return AllPublished(axes={axis: told for axis, told in found.items() if told is not None})
+    return AllPublished(axes={axis: document for axis, document in found.items() if document is not None})
 
 
 def _published(history: History, axis: str, config: MachineConfig) -> Published | None:
@@ -111,18 +111,18 @@ def _published(history: History, axis: str, config: MachineConfig) -> Published 
 
 
 def published_document(revisions: Sequence[Revision], first: Revision | None, config: MachineConfig) -> Published:
-    """Return the newest of an axis' revisions (oldest first), compared with the first one ever."""
+    """Return the newest of an axis' revisions (oldest first), compared with its first one."""
     newest = revisions[-1]
     shown: ParameterSet = newest.set
     firsts = first.set.parameters.as_dict() if first else {}
     limits = config.maintenance.model_dump()
     found = {}
-    for name, told in parameters_status(shown).items():
-        half = None if told["high"] is None else told["high"] - told["value"]
-        change, light = change_light(told["value"], half, firsts.get(name), limits[name])
-        beside = {"first": firsts.get(name), "change": change, "limit": limits[name], "light": light}
-        beside["course"] = [known[name] for each in revisions if name in (known := each.set.parameters.as_dict())]
-        found[name] = Parameter(**{key: told[key] for key in ("value", "low", "high", "unit")}, **beside)
+    for name, figures in parameters_status(shown).items():
+        half = None if figures["high"] is None else figures["high"] - figures["value"]
+        change, light = change_light(figures["value"], half, firsts.get(name), limits[name])
+        more = {"first": firsts.get(name), "change": change, "limit": limits[name], "light": light}
+        more["course"] = [known[name] for each in revisions if name in (known := each.set.parameters.as_dict())]
+        found[name] = Parameter(**{key: figures[key] for key in ("value", "low", "high", "unit")}, **more)
     return Published(
         revision=shown.revision,
         published_wall_s=newest.stamp.wall_s,

@@ -1,4 +1,4 @@
-"""Says of a status document how each axis is and what to do next. Pure: a document in, sentences out."""
+"""Assesses a status document: the state of each axis, and what to do next. Pure: a document in, sentences out."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -12,20 +12,20 @@ from fdhil.arming.standing import ADOPT, START_AND_ADOPT
 Light = Literal["good", "warn", "bad", "none"]
 LIVE_S = 2.0
 NEAR = 0.5
-"""The share of a maintenance limit from which a parameter is reported to move."""
+"""The share of a maintenance limit from which a changed parameter is reported."""
 ENABLED = "Operation enabled"
 DRIVE_FAULTS = ("Fault", "Fault reaction active")
 
 
 class AxisLight(BaseModel):
-    """How an axis is, in a colour and in words."""
+    """The state of an axis, as a colour and in words."""
 
     light: Light
     text: str
 
 
 class Step(BaseModel):
-    """What to do next: ``urgent`` while something may stand or is lost, ``page`` where it is done in the browser."""
+    """What to do next: ``urgent`` with a residual offset or a lost guard, ``page`` if it is done in the browser."""
 
     text: str
     advice: str
@@ -34,15 +34,17 @@ class Step(BaseModel):
 
 
 def axis_light(axis: Mapping[str, Any], troubles: list[str]) -> AxisLight:
-    """Return how an axis is: a trouble first, then what is not known of it, then what is warned of."""
+    """Return the state of an axis: faults first, then missing data, then warnings."""
     heard_s, last = axis.get("samples_s_ago"), axis.get("last_window")
     if axis.get("drive_state") in DRIVE_FAULTS:
-        return AxisLight(light="bad", text=f"the drive is in {axis['drive_state']}; read its fault code at the drive")
+        return AxisLight(
+            light="bad", text=f"the drive is in state {axis['drive_state']}; read its fault code at the drive"
+        )
     if troubles:
         return AxisLight(light="bad", text=troubles[0])
     if heard_s is None or heard_s > LIVE_S:
-        ago = "no samples came yet" if heard_s is None else f"no samples for {heard_s:.0f} s"
-        return AxisLight(light="none", text=f"{ago}; switch the drive on, or look at its bus")
+        ago = "no samples yet" if heard_s is None else f"no samples for {heard_s:.0f} s"
+        return AxisLight(light="none", text=f"{ago}; switch the drive on, or check its bus")
     if axis.get("parameters") is None:
         return AxisLight(light="none", text=_unpublished(axis))
     if last and not last["accepted"]:
@@ -56,15 +58,15 @@ def axis_light(axis: Mapping[str, Any], troubles: list[str]) -> AxisLight:
 def _unpublished(axis: Mapping[str, Any]) -> str:
     refused = axis.get("refused_by") or {}
     if not refused:
-        return "no parameters yet; let the NC make a few rapids (G0) of this axis"
+        return "no parameters yet; run a few rapids (G0) of this axis"
     code, count = max(refused.items(), key=lambda pair: pair[1])
     return f"no parameters yet: {count} rapids were refused because of {code}"
 
 
 def change_light(value: float, half: float | None, first: float | None, limit: float) -> tuple[float | None, Light]:
-    """Return a parameter's relative change from its first value, and how near that is to the maintenance limit.
+    """Return a parameter's relative change from its first value, and how near it is to the maintenance limit.
 
-    Bad is what is surely beyond: the change without half its 95 % interval. Without an interval nothing is known.
+    Bad only if the change less half its 95 % interval exceeds the limit. Without an interval it is unknown.
     """
     if not first or half is None or not math.isfinite(half):
         return None, "none"
@@ -75,17 +77,17 @@ def change_light(value: float, half: float | None, first: float | None, limit: f
 
 
 def steps(status: Mapping[str, Any], acting: bool) -> Iterator[Step]:
-    """Yield what to do next, the most urgent first; at least one."""
+    """Yield what to do next, the most urgent first; at least one step."""
     found = [*_standing(status), *_hearing(status), *_troubles(status), *_waiting(status), *_learning(status)]
     yield from found or _ready(status, acting)
 
 
 def _standing(status: Mapping[str, Any]) -> Iterator[Step]:
-    guard, stands = status.get("guard") or {}, status.get("may_stand") or {"nothing": True}
+    guard, residual = status.get("guard") or {}, status.get("may_stand") or {"nothing": True}
     if status["state"] == "lost":
-        yield Step(text=f"The guard is lost: {stands.get('text', '')}", advice=START_AND_ADOPT, urgent=True)
-    elif not stands["nothing"] and status["state"] in ("OFF", "FROZEN", "OFF(SHADOW)"):
-        yield Step(text=f"{stands['text']}", advice=ADOPT, urgent=True)
+        yield Step(text=f"The guard is lost: {residual.get('text', '')}", advice=START_AND_ADOPT, urgent=True)
+    elif not residual["nothing"] and status["state"] in ("OFF", "FROZEN", "OFF(SHADOW)"):
+        yield Step(text=f"{residual['text']}", advice=ADOPT, urgent=True)
     cause = guard.get("cause")
     if cause and cause["code"] not in ORDERED:
         yield Step(text=f"{cause['code']}: {cause['text']}", advice=cause.get("advice", ""))
@@ -94,11 +96,11 @@ def _standing(status: Mapping[str, Any]) -> Iterator[Step]:
 def _hearing(status: Mapping[str, Any]) -> Iterator[Step]:
     source = status["source"]["state"]
     if source == "reconnecting":
-        yield Step(text="The bus is lost.", advice="check the adapter and the cable; it is opened again by itself")
+        yield Step(text="The bus is lost.", advice="check the adapter and the cable; it is reopened automatically")
     elif source == "silent":
         yield Step(text="The bus is silent.", advice="switch the machine on; then check wiring and bit rate")
     if fault := status["store"]["fault"]:
-        yield Step(text=f"Nothing is stored: {fault}", advice="make room or mend the disk; nothing is armed meanwhile")
+        yield Step(text=f"Nothing is stored: {fault}", advice="free or repair the disk; nothing can be armed meanwhile")
 
 
 def _troubles(status: Mapping[str, Any]) -> Iterator[Step]:
@@ -120,10 +122,10 @@ def _waiting(status: Mapping[str, Any]) -> Iterator[Step]:
 
 
 def _learning(status: Mapping[str, Any]) -> Iterator[Step]:
-    unknown = [axis for axis, told in status["axes"].items() if told["parameters"] is None]
+    unknown = [axis for axis, state in status["axes"].items() if state["parameters"] is None]
     if unknown and status["source"]["state"] == "listening":
         text = f"The parameters of {', '.join(unknown)} are not identified yet."
-        yield Step(text=text, advice="let the NC make a few rapids (G0) of each, both ways, over most of the travel")
+        yield Step(text=text, advice="run a few rapids (G0) of each in both directions, over most of the travel")
 
 
 def _ready(status: Mapping[str, Any], acting: bool) -> Iterator[Step]:
@@ -132,8 +134,8 @@ def _ready(status: Mapping[str, Any], acting: bool) -> Iterator[Step]:
             text="A correction is armed.", advice="start the program at the NC; its error is measured as it runs"
         )
     elif status["state"] == "OFF(SHADOW)":
-        advice = "start fdhil-guard to correct, after fdhil commission; without it everything is only watched"
-        yield Step(text="All is in order; no guard runs, so nothing can be corrected.", advice=advice)
+        advice = "to correct, run fdhil commission and start fdhil-guard; without it the machine is only monitored"
+        yield Step(text="Everything is in order. No guard is running, so nothing can be corrected.", advice=advice)
     else:
         by = "below" if acting else "with fdhil arm CONFIG PROGRAM"
-        yield Step(text="All is in order.", advice=f"arm a program {by}, or judge one on the page Program")
+        yield Step(text="Everything is in order.", advice=f"arm a program {by}, or judge one on the page Program")

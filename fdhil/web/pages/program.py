@@ -1,6 +1,6 @@
-"""Programs before they are cut: their path error without and with the correction, and what their passes taught.
+"""Programs before machining: their path error without and with correction, and what their passes taught.
 
-A program that is dropped is forecast in a process of its own. Nothing here reaches the machine.
+A dropped program is forecast in a child process. Nothing context reaches the machine.
 """
 
 import asyncio
@@ -16,7 +16,7 @@ from starlette.requests import HTTPConnection
 from fdhil.errors import ConnectError, DeviceTimeout, StoreError
 from fdhil.store.history import RECENT_NOTICES
 from fdhil.web.answers import Refused
-from fdhil.web.context import Here
+from fdhil.web.context import MachineDependency
 from fdhil.web.forecast.desk import STATES, Desk, Job, Work
 from fdhil.web.forecast.lessons import jobs, lessons, passes
 from fdhil.web.forecast.view import Box, course, line_place, plane_of, view
@@ -31,7 +31,7 @@ LONGEST_LINE = 400
 
 
 class Fault(BaseModel):
-    """Why there is no forecast; ``line`` is that of the program at fault, where one is."""
+    """Why there is no forecast; ``line`` is the program line at fault, if there is one."""
 
     code: str
     text: str
@@ -40,7 +40,7 @@ class Fault(BaseModel):
 
 
 class Advice(BaseModel):
-    """The feeds that keep a tolerance, and how far they are: ``lines`` as ``fdhil advise --json`` has them."""
+    """The feeds that keep a tolerance, and their progress: ``lines`` as in ``fdhil advise --json``."""
 
     tolerance_um: float
     state: STATES
@@ -50,7 +50,7 @@ class Advice(BaseModel):
 
 
 class Told(BaseModel):
-    """A program and how far its forecast is; ``forecast`` as ``fdhil correct --json`` has it, and what a map needs."""
+    """A program and the progress of its forecast; ``forecast`` as in ``fdhil correct --json``, plus map data."""
 
     digest: str
     name: str
@@ -63,7 +63,7 @@ class Told(BaseModel):
 
 
 class Kept(BaseModel):
-    """A program that is kept."""
+    """A kept program."""
 
     digest: str
     name: str
@@ -71,14 +71,14 @@ class Kept(BaseModel):
 
 
 class Programs(BaseModel):
-    """The programs that are kept here, the newest first, and how large one may be."""
+    """The kept programs, the newest first, and the largest allowed size."""
 
     programs: list[Kept]
     largest_bytes: int
 
 
 class Learning(BaseModel):
-    """The curves of the programs that have learned, and the passes that the running daemon measured, oldest first."""
+    """The learning curves of programs, and the passes that the running daemon measured, oldest first."""
 
     daemon: bool
     learning: bool
@@ -87,7 +87,7 @@ class Learning(BaseModel):
 
 
 class Jobs(BaseModel):
-    """The newest passes of corrected programs that the history keeps, newest first."""
+    """The newest stored passes of corrected programs, newest first."""
 
     jobs: list[dict[str, Any]]
 
@@ -108,49 +108,52 @@ class Text(BaseModel):
 
 @asynccontextmanager
 async def _serving(app: FastAPI) -> AsyncIterator[None]:
-    """Drop what is kept when the pages are no longer served."""
     yield
-    desk = getattr(app.state, "programs", None)
-    if desk is not None:
-        await desk.close()
+    queue = getattr(app.state, "programs", None)
+    if queue is not None:
+        await queue.close()
 
 
 router = APIRouter(prefix="/api/program", lifespan=_serving)
 
 
-async def _desk(connection: HTTPConnection, here: Here) -> Desk:
+async def _desk(connection: HTTPConnection, context: MachineDependency) -> Desk:
     state = connection.app.state
     if getattr(state, "programs", None) is None:
-        state.programs = Desk(here.config)
-    desk = state.programs
-    assert isinstance(desk, Desk)
-    return desk
+        state.programs = Desk(context.config)
+    queue = state.programs
+    assert isinstance(queue, Desk)
+    return queue
 
 
-Programming = Annotated[Desk, Depends(_desk)]
+QueueDependency = Annotated[Desk, Depends(_desk)]
 Digest = Annotated[str, Path(pattern="^[0-9a-f]{64}$", description="SHA-256 of the program's bytes")]
 Mm = Annotated[float, Query(ge=-LARGEST_MM, le=LARGEST_MM, allow_inf_nan=False)]
 BODY = {"requestBody": {"content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}}}
 
 
 @router.get("")
-async def programs(desk: Programming) -> Programs:
-    """List the programs that are kept."""
-    kept = [Kept(digest=job.digest, name=job.name, state=job.forecasting.state) for job in desk.jobs]
-    return Programs(programs=kept, largest_bytes=LARGEST_PROGRAM)
+async def programs(queue: QueueDependency) -> Programs:
+    """List the kept programs."""
+    listed = [Kept(digest=job.digest, name=job.name, state=job.forecasting.state) for job in queue.jobs]
+    return Programs(programs=listed, largest_bytes=LARGEST_PROGRAM)
 
 
 @router.post("", status_code=202, openapi_extra=BODY)
-async def drop(request: Request, desk: Programming, name: Annotated[str, Query(min_length=1, max_length=255)]) -> Told:
-    """Take an NC program, or a demand where ``name`` ends in .csv, as the body's bytes, and have it forecast."""
-    return _told(await desk.take(name, request.stream()))
+async def drop(
+    request: Request, queue: QueueDependency, name: Annotated[str, Query(min_length=1, max_length=255)]
+) -> Told:
+    """Store an NC program, or a demand if ``name`` ends in .csv, from the body's bytes, and have it forecast."""
+    return _told(await queue.take(name, request.stream()))
 
 
 @router.post("/named", status_code=202)
-async def take_named(here: Here, desk: Programming, name: Annotated[str, Query(pattern=NAME)]) -> Told:
-    """Have a program forecast that is in the folder of the programs that may be armed from here."""
-    content = await asyncio.to_thread(content_of, here.config.web.programs_directory, name, LARGEST_PROGRAM)
-    return _told(await desk.take(name, _once(content)))
+async def take_named(
+    context: MachineDependency, queue: QueueDependency, name: Annotated[str, Query(pattern=NAME)]
+) -> Told:
+    """Have a program of the folder of programs forecast."""
+    content = await asyncio.to_thread(content_of, context.config.web.programs_directory, name, LARGEST_PROGRAM)
+    return _told(await queue.take(name, _once(content)))
 
 
 async def _once(content: bytes) -> AsyncIterator[bytes]:
@@ -158,10 +161,10 @@ async def _once(content: bytes) -> AsyncIterator[bytes]:
 
 
 @router.get("/jobs")
-def finished_jobs(here: Here) -> Jobs:
-    """Return the passes of corrected programs with their predicted and measured errors; none without a history."""
+def finished_jobs(context: MachineDependency) -> Jobs:
+    """Return the passes of corrected programs with predicted and measured errors; none without a history."""
     try:
-        with here.history() as history:
+        with context.history() as history:
             found = list(jobs(history.notices(limit=RECENT_NOTICES)))
     except StoreError:
         found = []
@@ -169,16 +172,16 @@ def finished_jobs(here: Here) -> Jobs:
 
 
 @router.get("/learning")
-async def learning(here: Here, desk: Programming) -> Learning:
-    """Tell what the passes of programs have taught."""
+async def learning(context: MachineDependency, queue: QueueDependency) -> Learning:
+    """Return what was learned in the passes of programs."""
     try:
-        status = await here.daemon.status()
+        status = await context.daemon.status()
     except (ConnectError, DeviceTimeout):
         status = None
     measured = passes(status)
     names = {str(each["program_digest"]): str(each["program"]).rpartition("/")[2] for each in measured}
-    names |= {job.digest: job.name for job in desk.jobs}
-    config = here.config
+    names |= {job.digest: job.name for job in queue.jobs}
+    config = context.config
     return Learning(
         daemon=status is not None,
         learning=config.correction.learning,
@@ -188,29 +191,29 @@ async def learning(here: Here, desk: Programming) -> Learning:
 
 
 @router.get("/{digest}")
-async def program(digest: Digest, desk: Programming) -> Told:
-    """Tell how far a forecast is, and what it says of the whole program."""
-    return _told(desk.job(digest))
+async def program(digest: Digest, queue: QueueDependency) -> Told:
+    """Return the progress of a forecast, and its results for the whole program."""
+    return _told(queue.job(digest))
 
 
 @router.post("/{digest}/cancel")
-async def cancel(digest: Digest, desk: Programming) -> Told:
-    """End a forecast that is under way."""
-    return _told(await desk.cancel(digest))
+async def cancel(digest: Digest, queue: QueueDependency) -> Told:
+    """Cancel a running forecast."""
+    return _told(await queue.cancel(digest))
 
 
 @router.post("/{digest}/advise", status_code=202)
 async def feeds(
-    digest: Digest, desk: Programming, tolerance_um: Annotated[float, Query(gt=0.0, le=1e6, allow_inf_nan=False)]
+    digest: Digest, queue: QueueDependency, tolerance_um: Annotated[float, Query(gt=0.0, le=1e6, allow_inf_nan=False)]
 ) -> Told:
-    """Have the feeds found that keep the path within a tolerance, as ``fdhil advise`` does."""
-    return _told(desk.advise(digest, tolerance_um))
+    """Compute the feeds that keep the path within a tolerance, as ``fdhil advise`` does."""
+    return _told(queue.advise(digest, tolerance_um))
 
 
 @router.get("/{digest}/view")
 def part(
     digest: Digest,
-    desk: Programming,
+    queue: QueueDependency,
     across: Annotated[str, Query(max_length=16)],
     along: Annotated[str, Query(max_length=16)],
     left: Mm | None = None,
@@ -219,16 +222,16 @@ def part(
     top: Mm | None = None,
     factor: Annotated[float, Query(ge=0.0, le=10_000.0, allow_inf_nan=False)] = 0.0,
 ) -> Json:
-    """Tell the path in the plane of two axes: all of it, or what lies in a box (mm), there with the table's way.
+    """Return the path in the plane of two axes: all of it, or inside a box (mm) with the predicted table path.
 
-    ``factor``: how many times as far the table is drawn from the path; 0 for what the view has room for.
+    ``factor`` enlarges the table's distance from the path; 0: as far as the view has room.
     """
-    forecast = desk.forecast(digest)
+    forecast = queue.forecast(digest)
     try:
         plane = plane_of(forecast, (across, along))
     except ValueError:
-        told = ", ".join(forecast.axes)
-        raise Refused(422, "BadRequest", "this is no plane of the program", f"its axes are {told}") from None
+        listed = ", ".join(forecast.axes)
+        raise Refused(422, "BadRequest", "the program has no such plane", f"its axes are {listed}") from None
     box = None
     if left is not None and right is not None and bottom is not None and top is not None:
         box = Box(left, right, bottom, top)
@@ -240,12 +243,12 @@ def part(
 @router.get("/{digest}/course")
 def over_time(
     digest: Digest,
-    desk: Programming,
+    queue: QueueDependency,
     start_s: Annotated[float, Query(ge=0.0, allow_inf_nan=False)] = 0.0,
     end_s: Annotated[float | None, Query(ge=0.0, allow_inf_nan=False)] = None,
 ) -> Json:
-    """Tell contour errors and feed over time."""
-    forecast = desk.forecast(digest)
+    """Return contour errors and feed over time."""
+    forecast = queue.forecast(digest)
     rows = len(forecast.line)
     first = min(int(min(start_s / forecast.dt_s, rows)), rows - 1)
     last = rows if end_s is None else int(min(end_s / forecast.dt_s, rows))
@@ -253,9 +256,9 @@ def over_time(
 
 
 @router.get("/{digest}/line/{line}")
-def place_of_line(digest: Digest, line: Annotated[int, Path(ge=1, le=10**9)], desk: Programming) -> Json:
-    """Tell where a line of the program has its largest error."""
-    found = line_place(desk.forecast(digest), line)
+def place_of_line(digest: Digest, line: Annotated[int, Path(ge=1, le=10**9)], queue: QueueDependency) -> Json:
+    """Return where a program line has its largest error."""
+    found = line_place(queue.forecast(digest), line)
     if found is None:
         raise Refused(404, "NotFound", f"line {line} of the program orders no motion", "choose a line that moves")
     return Json(found)
@@ -264,29 +267,28 @@ def place_of_line(digest: Digest, line: Annotated[int, Path(ge=1, le=10**9)], de
 @router.get("/{digest}/text")
 def text(
     digest: Digest,
-    desk: Programming,
+    queue: QueueDependency,
     first: Annotated[int, Query(ge=1, le=10**9)] = 1,
     count: Annotated[int, Query(ge=1, le=MOST_LINES)] = 40,
 ) -> Text:
-    """Tell lines of the program's text."""
-    job = desk.job(digest)
+    """Return lines of the program's text."""
+    job = queue.job(digest)
     try:
         with job.program.open(encoding="utf-8", errors="replace", newline="\n") as file:
             found = list(islice(file, first - 1, first + count))
     except OSError:
-        raise Refused(404, "NotFound", "the text is not kept (any more)", "drop the file again") from None
-    told = [Line(line=first + k, text=_printable(each)) for k, each in enumerate(found[:count])]
-    return Text(lines=told, more=len(found) > count)
+        raise Refused(404, "NotFound", "the text is not stored (any more)", "drop the file again") from None
+    lines = [Line(line=first + k, text=_printable(each)) for k, each in enumerate(found[:count])]
+    return Text(lines=lines, more=len(found) > count)
 
 
 def _printable(line: str) -> str:
-    """Return a line without what a screen would not show, cut where it is very long."""
-    kept = "".join(letter if letter.isprintable() else " " for letter in line.rstrip("\r\n")[:LONGEST_LINE])
-    return kept + ("..." if len(line) > LONGEST_LINE + 2 else "")
+    printable = "".join(letter if letter.isprintable() else " " for letter in line.rstrip("\r\n")[:LONGEST_LINE])
+    return printable + ("..." if len(line) > LONGEST_LINE + 2 else "")
 
 
 def _told(job: Job) -> Told:
-    work, advising = job.forecasting, job.advising
+    forecasting, advising = job.forecasting, job.advising
     advice = advising and Advice(
         tolerance_um=advising.tolerance_um or 0.0,
         state=advising.state,
@@ -297,10 +299,10 @@ def _told(job: Job) -> Told:
     return Told(
         digest=job.digest,
         name=job.name,
-        state=work.state,
-        step=work.progress.get("step"),
-        rows=work.progress.get("rows"),
-        fault=_fault(work),
+        state=forecasting.state,
+        step=forecasting.progress.get("step"),
+        rows=forecasting.progress.get("rows"),
+        fault=_fault(forecasting),
         forecast=None if job.forecast is None else job.forecast.document,
         advice=advice,
     )

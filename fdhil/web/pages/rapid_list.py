@@ -1,4 +1,4 @@
-"""The stored rapids as the browser has them: which there are, newest first, and what was said of each. Reads only."""
+"""The stored rapids for the browser: their list, newest first, and the verdict on each. Reads only."""
 
 from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
@@ -14,14 +14,14 @@ from fdhil.store.rows import StoredWindow
 from fdhil.web.answers import Refused
 
 SEARCHED = 5_000
-"""Rows of the history that one request looks through: with many more a rare reason would take seconds to find."""
+"""Rows of the history searched by one request: with many more a rare reason would take seconds."""
 LARGEST_ID = 2**63 - 1
 Kept = Callable[[str], bool]
-"""Whether the recording of this name is still there."""
+"""Returns whether the recording of this name still exists."""
 
 
 class Said(BaseModel):
-    """A reason or a warning: its class, the figure that caused it, what to do."""
+    """A reason or a warning: its code, the figure that caused it, the next action."""
 
     code: str
     text: str
@@ -29,7 +29,7 @@ class Said(BaseModel):
 
 
 class NcSaid(BaseModel):
-    """What the NC said of itself during the move; what it did not say is null. An override of 1 is 100 %."""
+    """The NC's report during the move; missing items are null. An override of 1 is 100 %."""
 
     line: int | None = None
     program: str | None = None
@@ -38,7 +38,7 @@ class NcSaid(BaseModel):
 
 
 class Rapid(BaseModel):
-    """A stored rapid and what the daemon said of it; ``kept`` is whether its recording is still there."""
+    """A stored rapid and the daemon's verdict; ``kept``: its recording still exists."""
 
     id: int
     axis: str
@@ -56,21 +56,21 @@ class Rapid(BaseModel):
 
 
 class Rapids(BaseModel):
-    """A page of rapids, newest first; ``older_before`` asks for the next one, null at the oldest."""
+    """A page of rapids, newest first; ``older_before`` requests the next one, null at the oldest."""
 
     rapids: list[Rapid]
     older_before: int | None
 
 
 class Count(BaseModel):
-    """How many of the newest rapids were refused for a reason of this class."""
+    """How many of the newest rapids were refused for a reason with this code."""
 
     code: str
     rapids: int
 
 
 class Counts(BaseModel):
-    """The newest rapids by verdict, and the refused ones by reason; ``searched`` is how many were looked at.
+    """The newest rapids by verdict, and the refused ones by reason; ``searched`` is how many were examined.
 
     ``axes`` are the machine's.
     """
@@ -83,7 +83,7 @@ class Counts(BaseModel):
 
 
 class Figure(BaseModel):
-    """A parameter in SI units, with its 95 % interval, and as people read it; ``reason`` says why it is not known."""
+    """A parameter in SI units with its 95 % interval, and formatted; ``reason`` says why it is unknown."""
 
     name: str
     unit: str | None
@@ -97,9 +97,9 @@ class Figure(BaseModel):
 
 
 class RapidTold(BaseModel):
-    """All that the history has of one rapid, and its neighbours on the axis.
+    """The stored data of one rapid, and its neighbours on the axis.
 
-    ``alike_id`` is the last one before it that was accepted and went the same way.
+    ``alike_id`` is the last accepted one before it in the same direction.
     """
 
     rapid: Rapid
@@ -114,14 +114,14 @@ Verdict = Literal["accepted", "refused"]
 
 def page_of(
     history: History,
-    kept: Kept,
+    is_stored: Kept,
     axis: str | None = None,
     verdict: Verdict | None = None,
     code: str | None = None,
     before: int | None = None,
     limit: int = 50,
 ) -> Rapids:
-    """Return the newest rapids below the number ``before`` that fit."""
+    """Return the newest matching rapids below the number ``before``."""
     before = newest_id(history) + 1 if before is None else before
     first = max(1, before - SEARCHED)
     wanted = {"axis = :axis": axis, "instr(reasons, :code)": None if code is None else f'"{code}:'}
@@ -132,11 +132,11 @@ def page_of(
     values = {"before": before, "first": first, "axis": axis, "code": wanted["instr(reasons, :code)"]}
     found = history.chosen_windows(f"{where} ORDER BY id DESC", values, limit)
     oldest = found[-1].number if len(found) == limit else first
-    return Rapids(rapids=[rapid_of(window, kept) for window in found], older_before=oldest if oldest > 1 else None)
+    return Rapids(rapids=[rapid_of(window, is_stored) for window in found], older_before=oldest if oldest > 1 else None)
 
 
 def newest_id(history: History) -> int:
-    """Return the number of the newest rapid, 0 when there is none."""
+    """Return the number of the newest rapid, 0 without one."""
     return int(history.figures("SELECT coalesce(max(id), 0) FROM windows", {})[0][0])
 
 
@@ -156,8 +156,8 @@ def counts_of(history: History, axes: Iterable[str], axis: str | None = None) ->
     return Counts(axes=[*axes], searched=accepted + refused, accepted=accepted, refused=refused, by_reason=reasons)
 
 
-def rapid_of(window: StoredWindow, kept: Kept) -> Rapid:
-    """Return a stored window as the browser has it."""
+def rapid_of(window: StoredWindow, is_stored: Kept) -> Rapid:
+    """Return a stored window for the browser."""
     return Rapid(
         id=window.number,
         axis=window.axis,
@@ -171,7 +171,7 @@ def rapid_of(window: StoredWindow, kept: Kept) -> Rapid:
         warnings=[_said(warning) for warning in window.warnings],
         nc=None if window.nc is None else NcSaid(**window.nc),
         file=window.file,
-        kept=kept(window.file),
+        kept=is_stored(window.file),
     )
 
 
@@ -180,8 +180,8 @@ def _said(reason: str) -> Said:
     return Said(code=code, text=typeset(text.strip()))
 
 
-def told_of(history: History, window: StoredWindow, kept: Kept) -> RapidTold:
-    """Return what the history has of one rapid."""
+def told_of(history: History, window: StoredWindow, is_stored: Kept) -> RapidTold:
+    """Return the stored data of one rapid."""
     values = {"axis": window.axis, "id": window.number, "direction": window.direction}
 
     def nearest(condition: str, order: str) -> int | None:
@@ -189,17 +189,17 @@ def told_of(history: History, window: StoredWindow, kept: Kept) -> RapidTold:
         return next((int(row[0]) for row in history.figures(query, values)), None)
 
     return RapidTold(
-        rapid=rapid_of(window, kept),
-        parameters=[figure_of(name, told) for name, told in (window.parameters or {}).items()],
+        rapid=rapid_of(window, is_stored),
+        parameters=[figure_of(name, values_of) for name, values_of in (window.parameters or {}).items()],
         older_id=nearest("id < :id", "DESC"),
         newer_id=nearest("id > :id", "ASC"),
         alike_id=nearest("id < :id AND direction = :direction AND accepted = 1", "DESC"),
     )
 
 
-def figure_of(name: str, told: dict[str, Any]) -> Figure:
+def figure_of(name: str, figures: dict[str, Any]) -> Figure:
     """Return one parameter of a window with its interval."""
-    value, std = told.get("value"), told.get("std")
+    value, std = figures.get("value"), figures.get("std")
     half = None if std is None else INTERVAL_95 * std
     ends = (None, None) if value is None or half is None else (value - half, value + half)
     unit = unit_of(name)
@@ -210,16 +210,16 @@ def figure_of(name: str, told: dict[str, Any]) -> Figure:
         std=std,
         low=ends[0],
         high=ends[1],
-        reason=None if told.get("reason") is None else typeset(str(told["reason"])),
+        reason=None if figures.get("reason") is None else typeset(str(figures["reason"])),
         shown=typeset(cell(name, value, half, " ")),
         shown_unit=typeset(DISPLAY[name][0] if name in DISPLAY else unit or ""),
     )
 
 
 def the_window(history: History, axis: str, number: int) -> StoredWindow:
-    """Return the window of an axis with this number; Refused when there is none, or it is damaged."""
+    """Return the window of an axis with this number; Refused if there is none, or it is damaged."""
     found = history.chosen_windows("id = :id AND axis = :axis", {"id": number, "axis": axis}, 1)
     if not found:
         text = f"the history has no rapid {number} of axis {axis}"
-        raise Refused(404, "NoSuchRapid", text, "take one from the list of rapids")
+        raise Refused(404, "NoSuchRapid", text, "use one from the list of rapids")
     return found[0]

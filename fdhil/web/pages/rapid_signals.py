@@ -1,4 +1,4 @@
-"""The signals of one rapid with the model laid over them, what is left, and the spectra of both. Pure."""
+"""The signals of one rapid with the model's, their residuals, and the spectra of both. Pure."""
 
 import math
 from dataclasses import dataclass
@@ -15,16 +15,15 @@ from fdhil.report.typography import typeset
 from fdhil.web.pages.rapid_list import Said
 
 MOST_POINTS = 6000
-"""Points of one curve: a screen shows fewer, and a browser on a phone draws so many at once."""
-DIGITS = 6
+"""Points of one curve: more than a screen shows, and few enough for a browser on a phone."""
 
 Points = list[float | None]
 
 
 class Signal(BaseModel):
-    """A signal in the unit that its name ends with: measured, modelled, and measured less modelled; null is not known.
+    """A signal in the unit that its name ends with: measured, modelled, and the residual; null if unknown.
 
-    ``model`` tells what made the modelled one: "voltage" (the drive under the measured voltage alone), "loop" (the
+    ``model`` is the source of the modelled one: "voltage" (the drive under the measured voltage alone), "loop" (the
     closed loop along the demand), or null. ``residual_rms`` is over the move. The spectra are amplitudes.
     """
 
@@ -41,7 +40,7 @@ class Signal(BaseModel):
 
 
 class Replayed(BaseModel):
-    """What a replay of the recording says with the configuration of today."""
+    """The verdict of a replay of the recording with the present configuration."""
 
     accepted: bool
     fit_percent: float | None
@@ -59,9 +58,9 @@ class Stage(BaseModel):
 
 
 class RapidSignals(BaseModel):
-    """A rapid's signals: point k is ``time_s[k]`` after the first row; of long ones each ``every``-th row is told.
+    """A rapid's signals: point k is ``time_s[k]`` after the first row; of long ones only each ``every``-th row.
 
-    ``turns_hz`` is how often the motor turns in a second at the most: what comes with each turn shows there.
+    ``turns_hz`` is the motor's highest frequency of rotation, where effects of each turn appear.
     """
 
     every: int
@@ -78,7 +77,7 @@ class RapidSignals(BaseModel):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Course:
-    """A signal (n,) with its name and unit, and the course (n,) that a model makes of it."""
+    """A signal (n,) with its name and unit, and the curve (n,) of a model."""
 
     name: str
     unit: str
@@ -96,13 +95,13 @@ def signals_of(overlay: Overlay) -> RapidSignals:
     verdict = overlay.outcome.verdict
     return RapidSignals(
         every=every,
-        time_s=_digits(np.arange(0, window.n, every) * window.dt_s),
+        time_s=round_digits(np.arange(0, window.n, every) * window.dt_s, 9),
         move_begin_s=begin * window.dt_s,
         move_end_s=end * window.dt_s,
         stages=_stages(window),
         direction=window.direction,
         turns_hz=float(np.nanmax(np.abs(window.speed_rad_s), initial=0.0)) / (2.0 * math.pi),
-        frequency_hz=_digits(frequency[:: _step(frequency.size)]),
+        frequency_hz=round_digits(frequency[:: _step(frequency.size)], 9),
         signals=[_signal(course, slice(begin, end), every) for course in _courses(overlay)],
         replayed=Replayed(
             accepted=verdict.accepted,
@@ -124,7 +123,7 @@ def _said(reason: Reason) -> Said:
 
 
 def _courses(overlay: Overlay) -> list[_Course]:
-    """Return the signals that the rapid has, in the order in which they are read: cause, answer, error."""
+    """Return the rapid's signals in reading order: cause, response, error."""
     window = overlay.window
     speed, current, model = _modelled(overlay)
     courses = [
@@ -145,7 +144,7 @@ def _courses(overlay: Overlay) -> list[_Course]:
 
 
 def _modelled(overlay: Overlay) -> tuple[Float | None, Float | None, str | None]:
-    """Return speed and current (n,) as the measured voltage makes them, else as the closed loop does."""
+    """Return speed and current (n,) from the measured voltage, else from the closed loop."""
     window, driven, followed = overlay.window, overlay.driven, overlay.followed
     if driven is not None:
         time_s = np.arange(window.n) * window.dt_s
@@ -160,7 +159,7 @@ def _modelled(overlay: Overlay) -> tuple[Float | None, Float | None, str | None]
 
 
 def _voltage(window: Window) -> list[_Course]:
-    """Return the voltage on the window's rows; a slow sensor's value stands for its whole period."""
+    """Return the voltage at the window's rows; a slow sensor's value covers its whole period."""
     if window.voltage_v is not None:
         return [_Course("voltage_v", "V", window.voltage_v)]
     slow = window.slow_voltage
@@ -181,19 +180,19 @@ def _signal(course: _Course, moving: slice, every: int) -> Signal:
         unit=course.unit,
         shown_unit=typeset(course.unit),
         model=course.model,
-        measured=_told(measured[::every]),
-        modelled=None if modelled is None else _told(modelled[::every]),
-        residual=None if residual is None else _told(residual[::every]),
+        measured=round_digits(measured[::every]),
+        modelled=None if modelled is None else round_digits(modelled[::every]),
+        residual=None if residual is None else round_digits(residual[::every]),
         residual_rms=rms(left) if left.size else None,
-        measured_spectrum=_told(spectrum(measured)),
-        residual_spectrum=None if residual is None else _told(spectrum(residual)),
+        measured_spectrum=round_digits(spectrum(measured)),
+        residual_spectrum=None if residual is None else round_digits(spectrum(residual)),
     )
 
 
 def spectrum(values: Float) -> Float:
     """Return the amplitudes (m,) of a signal (n,) less its mean: a sine of amplitude 1 makes a peak of 1.
 
-    Hann's window, whose peaks are Harris' (1978); lost rows are bridged by a line. Of neighbours the largest is told.
+    Uses Hann's window (Harris 1978); lost samples are interpolated. Of adjacent frequencies the largest is kept.
     """
     if not np.isfinite(values).any():
         return np.full(0, math.nan)
@@ -210,10 +209,6 @@ def _step(size: int) -> int:
     return max(1, -(-size // MOST_POINTS))
 
 
-def _told(values: Float) -> Points:
-    """Return numbers as JSON has them, null where there is none."""
-    return [float(f"{v:.{DIGITS}g}") if math.isfinite(v) else None for v in values.tolist()]
-
-
-def _digits(values: npt.NDArray[Any]) -> list[float]:
-    return [float(f"{v:.9g}") for v in values.tolist()]
+def round_digits(values: npt.NDArray[Any], digits: int = 6) -> list[Any]:
+    """Return numbers for JSON with so many significant digits; None for non-finite ones."""
+    return [float(f"{value:.{digits}g}") if math.isfinite(value) else None for value in values.tolist()]

@@ -1,4 +1,4 @@
-"""The rapids: which were recorded, what was said of each, its signals with the model laid over, its recording."""
+"""The recorded rapids: their list, the verdict on each, its signals with the model, its recording."""
 
 import logging
 from collections.abc import AsyncIterator
@@ -13,7 +13,7 @@ from starlette.requests import HTTPConnection
 from fdhil.daemon.outcome_store import WINDOWS_FOLDER
 from fdhil.errors import StoreError
 from fdhil.store.named_file import open_named
-from fdhil.web.context import Asking, Context, Here
+from fdhil.web.context import Context, MachineDependency, PrincipalDependency
 from fdhil.web.file_answer import FileAnswer
 from fdhil.web.pages.rapid_list import (
     LARGEST_ID,
@@ -33,7 +33,6 @@ from fdhil.web.replayer import Replayer
 
 @asynccontextmanager
 async def _replaying(app: FastAPI) -> AsyncIterator[None]:
-    """End the process that replays with the one that serves."""
     try:
         yield
     finally:
@@ -41,7 +40,7 @@ async def _replaying(app: FastAPI) -> AsyncIterator[None]:
 
 
 def replayer_of(app: FastAPI) -> Replayer:
-    """Return the one that replays for this application."""
+    """Return the replayer of this application."""
     if not hasattr(app.state, "replayer"):
         app.state.replayer = Replayer(app.state.context.config)
     replayer = app.state.replayer
@@ -54,7 +53,7 @@ async def _replayer(connection: HTTPConnection) -> Replayer:
 
 
 router = APIRouter(prefix="/api/rapids", lifespan=_replaying)
-Replaying = Annotated[Replayer, Depends(_replayer)]
+ReplayerDependency = Annotated[Replayer, Depends(_replayer)]
 LOG = logging.getLogger("fdhil.web")
 Axis = Annotated[str, Path(pattern="^[A-Z]2?$")]
 Number = Annotated[int, Path(ge=1, le=LARGEST_ID)]
@@ -63,53 +62,53 @@ PARQUET = "application/vnd.apache.parquet"
 
 @router.get("")
 def rapids(
-    here: Here,
+    context: MachineDependency,
     axis: Annotated[str | None, Query(pattern="^[A-Z]2?$")] = None,
     verdict: Verdict | None = None,
     code: Annotated[str | None, Query(max_length=64)] = None,
     before: Annotated[int | None, Query(ge=1, le=LARGEST_ID)] = None,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
 ) -> Rapids:
-    """Return the newest rapids, or those ``before`` a number, of an axis, a verdict, a reason's class."""
-    with here.history() as history:
-        return page_of(history, _kept(here), axis, verdict, code, before, limit)
+    """Return the newest rapids, or those ``before`` a number, by axis, verdict and reason."""
+    with context.history() as history:
+        return page_of(history, _kept(context), axis, verdict, code, before, limit)
 
 
 @router.get("/counts")
-def counts(here: Here, axis: Annotated[str | None, Query(pattern="^[A-Z]2?$")] = None) -> Counts:
+def counts(context: MachineDependency, axis: Annotated[str | None, Query(pattern="^[A-Z]2?$")] = None) -> Counts:
     """Return how many of the newest rapids were accepted, and why the others were refused."""
-    with here.history() as history:
-        return counts_of(history, here.config.axis, axis)
+    with context.history() as history:
+        return counts_of(history, context.config.axis, axis)
 
 
 @router.get("/recordings/{name:path}", response_class=Response)
-def recording(here: Here, asking: Asking, name: str) -> Response:
-    """Return a recording as its file is, for ``fdhil replay`` and ``fdhil export``."""
+def recording(context: MachineDependency, principal: PrincipalDependency, name: str) -> Response:
+    """Return a recording as its file, for ``fdhil replay`` and ``fdhil export``."""
     try:
-        return FileAnswer(open_named(_folder(here), name), name, PARQUET)
+        return FileAnswer(open_named(_folder(context), name), name, PARQUET)
     except StoreError as error:
         if error.code == "BadName":
-            LOG.warning("BadName: %a asked for a recording %a", asking.name, name[:200])
+            LOG.warning("BadName: %a asked for a recording %a", principal.name, name[:200])
         raise
 
 
 @router.get("/{axis}/{number}")
-def rapid(here: Here, axis: Axis, number: Number) -> RapidTold:
-    """Return what the history has of one rapid."""
-    with here.history() as history:
-        return told_of(history, the_window(history, axis, number), _kept(here))
+def rapid(context: MachineDependency, axis: Axis, number: Number) -> RapidTold:
+    """Return the stored data of one rapid."""
+    with context.history() as history:
+        return told_of(history, the_window(history, axis, number), _kept(context))
 
 
 @router.get("/{axis}/{number}/signals", response_model=RapidSignals)
-async def signals(replayer: Replaying, axis: Axis, number: Number) -> Response:
-    """Return a rapid's signals with the model laid over them, as a replay finds it now."""
+async def signals(replayer: ReplayerDependency, axis: Axis, number: Number) -> Response:
+    """Return a rapid's signals with the model, as replayed now."""
     return Response(await replayer.signals(axis, number), media_type="application/json")
 
 
-def _folder(here: Context) -> FilePath:
-    return here.config.store.directory / WINDOWS_FOLDER
+def _folder(context: Context) -> FilePath:
+    return context.config.store.directory / WINDOWS_FOLDER
 
 
-def _kept(here: Context) -> Kept:
-    folder = _folder(here)
+def _kept(context: Context) -> Kept:
+    folder = _folder(context)
     return lambda name: bool(name) and (folder / name).is_file()

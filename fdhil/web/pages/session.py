@@ -1,4 +1,4 @@
-"""Logs in and out, and tells the browser who it is. Open to everyone who reaches the address; it tells no secret."""
+"""Logs in and out, and reports the session to the browser. Open to every client; reveals no secret."""
 
 from typing import Annotated
 
@@ -7,7 +7,7 @@ from pydantic import BaseModel, Field
 
 from fdhil.config.users import LONGEST_PASSWORD, Role
 from fdhil.web.access import LIFE_S
-from fdhil.web.context import AtEntry
+from fdhil.web.context import LoginDependency
 from fdhil.web.gate import token_of
 
 router = APIRouter(prefix="/api/session")
@@ -21,7 +21,7 @@ class Login(BaseModel):
 
 
 class Who(BaseModel):
-    """Who asks, and whether a login is needed: ``role`` is null where nothing may be read yet."""
+    """The client, and whether a login is needed: ``role`` is null if nothing may be read yet."""
 
     name: str
     role: Role | None
@@ -30,32 +30,34 @@ class Who(BaseModel):
 
 
 class LoggedIn(Who):
-    """A login: the token that every further request carries, and for how long at most."""
+    """A login: the token for every further request, and its longest lifetime."""
 
     token: str
     life_s: float
 
 
 @router.get("")
-async def who(request: Request, here: AtEntry) -> Who:
-    """Tell who asks."""
-    asker = here.access.asker(token_of(request.headers))
-    acting = here.web.acting
-    role, name = (asker.role, asker.name) if asker else (None, "")
-    return Who(name=name, role=role, login_needed=here.access.by_login, acting=acting and role == "operate")
+async def who(request: Request, context: LoginDependency) -> Who:
+    """Return the client's name and role."""
+    principal = context.access.asker(token_of(request.headers))
+    acting = context.web.acting
+    role, name = (principal.role, principal.name) if principal else (None, "")
+    return Who(name=name, role=role, login_needed=context.access.by_login, acting=acting and role == "operate")
 
 
 @router.post("")
-async def log_in(login: Login, request: Request, here: AtEntry) -> LoggedIn:
+async def log_in(login: Login, request: Request, context: LoginDependency) -> LoggedIn:
     """Log in."""
     address = request.client.host if request.client else ""
-    token, session = await here.access.log_in(login.name, login.password, address)
-    asker, acting = session.asker, here.web.acting and session.asker.role == "operate"
-    return LoggedIn(name=asker.name, role=asker.role, login_needed=True, acting=acting, token=token, life_s=LIFE_S)
+    token, session = await context.access.log_in(login.name, login.password, address)
+    principal, acting = session.asker, context.web.acting and session.asker.role == "operate"
+    return LoggedIn(
+        name=principal.name, role=principal.role, login_needed=True, acting=acting, token=token, life_s=LIFE_S
+    )
 
 
 @router.delete("")
-async def log_out(request: Request, here: AtEntry) -> Who:
-    """Log out: the token is worth nothing from now on."""
-    here.access.log_out(token_of(request.headers))
-    return await who(request, here)
+async def log_out(request: Request, context: LoginDependency) -> Who:
+    """Log out: the token becomes invalid."""
+    context.access.log_out(token_of(request.headers))
+    return await who(request, context)

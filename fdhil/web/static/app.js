@@ -1,4 +1,4 @@
-// The frame of all pages: it finds the page of an address, draws the navigation, and always shows the state and the way out.
+// The frame of all pages: it routes addresses, draws the navigation, and always shows the state and the Disarm button.
 
 import {el, faultBox, lamp} from "/static/dom.js";
 import {ask, download, get, onLoginNeeded, post, socket} from "/static/ask.js";
@@ -15,10 +15,10 @@ const told = document.getElementById("told");
 let endPage = null;
 let turn = 0;
 
-// what a page is given beside its place and the parts of its path
+// the arguments of a page besides its element and the parts of its path
 export const context = {ask, get, post, socket, download, watch, lookNow, until, session, logIn, disarm: disarmNow, go, say, t, ago, decimal, number, when};
 
-// tell something: for who listens at once, for who sees for a while
+// announce a message: to screen readers at once, on the screen for a while
 const SHOWN_MS = 12000;
 let hiding = null;
 export function say(text) {
@@ -98,7 +98,7 @@ function nameMachine() {
   document.title = [[...PAGES].includes(name) ? t(`nav.${name}`) : name, named, "fdhil"].filter(Boolean).join(" – ");
 }
 
-// the state of the correction, and the buttons that are always there
+// the state of the correction, and the permanent buttons
 const state = el("span", {class: "state"});
 const disarm = el("button", {type: "button", class: "stop", onclick: disarmNow}, t("disarm"));
 const login = el("button", {type: "button", class: "quiet"});
@@ -107,7 +107,7 @@ async function disarmNow() {
   say(t("disarm.asked"));
   try {
     const answer = await post("/api/machine/disarm");
-    await until((status) => !status.armed);  // what the head shows, and what is said, agree
+    await until((status) => !status.armed);  // the head and the announcement agree
     say(t("disarm.done", answer));
   } catch (fault) {
     say(`${fault.code}: ${fault.text}. ${fault.advice}`);
@@ -158,7 +158,7 @@ onSession(() => {
 onLoginNeeded(() => lookWho().catch(failed));
 
 const {name: first} = pathOf(location);
-if (PAGES.includes(first)) import(`/static/pages/${first}.js`).catch(() => null);  // while it is found out who asks
+if (PAGES.includes(first)) import(`/static/pages/${first}.js`).catch(() => null);  // while the session is requested
 drawNavigation();
 lookWho().catch(function again(fault) {
   failed(fault);

@@ -1,4 +1,4 @@
-// Asks the server. The token of a login is kept for this tab alone; it goes into a header, never into an address or a cookie.
+// Sends requests to the server. The token of a login is stored for this tab only and sent in a header, never in an address or cookie.
 
 import {t} from "/static/text.js";
 
@@ -40,20 +40,20 @@ export async function ask(path, {method = "GET", body, headers = {}, signal} = {
   throw new Fault(told, answer.status);
 }
 
-// get("/api/…") gives the document; post("/api/…", {…}) sends one and gives the answer
+// get("/api/…") returns the document; post("/api/…", {…}) sends one and returns the answer
 export const get = async (path, options = {}) => (await ask(path, options)).json();
 export const post = async (path, document = {}, options = {}) => (await ask(path, {
   method: "POST", body: JSON.stringify(document), ...options,
   headers: {"Content-Type": "application/json", ...options.headers},
 })).json();
 
-// a socket to the server, with the login: messages as WebSocket gives them
+// a socket to the server, with the login: messages as from WebSocket
 export function socket(path) {
   const place = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${path}`;
   return new WebSocket(place, ["fdhil", ...(token ? [`bearer.${token}`] : [])]);
 }
 
-// save what an address gives as a file
+// save the content of an address as a file
 export async function download(path, name) {
   const place = URL.createObjectURL(await (await ask(path)).blob());
   const link = Object.assign(document.createElement("a"), {href: place, download: name});

@@ -1,4 +1,4 @@
-// The black boxes: a list, each as a file, and what the drives did in it.
+// The black boxes: their list, downloads, and the drives' signals.
 
 import {chart} from "/static/chart.js";
 import {el, faultBox, table} from "/static/dom.js";

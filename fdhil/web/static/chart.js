@@ -1,16 +1,16 @@
-// A chart against time or anything else, on the uPlot that fdhil carries: colours of the page in light and dark, envelopes,
-// a cursor with its values in words, zoom by dragging, by the keyboard and by pinching a touchpad.
+// A chart over time or another variable, on the bundled uPlot: page colours in light and dark mode, envelopes,
+// a cursor with its values as text, zoom by dragging, keyboard and touchpad pinch.
 //
 //   const shown = chart(place, {caption, unit, series: [{label, colour: 1, band: true}], x: {label: "time", unit: "s"}});
 //   shown.set(xs, [ys, {low, high}, ...]);   // null is a gap; a series with band has two of them
-//   shown.see(from, to);                     // shows this stretch; see(null) all of it
+//   shown.see(from, to);                     // shows this section; see(null) everything
 //   shown.end();
 //
-// onZoom({from, to} | null) takes a wish to see a stretch; without it the chart just shows it. onCursor(place | null) is told
-// the place under the cursor. Charts with the same ``sync`` share their cursor. A series may have ``dash``, ``points`` or
-// ``width``; ``steady`` keeps the scale of what moves from trembling, ``zero`` keeps 0 in sight, ``log`` counts in powers
-// of ten, ``span`` is the least that the scale shows, ``time`` is for seconds since 1970, ``level`` [{label, value}] are lines across; of a series with ``band`` and
-// ``bars`` nothing but its reach is kept.
+// onZoom({from, to} | null) receives requested sections; without it the chart zooms itself. onCursor(place | null) receives
+// the position under the cursor. Charts with the same ``sync`` share their cursor. A series may have ``dash``, ``points`` or
+// ``width``; ``steady`` keeps the scale of moving data steady, ``zero`` keeps 0 visible, ``log`` uses powers
+// of ten, ``span`` is the least range of the scale, ``time`` is for seconds since 1970, ``level`` [{label, value}] are lines across; of a series with ``band`` and
+// ``bars`` only the range is kept.
 
 import {el} from "/static/dom.js";
 import {language, number, t} from "/static/text.js";
@@ -32,7 +32,7 @@ matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
 
 export function chart(place, options) {
   const told = {height: 180, x: {}, series: [], level: [], steady: false, zero: false, ...options};
-  const reading = el("output", {class: "reading", "aria-live": "off"});  // said aloud when it is moved by the keyboard
+  const reading = el("output", {class: "reading", "aria-live": "off"});  // announced when it is moved by the keyboard
   const field = el("div", {
     class: "plot", tabindex: "0", role: "group", "aria-label": t("chart.label", {caption: told.caption}), id: `chart-${++count}`,
   });
@@ -41,7 +41,7 @@ export function chart(place, options) {
   const self = {figure, plot: null, set, see, end, show};
   let data = {x: [], values: told.series.map((each) => (each.band ? {low: [], high: []} : []))};
   let range = null;
-  let at = null;  // the place under the cursor
+  let at = null;  // the position under the cursor
   self.plot = new uPlot({...plan(told, self), hooks: {setCursor: [read], setSelect: [selected], draw: [drawLevels]}}, flat(), field);
   charts.add(self);
   const sized = new ResizeObserver(() => self.plot.setSize({width: Math.max(80, field.clientWidth), height: told.height}));
@@ -82,7 +82,7 @@ export function chart(place, options) {
     if (first !== undefined) self.plot.setScale("x", range ? {min: range.from, max: range.to} : {min: first, max: last});
   }
 
-  // does something to the plot; the cursor stays at its place, which may be another sample and elsewhere on the screen then
+  // changes the plot; the cursor keeps its position, which may then be another sample and elsewhere on the screen
   function hold(act) {
     const held = at;
     reading.setAttribute("aria-live", "off");
@@ -151,14 +151,14 @@ export function chart(place, options) {
     put(next, true);
   }
 
-  // puts the cursor, of the charts that share it too, at a sample; out of sight it is none
+  // moves the cursor, also of synchronised charts, to a sample; none if it is out of sight
   function put(index, shared = false) {
     const left = inside(data.x[index]) ? self.plot.valToPos(data.x[index], "x") : -10;
     self.plot.setCursor({left, top: self.plot.over.clientHeight / 2}, true, shared);
   }
 
   function wheeled(event) {
-    if (!event.ctrlKey) return;  // a touchpad's pinch; the plain wheel scrolls the page
+    if (!event.ctrlKey) return;  // touchpad pinch; the plain wheel scrolls the page
     event.preventDefault();
     zoom(event.deltaY < 0 ? 0.8 : 1.25);
   }
@@ -207,7 +207,7 @@ function plan(told) {
   };
 }
 
-// days as month-day; within days the time, and the day where it begins
+// days as month-day; within days the time, and the date at the start of a day
 function dates(plot, ticks, index, space, step) {
   const two = (value) => String(value).padStart(2, "0");
   const told = ticks.map((tick) => new Date(tick * 1e3)).map((at) => ({
@@ -217,12 +217,12 @@ function dates(plot, ticks, index, space, step) {
   return told.map((at, k) => (k && at[coarse] === told[k - 1][coarse] ? at[fine] : `${at[fine]}\n${at[coarse]}`));
 }
 
-// what is a millionth of the largest is noise of the computer
+// a millionth of the largest is rounding noise
 function decades(plot, low, high) {
   return high > 0 ? uPlot.rangeLog(Math.max(low || 0, high * 1e-6), high, 10, true) : [0.1, 1];
 }
 
-// powers of ten, not more than six of them
+// powers of ten, at most six
 function tens(plot, index, low, high) {
   const [first, last] = [Math.ceil(Math.log10(low) - 1e-9), Math.floor(Math.log10(high) + 1e-9)];
   const step = Math.ceil((last - first + 1) / 6);

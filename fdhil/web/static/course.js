@@ -1,10 +1,10 @@
-// A chart of the report in the browser: what fdhil/report/chart.py tells, drawn on the chart of all pages, with bars and marks.
+// A chart of a report in the browser: the data of fdhil/report/chart.py drawn on the shared chart, with bars and marks.
 
 import {chart, colour} from "/static/chart.js";
 import {el} from "/static/dom.js";
 import {t} from "/static/text.js";
 
-// course(place, {told, caption}) draws one panel; what it returns has end()
+// course(place, {told, caption}) draws one panel and returns an object with end()
 export function course(place, {told, caption, height = 220}) {
   const panel = told.panels[0];
   const traces = panel.traces.map((trace) => ({...trace, grid: told.grids[trace.x]}));
@@ -24,7 +24,7 @@ export function course(place, {told, caption, height = 220}) {
 const KEYS = {points: "●", line: "━", wide: "━", dashed: "╍"};
 const unitOf = (label) => /\(([^()]*)\)$/.exec(label)?.[1] ?? "";
 
-const FAR = 8;  // medians of the others: a bar that is longer would press all of them flat, and goes beyond the edge
+const FAR = 8;  // medians of the others: a longer bar would flatten them and is cut at the edge
 
 function withoutLongest({low, high}) {
   const lengths = low.map((each, i) => high[i] - each);
@@ -33,7 +33,7 @@ function withoutLongest({low, high}) {
   return [kept(low), kept(high)];
 }
 
-// a trace as one or two of the chart's: its band, or the reach of its bars, and itself
+// a trace as one or two series: its band or the range of its bars, and itself
 function columnsOf(trace) {
   const bars = trace.style === "points";
   const series = {label: trace.label, colour: trace.colour, points: bars, dash: trace.style === "dashed" ? [7, 5] : undefined, width: 1.8};
@@ -43,7 +43,7 @@ function columnsOf(trace) {
   return [{grid: trace.grid, values: bars ? withoutLongest(trace) : [trace.low, trace.high], series: reach}, own];
 }
 
-// the bars of points, and labelled lines where something changed: the shared chart has neither
+// error bars and labelled lines of changes, which the shared chart lacks
 function drawBeside(plot, traces, marks) {
   const pen = plot.ctx, ratio = devicePixelRatio;
   const {left, top, width, height} = plot.bbox;

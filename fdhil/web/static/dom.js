@@ -1,5 +1,5 @@
 // Builds elements: el("button", {type: "button", class: "act", onclick: f}, "text", child, ...). Text is never read as HTML;
-// its units are set as they are printed, but not in what is shown word for word.
+// units are typeset, except in verbatim text.
 
 import {typeset} from "/static/typeset.js";
 
@@ -17,8 +17,8 @@ export function el(tag, attributes = {}, ...children) {
   return node;
 }
 
-// table({caption, head, rows, stack}): a cell is text, a node, or {text, class}; the first of a row is its head. With stack
-// each row is a list of its cells where the screen is narrow; the roles keep it a table for who listens to it.
+// table({caption, head, rows, stack}): a cell is text, a node, or {text, class}; the first of a row is its header. With stack
+// each row is a list of its cells on narrow screens; the roles keep it a table for screen readers.
 export function table({caption, head, rows, stack = false, ...attributes}) {
   const parts = (told) => {
     const plain = told === null || told === undefined || typeof told !== "object" || told instanceof Node;
@@ -39,13 +39,13 @@ export function table({caption, head, rows, stack = false, ...attributes}) {
       el("tbody", role("rowgroup"), rows.map((row) => el("tr", role("row"), row.map(bodyCell))))));
 }
 
-// a state as a word with a shape beside it; kind is "good", "warn", "bad" or "none"
+// a state as a word with a shape; kind is "good", "warn", "bad" or "none"
 const SHAPES = {good: "●", warn: "▲", bad: "■", none: "○"};
 export function lamp(kind, text) {
   return el("span", {class: `lamp ${kind}`}, el("span", {"aria-hidden": "true"}, SHAPES[kind]), ` ${text}`);
 }
 
-// a fault as the server tells it: what happened, what to do next
+// a fault from the server: what happened, and the next action
 export function faultBox(fault) {
   return el("div", {class: "fault", role: "alert"},
     el("strong", {}, fault.code), `: ${fault.text}`,

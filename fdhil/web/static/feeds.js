@@ -1,4 +1,4 @@
-// The feeds that keep a tolerance: asked for, waited for, and listed with a button that leads to each line.
+// The feeds that keep a tolerance: request, progress, and the list with a button for each line.
 
 import {el, faultBox, table} from "/static/dom.js";
 

@@ -1,18 +1,18 @@
-// A program's forecast on the page: figures, two maps with one scale and one camera, worst places, course, text.
+// A program's forecast: figures, two maps with one scale and one camera, worst zones, curve over time, text.
 
 import {chart} from "/static/chart.js";
 import {el, faultBox, table} from "/static/dom.js";
 import {feedsSection} from "/static/feeds.js";
 import {makeCamera, pathMap, shadeKey, zoomStep} from "/static/path.js";
 
-const FACTORS = [0, 1, 10, 100, 1000];  // 0: what the view has room for
+const FACTORS = [0, 1, 10, 100, 1000];  // 0: as far as the view has room
 const ASK_MS = 150;
 const CASES = ["before", "after"];
 const LINES_AROUND = 7;
-const LEAST_UM = 0.001;  // what no drive resolves
-const MOST_NEAR_MM = 5;  // to each side of a place that is shown; less in a small part
+const LEAST_UM = 0.001;  // below any drive's resolution
+const MOST_NEAR_MM = 5;  // to each side of a shown zone; less in a small section
 
-// ``next`` is what the page shows behind the figures
+// ``next`` is shown after the figures
 export async function showForecast(shown, told, query, context, next) {
   const {t, get} = context;
   const forecast = told.forecast;
@@ -113,7 +113,7 @@ export async function showForecast(shown, told, query, context, next) {
     tableWords.textContent = state.part?.whole ? t("program.table", {factor: state.part.factor}) : t("program.table.none");
   };
 
-  // show all of the path
+  // show the whole path
   function fit() {
     const [across, along] = state.plane.map((axis) => forecast.moved[axis]);
     const flat = state.plane[0] === state.plane[1] ? [0, 0] : along;
@@ -122,7 +122,7 @@ export async function showForecast(shown, told, query, context, next) {
     camera.set((across[0] + across[1]) / 2, (flat[0] + flat[1]) / 2, camera.widest);
   }
 
-  // show a place with what is around it; its error is drawn as large as it has to be
+  // show a zone and its surroundings, its error enlarged as needed
   const size = Math.max(...Object.values(forecast.moved).map(([low, high]) => high - low));
   function goTo(at, um) {
     const [x, y] = inPlane(at);
@@ -252,7 +252,7 @@ export async function showForecast(shown, told, query, context, next) {
     }, el("span", {}, String(each.line)), el("span", {}, each.text || " ")))));
   }
 
-  // contour errors and feed over time; a stretch that is enlarged is asked for anew, so that nothing is thinned away
+  // contour errors and feed over time; a zoomed section is requested again at full resolution
   let charts = [];
   function courseSection() {
     const place = el("div", {});
@@ -260,7 +260,7 @@ export async function showForecast(shown, told, query, context, next) {
       caption, unit, series: [{label: caption, colour}], sync: "program", zero: true, height: 150,
       x: {label: t("program.course.time"), unit: "s"}, onZoom: fetchCourse, onCursor: (at) => at !== null && pointNear(at / forecast.sync_period_s),
     });
-    queueMicrotask(() => {  // a chart wants to know how wide its place is
+    queueMicrotask(() => {  // a chart needs the width of its element
       charts = [
         ...cases.map((which, k) => made(t(`program.map.${which}`, {method}), "µm", k ? 1 : 2)),
         made(t("program.cursor.feed"), "mm/min", 3)];

@@ -1,4 +1,4 @@
-// Notices as pages show them: how grave, what happened, who acknowledged it.
+// Notices on the pages: severity, text, acknowledgement.
 
 import {el, lamp} from "/static/dom.js";
 import {t, when} from "/static/text.js";
@@ -19,7 +19,7 @@ export function answered(notice) {
   return t(given.note ? "events.acknowledged.note" : "events.acknowledged", {...given, time: minute(given.time)});
 }
 
-// "HeartbeatLost" as "Heartbeat lost"; what is written in capitals stays so
+// "HeartbeatLost" as "Heartbeat lost"; capitals are kept
 const CAPITALS = ["Nc", "Pdo", "Sync", "Crc", "Pc", "Nmt"];
 export function classWords(code) {
   const words = code.match(/[A-Z]?[a-z0-9]+|[A-Z]+(?![a-z])/g) ?? [code];

@@ -8,7 +8,7 @@ const NEAR_PX = 24;
 const LEAST_MM_PER_PX = 2e-6;
 const ZOOM_STEP = 1.5;
 
-// one look at a plane for all maps of a page: where its middle is (mm), and how much a pixel is
+// one view of a plane for all maps of a page: its centre (mm) and the size of a pixel
 export function makeCamera() {
   const changed = new EventTarget();
   const camera = {
@@ -27,14 +27,14 @@ export function makeCamera() {
   return camera;
 }
 
-// which of SHADES shades an error has; the scale is the same for all maps that are compared
+// the shade of an error, of SHADES; compared maps share the scale
 export function shadeOf(um, {largest_um: largest, least_um: least}) {
   if (!(largest > 0)) return 0;
   const share = least === null ? um / largest : Math.log(Math.max(um, least) / least) / Math.log(Math.max(largest / least, 10));
   return Math.min(SHADES - 1, Math.max(0, Math.floor(share * SHADES)));
 }
 
-// from which error on each shade is
+// the lower bound of each shade
 export function shadeLimits({largest_um: largest, least_um: least}) {
   const span = least === null ? 0 : Math.max(largest / least, 10);
   return Array.from({length: SHADES}, (_, k) => (least === null ? largest * k / SHADES : k ? least * span ** (k / SHADES) : 0));
@@ -46,7 +46,7 @@ export function shadeKey(scale, words) {
     el("span", {class: `shade shade-${k}`, "aria-hidden": "true"}), words.text(from, limits[k + 1] ?? null))));
 }
 
-// pathMap({camera, label, hint, values, scale, onCursor}): ``values`` names what of a run colours it
+// pathMap({camera, label, hint, values, scale, onCursor}): ``values`` names the figure that colours a run
 export function pathMap({camera, label, hint, values, table, scale, onCursor, onStep}) {
   const canvas = el("canvas", {
     class: "map", tabindex: "0", role: "application", "aria-label": label, "aria-describedby": hint,
@@ -184,7 +184,7 @@ export function pathMap({camera, label, hint, values, table, scale, onCursor, on
     }
   }
 
-  // the point of the path that is nearest to a pixel, null where none is near
+  // the point of the path nearest to a pixel, null without one nearby
   function nearest(px, py, within = NEAR_PX) {
     let best = null, least = within;
     for (const run of data?.runs ?? []) {
@@ -226,7 +226,7 @@ function niceStep(rough) {
   return decade * [1, 2, 5, 10].find((step) => step * decade >= rough);
 }
 
-// wheel, drag, pinch and keys: all move the one camera
+// wheel, drag, pinch and keys all move the same camera
 function listen(canvas, camera, {toMm, nearest, onCursor, onStep}) {
   const fingers = new Map();
   const place = (event) => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };

@@ -25,7 +25,7 @@ export async function logOut() {
   await lookWho();
 }
 
-// ends with true when someone has logged in, with false when it was given up
+// resolves to true after a login, to false if it was cancelled
 export function logIn() {
   return new Promise((resolve) => {
     const name = el("input", {name: "name", id: "login-name", autocomplete: "username", required: true, maxlength: "64"});

@@ -1,4 +1,4 @@
-// Small pictures that fit into a tile: a parameter within its maintenance band, and a signal of the last seconds.
+// Small charts for tiles: a parameter within its maintenance band, and a signal of the last seconds.
 
 import {colour} from "/static/chart.js";
 
@@ -26,7 +26,7 @@ export function band({label, course, low, high, least, most}) {
   return svg("svg", {class: "sparkline", viewBox: `0 0 ${WIDE} ${HIGH}`, role: "img", "aria-label": label}, ...parts);
 }
 
-// draws least and greatest of each column on a canvas; scaled to what is there, but to no less than ``span``
+// draws minimum and maximum of each column on a canvas; scaled to the data, but at least to ``span``
 export function drawTrace(canvas, {low, high}, colourName, span) {
   const ratio = devicePixelRatio, wide = canvas.width = canvas.clientWidth * ratio, tall = canvas.height = canvas.clientHeight * ratio;
   const known = [...low, ...high].filter((value) => value !== null);

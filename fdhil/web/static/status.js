@@ -1,5 +1,5 @@
-// Asks how the machine is once a second, for all of the page that shows it. watch(f) calls f({told, status, fault}):
-// what /api/machine tells, the daemon's newest status document (kept while it is silent), and why it is silent, else null.
+// Requests the machine's state once a second for the whole page. watch(f) calls f({told, status, fault}):
+// the answer of /api/machine, the daemon's newest status document (kept while it is silent), and the fault, else null.
 
 import {get} from "/static/ask.js";
 
@@ -35,7 +35,7 @@ export function watch(f) {
 
 export const lookNow = look;
 
-// resolves with true as soon as the status passes the test, with false when it has not within so many ms
+// resolves to true once the status passes the test, to false after the given ms
 export function until(test, within = 10000) {
   return new Promise((resolve) => {
     const end = (passed) => { clearTimeout(timer); queueMicrotask(() => stop()); resolve(passed); };

@@ -1,9 +1,9 @@
-// The words of the pages in the browser's language; English where there is no other. t("key", {name: value}) fills {name} in.
+// The texts of the pages in the browser's language, English by default. t("key", {name: value}) fills in {name}.
 
 import english from "/static/text/en.js";
 import {typeset} from "/static/typeset.js";
 
-const LANGUAGES = ["en", "de", "fr"];  // another one is a file of its name next to en.js, and its name here
+const LANGUAGES = ["en", "de", "fr"];  // to add a language, add its file next to en.js and its name here
 const chosen = (navigator.languages ?? []).map((told) => told.slice(0, 2)).find((told) => LANGUAGES.includes(told)) ?? "en";
 const own = chosen === "en" ? english : (await import(`/static/text/${chosen}.js`)).default;
 document.documentElement.lang = chosen;
@@ -15,8 +15,8 @@ export function t(key, values = {}) {
   return typeset(words.replace(/\{(\w+)\}/g, (whole, name) => (name in values ? String(values[name]) : whole)));
 }
 
-// a number with so many digits that count, grouped as the language has it
-const TINY = 1e-6;  // what is smaller would be a row of zeros
+// a number with significant digits, grouped by the language's rules
+const TINY = 1e-6;  // smaller numbers would be all zeros
 
 export function number(value, digits = 4) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
@@ -24,7 +24,7 @@ export function number(value, digits = 4) {
   return value.toLocaleString(chosen, {maximumSignificantDigits: digits, notation});
 }
 
-// a number with so many decimals, never -0
+// a number with fixed decimals, never -0
 export function decimal(value, places) {
   const shown = Number(value.toFixed(places)) + 0;
   return shown.toLocaleString(chosen, {minimumFractionDigits: places, maximumFractionDigits: places});

@@ -1,4 +1,4 @@
-// Sets units and signs as they are printed, as fdhil/report/typography.py does (a test compares the two): µm, ±, °C and N·m.
+// Typesets units and signs like fdhil/report/typography.py (a test compares the two): µm, ±, °C and N·m.
 
 const PRINTED = {
   "N.m.s/rad": "N·m·s/rad", "N.m/A": "N·m/A", "N.m.s": "N·m·s", "mN.m.s": "mN·m·s", "N.m": "N·m", "kg.m2": "kg·m²", "g.m2": "g·m²",

@@ -57,7 +57,7 @@ class _Reader:
             self._fork.join()
             self._asked.close()
             assert self._fork.exitcode != RAISED, f"{self._module.__name__}.read raised what it must not, see above"
-            return RecordingError("its reader did not survive it")
+            return RecordingError("its reader crashed")
 
 
 def _read_all(module: Any, asked: Connection, others: Connection) -> None:

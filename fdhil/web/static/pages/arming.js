@@ -1,4 +1,4 @@
-// Arming: choose what, see its predicted error and what it may move, confirm. To disarm asks nothing; the button for that is
+// Arming: choose a program, see its predicted error and what it may move, confirm. Disarming needs no confirmation; its button is
 // in the head of every page.
 
 import {el, faultBox, table} from "/static/dom.js";
@@ -7,7 +7,7 @@ const POLL_MS = 400;
 const FORECAST_METHOD = "inverse";
 const UNSET = "-";
 
-// ``only``: {name, digest} of the one program that may be armed there; else it is chosen in the dialogue
+// ``only``: {name, digest} of the only program that may be armed there; otherwise it is chosen in the dialog
 export function armingPanel(context, only = null) {
   const {t, session} = context;
   const open = el("button", {type: "button", class: "primary", id: "arm", onclick: () => choose(context, only)}, t("arm.open"));
@@ -44,7 +44,7 @@ async function choose(context, only) {
   const predicted = el("p", {"aria-live": "polite", id: "arm-predicted"});
   const told = el("div", {"aria-live": "assertive"});
   const confirm = el("button", {type: "submit", class: "primary", disabled: true}, t("arm.confirm"));
-  // the dialog covers the head of the page, and with it the button that must always be there
+  // the dialog covers the head of the page with the Disarm button, which must always be visible
   const disarm = el("button", {type: "button", class: "stop", onclick: context.disarm}, t("disarm"));
   const dialog = el("dialog", {id: "arming", "aria-labelledby": "arm-title"}, el("form", {method: "dialog", onsubmit: act},
     el("h2", {id: "arm-title"}, t("arm.title")),
@@ -74,7 +74,7 @@ async function choose(context, only) {
     if (plan.program) predict(plan, () => mine === turn);
   }
 
-  // the forecast of the page Program, as it is or made now
+  // the forecast of the page Program, existing or computed now
   async function predict({program: {name, sha256}, method: chosen}, current) {
     if (chosen !== FORECAST_METHOD) { predicted.textContent = t("arm.predicted.none"); return; }
     predicted.textContent = t("arm.predicting");
@@ -106,7 +106,7 @@ async function choose(context, only) {
       const answer = await context.post("/api/machine/arm",
         {program: plan.program?.name ?? null, method: plan.method, confirm: plan.confirm}, {signal: stopping.signal});
       told.replaceChildren(el("p", {}, t("arm.waiting")));
-      await context.until((status) => status.armed || status.state === "OFF(SHADOW)");  // closed when the guard says so
+      await context.until((status) => status.armed || status.state === "OFF(SHADOW)");  // closed once the guard reports it
       context.say(answer.text);
       dialog.close();
     } catch (fault) {

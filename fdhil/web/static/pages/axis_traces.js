@@ -15,7 +15,7 @@ export class AxisTraces {
     this.connect();
   }
 
-  // lights: {X: {light, text}} as /api/machine tells it
+  // lights: {X: {light, text}} from /api/machine
   update(lights) {
     for (const axis of this.rows.keys()) if (!(axis in lights)) { this.rows.get(axis).row.remove(); this.rows.delete(axis); }
     for (const [axis, {light, text}] of Object.entries(lights)) {

@@ -1,4 +1,4 @@
-// Alarms with cause, effect and next action, those that wait in front; black boxes: /events?axis=X&code=C&severity=S.
+// Alarms with cause, effect and next action, unacknowledged ones first; black boxes: /events?axis=X&code=C&severity=S.
 
 import {boxesSection} from "/static/black_boxes.js";
 import {el, faultBox, lamp} from "/static/dom.js";
@@ -10,7 +10,7 @@ const FILTERS = ["axis", "code", "severity"];
 
 export async function show(main, path, context) {
   dress();
-  const place = main.appendChild(el("div"));  // what comes after another page was asked for goes nowhere
+  const place = main.appendChild(el("div"));  // answers that arrive after a page change are ignored
   const only = Object.fromEntries(FILTERS.map((name) => [name, path.query.get(name)]).filter(([, value]) => value));
   const wanted = new URLSearchParams(only);
   let told = await context.get(`/api/events?${wanted}`);
@@ -103,7 +103,7 @@ function filter(told, only, context) {
   return el("form", {class: "choices", "aria-label": t("events.filter"), onsubmit: (event) => event.preventDefault()}, selects);
 }
 
-// ends with true when the daemon has kept it
+// resolves to true once the daemon has stored it
 function askToAcknowledge(about, which, context) {
   return new Promise((resolve) => {
     const note = el("input", {id: "acknowledge-note", maxlength: "200", autocomplete: "off"});

@@ -1,4 +1,4 @@
-// All machines: /fleet, and how the parameters of one axis moved: /fleet/MACHINE/AXIS. It reads; nothing reaches a machine.
+// All machines: /fleet, and the parameter trends of one axis: /fleet/MACHINE/AXIS. Reads only; nothing reaches a machine.
 
 import {chart} from "/static/chart.js";
 import {el, lamp, table} from "/static/dom.js";
@@ -14,7 +14,7 @@ const section = (title, ...children) => el("section", {"aria-label": title}, el(
 const place = (machine, axis) => el("a", {href: `/fleet/${encodeURIComponent(machine)}/${axis}`}, t("fleet.axis.of", {machine, axis}));
 
 export async function show(main, path, context) {
-  const spot = main.appendChild(el("div"));  // what comes after another page was asked for goes nowhere
+  const spot = main.appendChild(el("div"));  // answers that arrive after a page change are ignored
   if (path.rest.length === 2) return showAxis(spot, ...path.rest, context);
   const by = path.query.get("by") ?? "type";
   const [told, unlike] = await Promise.all([context.get("/api/fleet"), context.get(`/api/fleet/outliers?by=${encodeURIComponent(by)}`)]);

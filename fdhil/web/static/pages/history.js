@@ -1,4 +1,4 @@
-// How the drives are and how their parameters moved: /history, /history/X.
+// The drives' state and parameter trends: /history, /history/X.
 
 import {course} from "/static/course.js";
 import {el, lamp, table} from "/static/dom.js";
@@ -9,7 +9,7 @@ const date = (time) => (time ? time.slice(0, 10) : "–");
 
 export async function show(main, path, context) {
   dress();
-  const place = main.appendChild(el("div"));  // what comes after another page was asked for goes nowhere
+  const place = main.appendChild(el("div"));  // answers that arrive after a page change are ignored
   if (path.rest.length) return showAxis(place, path.rest[0], context);
   const {axes} = await context.get("/api/history");
   if (axes.length === 1) return showAxis(place, axes[0].axis, context);

@@ -1,4 +1,4 @@
-// The page live: the chosen signals of the axes and their path as they pass, frozen and enlarged down to single samples.
+// The page live: the selected signals of the axes and their path, frozen and zoomed down to single samples.
 
 import {chart} from "/static/chart.js";
 import {el, table} from "/static/dom.js";
@@ -10,7 +10,7 @@ const MOST_COLUMNS = 800, FEWEST_COLUMNS = 150;
 const RETRY_MS = [500, 1000, 2000, 5000];
 const TABLE_MS = 500;
 const NOTE_MS = 5000;
-// in the order of the page: how little a chart shows at least, so that noise at rest looks like noise
+// in the order of the page: the least range of a chart, so that noise at standstill looks like noise
 const SPANS = {
   position_mm: 0.1, demand_mm: 0.1, speed_rad_s: 2, following_error_um: 2, current_a: 1, voltage_v: 2, offset_um: 2, temperature_c: 1,
 };
@@ -73,7 +73,7 @@ class Live {
 
   lost({reason}) {
     this.state.textContent = reason ? this.t("live.closed", {text: reason}) : this.t("live.lost");
-    this.context.lookNow();  // which also finds out whether the login has ended
+    this.context.lookNow();  // which also detects an ended login
     this.retry = setTimeout(() => this.connect(), RETRY_MS[Math.min(this.tries++, RETRY_MS.length - 1)]);
   }
 
@@ -106,7 +106,7 @@ class Live {
     if (note) this.remark(note);
   }
 
-  // says something beside the state for some seconds
+  // shows a message next to the state for some seconds
   remark(note) {
     this.note.textContent = note;
     clearTimeout(this.forget);
@@ -146,7 +146,7 @@ class Live {
     this.tell();
   }
 
-  // a signal as it is shown: the speed is that of the table
+  // a signal as displayed: the speed is that of the table
   shownAs(name, axis, {low, high}) {
     if (name !== "speed_rad_s") return {low, high};
     const scaled = (values) => values.map((value) => (value === null ? null : value * this.begun.mm_per_rad[axis]));
@@ -183,7 +183,7 @@ class Live {
     this.drawSignals(columns.x, (axis, name) => columns.of(axis, this.place[name]));
   }
 
-  // draws what is chosen; ``of`` returns {low, high} of an axis' signal
+  // draws the selection; ``of`` returns {low, high} of an axis' signal
   drawSignals(x, of) {
     this.charts.forEach((each, n) => {
       const name = this.names[n];
@@ -219,7 +219,7 @@ class Live {
     this.tell();
   }
 
-  // around the cursor where it is in sight, else around the middle
+  // around the cursor if it is visible, else around the middle
   zoom(factor) {
     const {from, to} = this.stretch();
     const fixed = this.at !== null && this.at > from && this.at < to ? this.at : (from + to) / 2;
@@ -235,7 +235,7 @@ class Live {
     return this.frozen?.stretch ?? {from: -this.seconds, to: 0};
   }
 
-  // shows a stretch of what is frozen with all that is kept of it; null shows all of it again
+  // shows a section of the frozen data at full resolution; null shows all of it
   async see(stretch) {
     if (!this.frozen) this.freeze();
     const {frozen} = this;
@@ -278,14 +278,14 @@ class Live {
     }
   }
 
-  // the columns as they were when it was frozen
+  // the columns at the time of freezing
   drawFrozen(frozen) {
     frozen.samples = null;
     this.fill(frozen.columns);
     this.tell();
   }
 
-  // in words -------------------------------------------------------------------------------------------------------
+  // text -------------------------------------------------------------------------------------------------------
 
   tell() {
     const {t, begun, columns, frozen, header} = this;
@@ -332,7 +332,7 @@ class Live {
     return index === undefined ? null : index;
   }
 
-  // as many decimals for every value of a signal, so that digits do not jump
+  // the same decimals for every value of a signal, so that digits do not jump
   fixed(name, value) {
     return this.context.decimal(value, name.endsWith("_mm") ? 3 : name === "current_a" ? 2 : 1);
   }

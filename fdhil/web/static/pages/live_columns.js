@@ -1,6 +1,6 @@
-// Keeps what the stream tells on one grid of columns: the newest ones of every signal of every axis.
+// Keeps the stream on one grid of columns: the newest ones of every signal of every axis.
 
-// a message is a length, a header in JSON, and behind it the least and the greatest of every column
+// a message is a length, a header in JSON, then minimum and maximum of every column
 export function decode(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
@@ -20,7 +20,7 @@ export class Columns {
     this.period_s = begin.sync_period_s;
     this.signals = begin.signals;
     this.count = count;
-    this.end = null;  // the column behind the newest
+    this.end = null;  // the column after the newest
     this.kept = new Map(begin.axes.map((axis) => [axis, begin.signals.map(() => ({low: empty(count), high: empty(count)}))]));
     this.x = Array.from({length: count}, (_, k) => (k - count + 0.5) * this.width * this.period_s);
   }
@@ -42,7 +42,7 @@ export class Columns {
     }
   }
 
-  // move on so that the grid ends with this column; what is too old leaves it
+  // move the grid so that it ends with this column; older ones are dropped
   reach(end) {
     if (this.end === null) this.end = end;
     const step = Math.min(this.count, end - this.end);
@@ -64,7 +64,7 @@ export class Columns {
     return twin;
   }
 
-  // the values of a signal as a chart takes them: null where there is none
+  // the values of a signal for a chart: null for missing ones
   of(axis, s) {
     const {low, high} = this.kept.get(axis)[s];
     return {low: Array.from(low, known), high: Array.from(high, known)};

@@ -1,4 +1,4 @@
-// The path of two axes as it passes: the demand and where the axes are, in one scale for both.
+// The live path of two axes: demand and position, in one scale.
 
 import {colour} from "/static/chart.js";
 import {el} from "/static/dom.js";

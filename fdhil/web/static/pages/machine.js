@@ -1,4 +1,4 @@
-// The machine: its axes now, the correction, what needs somebody, each parameter within its band; the tables are details.
+// The machine: its axes now, the correction, required actions, each parameter within its band; tables as details.
 
 import {el, faultBox, lamp, table} from "/static/dom.js";
 import {classOf, dress, minute, noticeText, where} from "/static/notices.js";
@@ -26,7 +26,7 @@ export async function show(main, path, context) {
   let revisions = "";
   let drawn = {};
 
-  // a part is drawn again only when what it shows has changed, so that focus and selection stay
+  // a part is redrawn only if its content has changed, so that focus and selection are kept
   function draw(name, shown, ...nodes) {
     const key = JSON.stringify(shown);
     if (drawn[name] === key) return;
@@ -75,7 +75,7 @@ function sentence(text) {
   return text ? `${text[0].toUpperCase()}${text.slice(1)}.` : "";
 }
 
-// what is to be done, and the alarms that are active: their number leads to all of them
+// required actions and active alarms, with a link to all of them
 function needs(next, alarms, {t}) {
   const steps = next.map((step) => el("li", {class: step.urgent ? "urgent" : null},
     step.urgent ? lamp("bad", t("machine.urgent")) : null, " ", el("strong", {}, step.text), " ",
@@ -87,7 +87,7 @@ function needs(next, alarms, {t}) {
   return el("ul", {class: "steps"}, steps, shown, more);
 }
 
-// the last passes: what was predicted, and what was measured next to it
+// the last passes: predicted and measured errors
 function passes(status, {t, number}) {
   const told = (status?.passes ?? []).slice(-PASSES).reverse();
   if (!told.length) return [el("p", {class: "soft"}, t("machine.passes.none"))];
@@ -166,7 +166,7 @@ function smallChart(axis, name, {value, low, high, unit, first, change, limit, l
     el("p", {}, lamp(light, ""), ` ${moved}`, light === "bad" ? `, ${t("change.bad")}` : "")];
 }
 
-// one decimal beyond the place where half the interval begins
+// one decimal more than the first digit of half the interval
 const places = (half) => (half ? Math.max(0, Math.min(7, 1 - Math.floor(Math.log10(half)))) : 4);
 const signed = (change, decimal) => `${change >= 0.0005 ? "+" : ""}${decimal(change * 100, 1)}`;
 

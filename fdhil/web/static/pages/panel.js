@@ -1,4 +1,4 @@
-// A panel for a tab of an NC's own screen, from 400 x 300 pixels on: state, offsets, what runs, and the way out.
+// A panel for a tab of an NC's own screen, from 400 x 300 pixels on: state, offsets, running program, and the Disarm button.
 
 import {el, faultBox, lamp, table} from "/static/dom.js";
 import {useStyles} from "/static/pages/program.js";

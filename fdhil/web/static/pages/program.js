@@ -1,4 +1,4 @@
-// Programs before they are cut: drop one, see where and why it errs, without and with the correction.
+// Programs before machining: drop one, see where and why it has errors, without and with the correction.
 
 import {el, faultBox, lamp, table} from "/static/dom.js";
 import {showForecast} from "/static/forecast.js";
@@ -23,7 +23,7 @@ export async function show(main, path, context) {
   return () => ends.forEach((end) => end());
 }
 
-// wait until the styles are there, so that nothing is drawn without them
+// wait for the styles, so that nothing is drawn without them
 export function useStyles() {
   const place = "/static/pages/program.css";
   if (document.querySelector(`link[href="${place}"]`)) return Promise.resolve();
@@ -79,7 +79,7 @@ function dropPlace(kept, named, context) {
       el("a", {href: `/program/${each.digest}`}, each.name), each.state === "done" ? "" : ` (${t(`program.state.${each.state}`)})`)))) : null);
 }
 
-// asks until the forecast is over, then shows it; returns what ends it
+// polls until the forecast is over, then shows it; returns a function that ends it
 function follow(shown, digest, query, context, next, onDone) {
   const {t} = context;
   const words = el("span", {});
@@ -143,7 +143,7 @@ async function learning(context) {
   return part;
 }
 
-// arm what was judged, and see its passes: measured next to predicted
+// arm the judged program, and show its passes: measured and predicted
 function onTheMachine(place, told, context) {
   const {t, number} = context;
   const arming = armingPanel(context, {name: told.name, digest: told.digest});
@@ -167,7 +167,7 @@ function onTheMachine(place, told, context) {
   return () => { stop(); arming.end(); };
 }
 
-// every pass that the history keeps, a page at a time
+// all stored passes, page by page
 async function jobs(context) {
   const {t, number} = context;
   const part = el("section", {"aria-labelledby": "program-jobs"}, el("h2", {id: "program-jobs"}, t("program.jobs")));
@@ -193,7 +193,7 @@ async function jobs(context) {
   return part;
 }
 
-// the passes as a little curve beside their numbers, which say the same
+// the passes as a small curve next to their numbers
 function curve({curve_um: left, without_um: without}, t) {
   const svg = (tag, attributes, ...children) => {
     const node = document.createElementNS("http://www.w3.org/2000/svg", tag);

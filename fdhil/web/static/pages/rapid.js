@@ -1,4 +1,4 @@
-// One rapid: its verdict and reasons in words, its signals with the model laid over, spectra; ?with=X/12 lays another beside.
+// One rapid: its verdict and reasons, its signals with the model, spectra; ?with=X/12 compares another.
 
 import {el, faultBox, table} from "/static/dom.js";
 import {Drawn} from "/static/pages/rapid_charts.js";
@@ -24,7 +24,7 @@ class Page {
     const other = path.query.get("with")?.match(/^([A-Z])\/(\d+)$/);
     const asked = [[axis, id], ...(other ? [other.slice(1)] : [])];
     const signals = Promise.all(asked.map((each) => this.context.get(`${apiOf(...each)}/signals`)));
-    signals.catch(() => null);  // it is told where it is drawn
+    signals.catch(() => null);  // reported where it is drawn
     const [told, second] = await Promise.all(asked.map((each) => this.context.get(apiOf(...each))));
     if (this.over) return;
     document.title = `${t("rapid.title", told.rapid)} – fdhil`;
@@ -66,7 +66,7 @@ class Page {
       el("h2", {}, verdictOf(rapid)), el("p", {}, facts.join(" ")), this.said.reasons, this.said.warnings, this.differs);
   }
 
-  // what to do is known once the recording was replayed; and whether today's configuration says something else
+  // the replay adds the next action, and whether the present configuration changes the verdict
   replayed(rapid, now) {
     for (const name of ["reasons", "warnings"]) {
       const advised = rapid[name].map((said) => ({...said, advice: now[name].find(({code}) => code === said.code)?.advice}));

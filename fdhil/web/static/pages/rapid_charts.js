@@ -1,5 +1,5 @@
-// The charts of a rapid: each signal with its model and below it what the model leaves, or with another rapid and below it
-// their difference; then spectra. What the charts show is told in tables and sentences too.
+// The charts of a rapid: each signal with its model and below it the residual, or with another rapid and below it
+// their difference; then spectra. Tables and sentences contain the same.
 
 import {chart} from "/static/chart.js";
 import {el, table} from "/static/dom.js";
@@ -144,14 +144,14 @@ function numbersOfTwo({rapid, own}, other) {
   return table({caption: t("rapid.numbers"), stack: true, head: [t("rapid.signal"), ...heads, t("rapid.difference_rms")], rows});
 }
 
-// another rapid's signal at the times of this one, both counted from the move's begin; turned round where it went the other way
+// another rapid's signal at the times of this one, both from the start of the move; mirrored if it moved the other way
 function laidOver(own, other, values) {
   const side = own.direction * other.direction;
   const later = own.move_begin_s - other.move_begin_s;
   return between(own.time_s, other.time_s.map((time) => time + later), values).map((value) => (value === null ? null : side * value));
 }
 
-// straight lines between the known values; null beyond them and beside unknown ones
+// linear interpolation between known values; null beyond them and next to unknown ones
 function between(x, grid, values) {
   let k = 0;
   return x.map((at) => {

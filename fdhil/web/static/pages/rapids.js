@@ -1,4 +1,4 @@
-// The page rapids: which were recorded and what was said of each; /rapids/X/12 is one of them.
+// The page rapids: the recorded ones with their verdicts; /rapids/X/12 is one of them.
 
 import {el, faultBox, lamp, table} from "/static/dom.js";
 import {decimal, number, t, when} from "/static/text.js";
@@ -8,7 +8,7 @@ const PAGE = {wide: 25, narrow: 10};
 
 export async function show(main, path, context) {
   dress();
-  const place = main.appendChild(el("div"));  // what comes after another page was asked for goes nowhere
+  const place = main.appendChild(el("div"));  // answers that arrive after a page change are ignored
   if (path.rest.length === 2) return (await import("/static/pages/rapid.js")).show(place, path, context);
   const list = new List(place, context);
   await list.begin(path);
@@ -20,7 +20,7 @@ function dress() {
   if (!document.querySelector(`link[href="${LOOK}"]`)) document.head.append(el("link", {rel: "stylesheet", href: LOOK}));
 }
 
-// "2026-11-20T13:20:19+00:00" as every page writes a time
+// "2026-11-20T13:20:19+00:00" as every page formats times
 export const at = (time) => when(Date.parse(time) / 1000);
 export const way = (rapid) => `${rapid.direction > 0 ? "+" : "−"}${rapid.axis}`;
 export const place = (rapid) => `/rapids/${rapid.axis}/${rapid.id}`;
@@ -89,7 +89,7 @@ class List {
     if (count !== null) this.context.say(t("rapids.shown", {count}));
   }
 
-  // returns how many came; null when the next question was asked meanwhile
+  // returns the number of rapids; null if another request was sent meanwhile
   async fetch() {
     this.asking?.abort();
     const asking = this.asking = new AbortController();

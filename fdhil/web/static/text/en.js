@@ -1,4 +1,4 @@
-// All words in English, by key. The words of a page are in en/PAGE.js; what all pages share is here.
+// All texts in English, by key. The texts of a page are in en/PAGE.js, the shared ones here.
 
 import events from "/static/text/en/events.js";
 import fleet from "/static/text/en/fleet.js";
@@ -26,7 +26,7 @@ export default {
   "login.title": "Log in",
   "login.name": "Name",
   "login.password": "Password",
-  "login.needed": "The machine is shown to who has logged in.",
+  "login.needed": "Log in to see the machine.",
   "login.cancel": "Cancel",
   "logout": "Log out {name}",
   "logout.done": "You are logged out.",
@@ -35,11 +35,11 @@ export default {
   "disarm.asked": "Disarming: the correction is ramped to zero …",
   "disarm.done": "Disarmed. {text}",
   "state": "Correction: {state}",
-  "state.unknown": "Correction: not known",
-  "daemon.silent": "The daemon does not answer. What is shown is from before.",
+  "state.unknown": "Correction: unknown",
+  "daemon.silent": "The daemon does not answer. The figures shown are old.",
   "daemon.back": "The daemon answers again.",
-  "network.lost": "fdhil web does not answer. Is it running, and is the network there?",
-  "network.advice": "It is asked again every few seconds.",
+  "network.lost": "fdhil web does not answer. Is it running, and is the network available?",
+  "network.advice": "It is retried every few seconds.",
   "ago.never": "never",
   "ago.seconds": "{count} s ago",
   "ago.minutes": "{count} min ago",

@@ -11,7 +11,7 @@ export default {
   "panel.nc": "NC: {motion}, line {line}, F {feed} mm/min, feed override {override}",
   "panel.armed": "Armed: {program}, {promise}",
   "panel.armed.none": "Nothing is armed.",
-  "panel.waiting": "{count} notices wait to be acknowledged.",
+  "panel.waiting": "{count} notices to be acknowledged.",
   "panel.checking": "Checking {program}, line {line}",
   "panel.pass": "Last pass of {program}: {measured} µm RMS measured, {predicted} predicted",
 };
