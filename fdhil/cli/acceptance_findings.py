@@ -1,4 +1,4 @@
-"""Gathers what an acceptance report says, and which points are open, each by a rule."""
+"""Content of an acceptance report and the rules of its open points."""
 
 import csv
 import hashlib
@@ -30,13 +30,13 @@ from fdhil.report.history_course import AxisHistory
 from fdhil.report.history_reading import PASS, by_axis, read_history, read_notices, read_passes
 
 SCHEMA = "fdhil-acceptance-1"
-NO_LIMIT = "no limit was set: give --circle-um and --contour-um what the machine must keep"
+NO_LIMIT = "no limit was set: give the required accuracy with --circle-um and --contour-um"
 NEWEST_PASSES = 20
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What was asked for: see ``fdhil acceptance --help``."""
+    """Options of ``fdhil acceptance``."""
 
     by: str
     customer: str
@@ -50,13 +50,13 @@ class Asked:
 
     @property
     def limits(self) -> Sequence[float]:
-        """The limits that were set."""
+        """Limits that were set, um."""
         return [um for um in (self.contour_um, self.circle_um) if um is not None]
 
 
 @dataclass(frozen=True, slots=True)
 class AxisProof:
-    """What was proven of one drive: its record and when each step was done; what speaks against it, or nothing."""
+    """Commissioning of one drive: record, time of each step, and the objection, or an empty text."""
 
     record: CommissioningRecord | None
     steps: Mapping[str, str]
@@ -65,10 +65,10 @@ class AxisProof:
 
 @dataclass(frozen=True, slots=True)
 class Findings:
-    """All that the report says. ``circles`` are by how they were found; ``plane`` is empty where no two axes move.
+    """Content of the report. ``circles`` are by their origin; ``plane`` is None without two linear axes.
 
-    ``passes`` are the last that were cut corrected, ``notices`` those that nobody has acknowledged, both as JSON has
-    notices; ``latency`` is what fdhil doctor --latency measured last.
+    ``passes`` are the latest corrected passes and ``notices`` the pending notices, both as JSON entries; ``latency`` is
+    the latest result of fdhil doctor --latency.
     """
 
     machine: MachineConfig
@@ -87,7 +87,7 @@ class Findings:
 
 
 def find(machine: MachineConfig, config: Path, asked: Asked) -> Findings:
-    """Gather everything; ConfigError, StoreError, ProgramError, RecordingError where something cannot be read."""
+    """Gather the content. Raises ConfigError, StoreError, ProgramError, RecordingError."""
     proofs = {axis: _proof(machine, axis) for axis in machine.axis}
     passes: Sequence[Mapping[str, Any]] = []
     notices: Sequence[Mapping[str, Any]] = []
@@ -107,13 +107,13 @@ def find(machine: MachineConfig, config: Path, asked: Asked) -> Findings:
     path = _planned(asked.program, config, identified) if asked.program else None
     points = [f"{axis}: {proof.against}" for axis, proof in proofs.items() if proof.against]
     points += [
-        f"{axis}: no parameters were published, the nominal ones stand in; let the daemon see some rapids"
+        f"{axis}: no published parameters, nominal ones are used; run the daemon while the axis makes rapids"
         for axis in machine.axis
         if axis not in known
     ]
     points += _beyond(asked, circles, path)
     if major := sum(notice["severity"] == "MAJOR" for notice in notices):
-        points.append(f"{major} MAJOR notices that nobody has acknowledged; see fdhil status, then fdhil acknowledge")
+        points.append(f"{major} MAJOR notices are pending; see fdhil status, then fdhil acknowledge")
     made = datetime.now(UTC).isoformat(timespec="seconds")
     known_by = (machine, asked, made, proofs, histories, identified, plane, circles, path)
     return Findings(*known_by, passes, notices, read_latency(machine), points)
@@ -162,7 +162,7 @@ def _table_mm(predicted: Prediction, plane: tuple[str, str]) -> Float:
 
 
 def read_path(path: Path, plane: tuple[str, str]) -> Float:
-    """Return the columns of a measured path (n, 2), mm. RecordingError where the file has none."""
+    """Return a measured path (n, 2), mm. Raises RecordingError if the file has none."""
     names = [f"{axis}_mm" for axis in plane]
     try:
         with path.open(encoding="utf-8", newline="") as file:
@@ -171,32 +171,32 @@ def read_path(path: Path, plane: tuple[str, str]) -> Float:
         raise RecordingError(f"{path} cannot be read ({error.strerror}); check the path") from None
     except (KeyError, TypeError, ValueError, csv.Error):
         text = (
-            f"{path} is no measured path: a CSV with the columns {', '.join(names)} and a number in each row is needed"
+            f"{path} is not a measured path; provide a CSV with the columns {', '.join(names)} and numbers in each row"
         )
         raise RecordingError(text) from None
     if not rows or not np.isfinite(rows).all():
-        raise RecordingError(f"{path} holds no path, or a place that is no number; export it again")
+        raise RecordingError(f"{path} has no rows, or a value that is not finite; export it again")
     return np.array(rows)
 
 
 def _beyond(asked: Asked, circles: Mapping[str, Circular], path: Correction | None) -> list[str]:
-    """Return the limits that are not kept; a limit without anything to compare it with is open too."""
+    # a limit without a result to compare is open as well
     points = []
     if asked.circle_um is not None:
-        told = circles.get("measured") or circles.get("predicted, corrected") or circles.get("predicted, uncorrected")
-        if told is None or told.both_um > asked.circle_um:
-            found = "no circle could be run" if told is None else f"it is {told.both_um:.1f} um"
+        circle = circles.get("measured") or circles.get("predicted, corrected") or circles.get("predicted, uncorrected")
+        if circle is None or circle.both_um > asked.circle_um:
+            found = "no circle is possible" if circle is None else f"it is {circle.both_um:.1f} um"
             points.append(f"circular deviation: {asked.circle_um:g} um are allowed, {found}")
     if asked.contour_um is not None:
         if path is None:
-            points.append(f"contour error: {asked.contour_um:g} um are allowed, and no --program was given to tell it")
+            points.append(f"contour error: {asked.contour_um:g} um are allowed, but no --program was given")
         elif (largest := float((path.before if path.refused else path.after).contour_um.max())) > asked.contour_um:
             points.append(f"contour error: {asked.contour_um:g} um are allowed, it is {largest:.1f} um")
     return points
 
 
 def document_of(found: Findings) -> dict[str, Any]:
-    """Return what the report says as JSON has it; ``sha256`` is over all the rest, keys sorted, no spaces."""
+    """Return the content as JSON; ``sha256`` covers all other entries, with sorted keys and without spaces."""
     machine, asked = found.machine, found.asked
     document: dict[str, Any] = {
         "schema": SCHEMA,

@@ -1,4 +1,4 @@
-"""``fdhil commission``: set the drives up step by step, and try them by moving them where the operator allows it."""
+"""``fdhil commission``: commission the drives step by step, and run a trial if the operator allows motion."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from fdhil.cli.commission_steps import (
 )
 from fdhil.cli.commission_trial import ask_room, try_commissioned
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, CONFIG
+from fdhil.cli.options import AS_JSON, CONFIG, help_epilog
 from fdhil.errors import ConfigError, ConfigFault, DriveFault
 
 if TYPE_CHECKING:
@@ -37,26 +37,31 @@ if TYPE_CHECKING:
 
 SCHEMA = "fdhil-commission-1"
 NEXT = "next: fdhil run and, in another terminal, fdhil-guard; then switch the NC on and let it make rapids"
-NEXT_UNTRIED = (
-    f"{NEXT}, which identify the drives (or fdhil commission --room BACK FORWARD, which moves the axes itself)"
-)
+NEXT_UNTRIED = f"{NEXT}, which identify the drives (or run fdhil commission --room BACK FORWARD, which moves the axes)"
 NEXT_PDOS = "next: fdhil commission"
-NEXT_STOPPED = "next: run the same command again; it continues with the step that was not finished"
-NEXT_REFUSED = "next: correct that, then run the same command again; completed steps are kept"
+NEXT_STOPPED = "next: run the same command again; it continues with the unfinished step"
+NEXT_REFUSED = "next: correct the cause, then run the same command again; completed steps are kept"
 
 
-@click.command()
-@CONFIG
-@click.option("--axis", "only", help="Commission this axis; left out: all, one after the other.")
-@click.option("--room", nargs=2, type=float, metavar="BACK FORWARD",
-              help="How far, mm, each axis may go from where it stands: -20 200. It is then tried by a jog and rapids, "
-              "and identified; left out, you are asked, and with --yes it is not tried.")  # fmt: skip
-@click.option("--dry-run", is_flag=True, help="Say what each step does and moves, and send nothing.")
-@click.option("--again", is_flag=True, help="Do all steps anew, also those that were done with this very drive.")
-@click.option(
-    "--set-pdos", is_flag=True, help="Write the PDOs of the drives' profiles, save them in the drives; no more."
+@click.command(
+    epilog=help_epilog(
+        "fdhil commission machine.toml --axis X --room -20 200",
+        "commissioned",
+        "refused, by you or because the drive is not set up correctly",
+        trouble="the drive or the bus cannot be reached",
+    )
 )
-@click.option("--yes", is_flag=True, help="Do not ask before an axis moves, or PDOs are written.")
+@CONFIG
+@click.option("--axis", "only", help="Axis to commission (default: all, one after the other).")
+@click.option("--room", nargs=2, type=float, metavar="BACK FORWARD",
+              help="Travel allowed from the present position for the trial, mm: -20 200 (default: ask; with --yes: "
+              "no trial).")  # fmt: skip
+@click.option("--dry-run", is_flag=True, help="Print the effect and the motion of each step; send nothing.")
+@click.option("--again", is_flag=True, help="Repeat all steps, including completed ones.")
+@click.option(
+    "--set-pdos", is_flag=True, help="Only write and save the PDO mapping of the drives' profile; nothing moves."
+)
+@click.option("--yes", is_flag=True, help="Do not ask before an axis moves or PDOs are written.")
 @AS_JSON
 @verdict
 def commission(
@@ -69,20 +74,21 @@ def commission(
     yes: bool,
     as_json: bool,
 ) -> int:
-    """Commission the drives of CONFIG, step by step: what arming a correction asks for.
+    """Commission the drives of CONFIG, step by step, as arming requires.
 
-    The NC must be off, the axis free to move a tenth of a millimetre, and the machine's own safety functions effective.
-    Reads and compares the drive's set-up, asks, switches the drive on, moves the axis by 10 um, finds out where the
-    offset acts, proves the drive's watchdog, and writes the signed record into the store. Where --room allows it, the
-    axis is then jogged, moved as by G0, identified, and compared with what the identified model predicts; each step
-    says before what it moves. Completed steps are skipped unless the drive or the configuration changed, so a run
-    that was stopped continues where it ended. Whatever fails, also Ctrl-C, the axis is braked, the offset goes back
-    to zero and the drive is switched off. With --set-pdos nothing moves: what differs from the profile in the
-    drive's PDOs is written and saved, and that is all. Exit codes: 0 commissioned, 1 refused, by you or because the
-    drive is not set up as it must be, 2 wrong option or configuration, 3 the drive or the bus cannot be reached.
+    Before: switch the NC off, leave the axis free to move by 0.1 mm, and make sure that the machine's safety functions
+    are effective.
+
+    Compares the drive's set-up with CONFIG, asks, switches the drive on, moves the axis by 10 um, determines where the
+    offset acts, verifies the drive's watchdog, and writes a signed record to the store. With --room the axis is then
+    jogged, moved as by G0, identified, and compared with the prediction of the identified model. Each step announces
+    its motion first.
+
+    Completed steps are skipped unless the drive or the configuration changed; an interrupted run continues where it
+    ended. On any failure and on Ctrl-C the axis is braked, the offset returns to zero and the drive is switched off.
     """
     machine = machine_config.load(config)
-    # an axis of HAL pins without offsets has nothing to prove
+    # an axis of HAL pins without offsets needs no commissioning
     proven = [name for name, axis in machine.axis.items() if axis.correction is not None or axis.drive.source != "hal"]
     axes = [only] if only else proven or list(machine.axis)
     if axes[0] not in machine.axis:
@@ -116,9 +122,9 @@ def commission(
 
 @contextmanager
 def _stopped_like_ctrl_c() -> Iterator[None]:
-    """A terminal that closes, or a kill, must leave the drive as Ctrl-C does: braked, offset zero, switched off.
+    """Turn SIGTERM and a closed terminal into Ctrl-C: the axis is braked, the offset zeroed, the drive switched off.
 
-    Only the first of them counts: a second one must not end what brings the axis to a stand.
+    Only the first signal counts: a second one must not interrupt the braking.
     """
     from fdhil.commissioning.moving import handling
 
@@ -141,7 +147,6 @@ def _progress_of(machine: MachineConfig, axis: str) -> Progress:
 
 
 def _tell_plan(machine: MachineConfig, axes: list[str], asked: Asked) -> int:
-    """Say what would be done; 1 where the room is too small for it."""
     from fdhil.report.parameter_view import minute
 
     plans: dict[str, list[dict[str, Any]]] = {}
@@ -155,9 +160,9 @@ def _tell_plan(machine: MachineConfig, axes: list[str], asked: Asked) -> int:
     if asked.quiet:
         click.echo(json.dumps({"schema": SCHEMA, "dry_run": True, "axes": plans, "refused": refused}))
     for axis, steps in plans.items():
-        asked.say(f"axis {axis}, nothing is sent now:")
+        asked.say(f"axis {axis}, planned steps (nothing is sent now):")
         for number, step in enumerate(steps, 1):
-            done = f" Done {minute(step['done_utc'])}, kept if the drive is the same." if step["done_utc"] else ""
+            done = f" Done {minute(step['done_utc'])}, skipped if the drive is unchanged." if step["done_utc"] else ""
             asked.say(f"  {number} of {len(steps)}, {step['step']}: {told(step['does'], step['moves'])}{done}")
     if refused is not None:
         click.echo(f"refused: {refused}", err=True)
@@ -179,7 +184,7 @@ def _commission_axis(machine: MachineConfig, axis: str, asked: Asked) -> dict[st
     if asked.room is None and not asked.yes and tried_by_moving(machine, axis):
         asked = replace(asked, room=ask_room(axis, machine.axis[axis].unit))
     if asked.room is not None and not hal:
-        trial_moves(machine, axis, asked.room)  # a room that is too small is refused before anything is sent
+        trial_moves(machine, axis, asked.room)  # too little room is refused before anything is sent
     bus = machine.bus[machine.axis[axis].drive.bus]
     with lock_bus(bus), audited(machine, "commission", axis=axis) as ended:  # the guard reads the record when it starts
         own = HAL_STEPS if hal else STEPS
@@ -202,7 +207,6 @@ def _commission_axis(machine: MachineConfig, axis: str, asked: Asked) -> dict[st
 
 
 def _asking(machine: MachineConfig, axis: str, asked: Asked, guide: Guide) -> Callable[[str], None]:
-    """Return the function that reports each step, and asks before the drive is switched on."""
     guide.moves = moves_of(machine, axis)
 
     def report(step: str) -> None:
@@ -221,14 +225,12 @@ def _set_pdos(machine: MachineConfig, axis: str, asked: Asked) -> dict[str, Any]
 
     profile = load_profile(machine.axis[axis].drive)
     if not asked.yes:
-        question = (
-            f"The PDOs of drive {axis} are written as profile {profile.name} has them, and saved in it. May they?"
-        )
-        confirm(axis, question, "nothing was written; start again with --yes where nobody can be asked")
+        question = f"Write the PDO mapping of profile {profile.name} to drive {axis} and save it there?"
+        confirm(axis, question, "nothing was written; start again, with --yes without a terminal")
     bus = machine.bus[machine.axis[axis].drive.bus]
     with lock_bus(bus), audited(machine, "set the PDOs up", axis=axis), Master(machine, axis) as master:
         done = set_up_pdos(master)
-    written = ", ".join(done.written) or "none, all were right"
+    written = ", ".join(done.written) or "none, all match the profile"
     kept = {True: ", saved in the drive", False: ", NOT saved: lost when the drive is off", None: ""}[done.saved]
     if not asked.quiet:
         click.echo(f"axis {axis}: PDOs written: {written}{kept}")
@@ -236,20 +238,16 @@ def _set_pdos(machine: MachineConfig, axis: str, asked: Asked) -> dict[str, Any]
 
 
 def _ask(machine: MachineConfig, axis: str) -> None:
-    """Ask before anything moves; DriveFault when the answer is no, or nobody is there to give one."""
     from fdhil.commissioning.steps import largest_move_um
 
     hal = machine.axis[axis].drive.source == "hal"
-    question = f"Now axis {axis} moves by 10 um, or by 50 um where friction holds it. Is it free to move, and may it?"
-    question = (
-        question
-        if hal
-        else (
-            f"The set-up of axis {axis} is as it must be. Now the drive is switched on and the axis moves by 10 um, "
-            f"then up to {largest_move_um(machine, axis):.0f} um to and fro. Is it free to move, and may it?"
+    question = f"Axis {axis} will move by 10 um, or by 50 um if friction holds it. Is it free to move? Start?"
+    if not hal:
+        question = (
+            f"The set-up of axis {axis} matches. The drive will be switched on and the axis will move by 10 um, then "
+            f"up to {largest_move_um(machine, axis):.0f} um back and forward. Is it free to move? Start?"
         )
-    )
     if axis[0] + "2" in machine.axis:
         question = f"{axis} is one of two drives of a gantry axis: its beam will be skewed by as much. {question}"
-    advice = "nothing was moved or written; start again when it may move, with --yes where nobody can be asked"
+    advice = "nothing was moved or written; start again when it may move, with --yes without a terminal"
     confirm(axis, question, advice)

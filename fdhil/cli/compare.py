@@ -1,4 +1,4 @@
-"""``fdhil compare``: two measured passes, models or recordings, before and after a change."""
+"""``fdhil compare``: compare two passes, models or recordings, before and after a change."""
 
 import json
 import math
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fdhil.cli.options import AS_JSON, FILE
+from fdhil.cli.options import AS_JSON, FILE, help_epilog
 from fdhil.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -18,23 +18,27 @@ SCHEMA = "fdhil-compare-1"
 REFERENCE = "_reference_mm"
 ACTUAL = ("_table_mm", "_predicted_mm")  # of a trace of fdhil sim, of fdhil predict --out
 Values = Mapping[str, Mapping[str, Mapping[str, Any]]]
-"""Axis, parameter, then value, low and high of its 95 % interval (None where it has none)."""
+"""Axis, parameter, then value, low and high of its 95 % interval (None if unknown)."""
 
 
-@click.command()
+@click.command(
+    epilog=help_epilog(
+        "fdhil compare before.csv after.csv", trouble="a file cannot be read or has no comparable content"
+    )
+)
 @click.argument("before", type=FILE)
 @click.argument("after", type=FILE)
 @AS_JSON
 def compare(before: Path, after: Path, as_json: bool) -> None:
     """Compare two passes, models or recordings, BEFORE and AFTER a change.
 
-    A pass is a CSV with X_reference_mm and X_table_mm or X_predicted_mm: a trace of fdhil sim, or what fdhil predict
-    --out wrote. Of passes the contour error is compared, the distance of the table from the programmed path, as fdhil
-    status, predict and correct measure it. Of models (.json) and recordings the parameters are compared.
+    A pass is a CSV with X_reference_mm and X_table_mm or X_predicted_mm, written by fdhil sim --trace or fdhil predict
+    --out. Passes are compared by contour error, the distance of the table from the programmed path. Models (.json) and
+    recordings are compared by their parameters.
     """
     kinds = [_kind(path) for path in (before, after)]
     if kinds[0] != kinds[1]:
-        raise click.UsageError(f"{before} is a {kinds[0]}, {after} a {kinds[1]}: give two of one kind")
+        raise click.UsageError(f"{before} is a {kinds[0]}, {after} a {kinds[1]}; give two files of one kind")
     document = {"schema": SCHEMA, "kind": kinds[0]}
     document |= _passes(before, after) if kinds[0] == "pass" else _models(kinds[0], before, after)
     if as_json:
@@ -62,7 +66,7 @@ def _passes(before: Path, after: Path) -> dict[str, Any]:
 
 
 def read_pass(path: Path) -> dict[str, Any]:
-    """Return the errors of a pass, um: of the contour, and of each axis from its reference. RecordingError."""
+    """Return contour error and axis errors of a pass, um. Raises RecordingError."""
     import numpy as np
 
     from fdhil.csv_text import read_csv_text
@@ -103,7 +107,7 @@ def _models(kind: str, before: Path, after: Path) -> dict[str, Any]:
     first, second = read(before), read(after)
     if not first.keys() & second.keys():
         what = f"{before} is of axis {', '.join(first)}, {after} of {', '.join(second)}"
-        raise click.UsageError(f"{what}: nothing in them can be compared")
+        raise click.UsageError(f"{what}; they have no axis in common")
     parameters = {
         axis: {
             name: {
@@ -144,7 +148,7 @@ def _recording_values(path: Path) -> Values:
     result = analyse_file(path, Identification())
     if result.axis is None or result.pooled is None or not result.verdict.accepted:
         why = "; ".join(map(str, result.verdict.reasons)) or "no rapid move was found in it"
-        raise RecordingError(f"{path} gives no validated parameters: {why}; see fdhil identify {path}")
+        raise RecordingError(f"no validated parameters from {path}: {why}; see fdhil identify {path}")
     pooled = result.pooled
     values = {}
     for name in PARAMETERS:

@@ -1,4 +1,4 @@
-"""``fdhil eds``: what fdhil can and cannot do with a drive, by its maker's EDS or DCF file."""
+"""``fdhil eds``: capabilities of a drive with fdhil, from its EDS or DCF file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import click
 
 from fdhil import tables
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, FILE
+from fdhil.cli.options import AS_JSON, FILE, help_epilog
 from fdhil.errors import ConfigError, ConfigFault
 
 if TYPE_CHECKING:
@@ -27,17 +27,26 @@ CANDIDATES = {"voltage": "a motor voltage or duty", "dc_link": "the DC link", "c
 MOST_NAMED = 6
 
 
-@click.command()
+@click.command(
+    epilog=help_epilog(
+        "fdhil eds drive.eds",
+        "fdhil can listen to the drive",
+        "fdhil cannot listen to the drive",
+        "wrong option or profile",
+        "the file cannot be read",
+    )
+)
 @click.argument("file", type=FILE)
-@click.option("--profile", "name", help="Judge by this profile, a packaged name or a TOML file; left out: its maker's.")
+@click.option(
+    "--profile", "name", help="Profile to assess with: a packaged name or a TOML file (default: the vendor's)."
+)
 @AS_JSON
 @verdict
 def eds(file: Path, name: str | None, as_json: bool) -> int:
-    """Show what fdhil can and cannot do with the drive that FILE, an EDS or DCF, describes, and why.
+    """Assess a drive from its EDS or DCF FILE: show what fdhil can do with it, and why.
 
-    Suggests a profile by the maker, and the PDOs to set up; names the objects that may be a motor voltage, a DC link or
-    a current. Nothing is sent. An EDS is what the maker says: the drive itself may differ. Exit codes: 0 it can be
-    listened to, 1 it cannot, 2 wrong option or profile, 3 the file cannot be read.
+    Suggests a profile for the vendor and the PDOs to set up. Lists the objects that may be a motor voltage, a DC link
+    or a current. Nothing is sent. The drive itself may differ from its EDS.
     """
     from fdhil.drivers.cia402.abilities import abilities, named_alike, suggest_profile  # late: --help imports nothing
     from fdhil.drivers.cia402.device import read_device
@@ -125,10 +134,10 @@ def _show(
     out.print(Text(f"{device.file}: {who}, vendor {device.vendor_id:08X}, product {device.product_code:08X}"))
     if len(device.axes) > 1:
         others = ", ".join(map(str, device.axes[1:]))
-        out.print(Text(f"it has axes {others} besides: set drive.logical_axis for these"), soft_wrap=True)
+        out.print(Text(f"it also has axes {others}: set drive.logical_axis for these"), soft_wrap=True)
     by = "suggested" if profile.name == suggested else f"{suggested} is suggested"
     title = f" ({profile.title})" if profile.title else ""
-    out.print(Text(f"judged by profile {profile.name}{title}; {by}"), soft_wrap=True)
+    out.print(Text(f"assessed with profile {profile.name}{title}; {by}"), soft_wrap=True)
     table = Table("", "", "why", box=box.SIMPLE_HEAD, pad_edge=False)
     for ability in found:
         why = f"{ability.why}; {ability.advice}" if ability.advice else ability.why
@@ -136,7 +145,7 @@ def _show(
     out.print(table)
     for what, objects in alike.items():
         if objects:
-            out.print(Text(f"by its name may be {CANDIDATES[what]}: {_named(objects)}"), soft_wrap=True)
+            out.print(Text(f"by name, may be {CANDIDATES[what]}: {_named(objects)}"), soft_wrap=True)
     for note in (*profile.notes, *device.doubts) if device.is_drive else device.doubts:
         out.print(Text(f"note: {note}"), soft_wrap=True)
     _show_pdos(out, profile if device.is_drive else None)

@@ -1,4 +1,4 @@
-"""``fdhil fleet reanalyse``: the stored windows of all machines again, and what that changed."""
+"""``fdhil fleet reanalyse``: repeat the analysis of all stored windows and report the changes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import click
 from fdhil import tables
 from fdhil.cli.failing import verdict
 from fdhil.cli.fleet import BY, with_extra
-from fdhil.cli.options import AS_JSON, FILE, FLEET
+from fdhil.cli.options import AS_JSON, FILE, FLEET, help_epilog
 
 if TYPE_CHECKING:
     from fdhil.config import MachineConfig
@@ -24,17 +24,24 @@ UNREADABLE = 3
 DAY = click.DateTime(["%Y-%m-%d", "%Y-%m-%dT%H:%M:%S"])
 
 
-@click.command()
+@click.command(
+    epilog=help_epilog(
+        "fdhil fleet reanalyse fleet.toml --since 2026-01-01 --config machines/mill-7.toml",
+        trouble="a window could not be read (all others were analysed)",
+    )
+)
 @FLEET
-@click.option("--since", type=DAY, help="Windows from this day on (UTC) only.")
-@click.option("--until", type=DAY, help="Windows before this day (UTC) only.")
-@click.option("--machine", help="One machine only, by its name in the works.")
-@click.option("--axis", help="One axis letter only.")
-@click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Estimator; left out: the best there is.")
-@click.option("--config", "configs", type=FILE, multiple=True, help="A machine's configuration; may be given often.")
-@click.option("--scheduler", help="A Dask scheduler (tcp://... or tls://...); left out: processes of this computer.")
+@click.option("--since", type=DAY, help="Restrict to windows from this day on (UTC).")
+@click.option("--until", type=DAY, help="Restrict to windows before this day (UTC).")
+@click.option("--machine", help="Restrict to one machine, by its fleet name.")
+@click.option("--axis", help="Restrict to one axis letter.")
+@click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Estimator (default: the best).")
+@click.option("--config", "configs", type=FILE, multiple=True, help="Configuration of a machine; repeatable.")
+@click.option("--scheduler", help="Dask scheduler, tcp://... or tls://... (default: processes of this computer).")
 @click.option(
-    "--workers", type=click.IntRange(0, 1024), help="Processes of this computer, 0 for none; left out: one per core."
+    "--workers",
+    type=click.IntRange(0, 1024),
+    help="Number of processes of this computer, 0 for none (default: one per core).",
 )
 @BY
 @AS_JSON
@@ -52,19 +59,20 @@ def reanalyse(
     by: str,
     as_json: bool,
 ) -> int:
-    """Analyse the stored windows of all machines again.
+    """Repeat the analysis of the stored windows of all machines.
 
-    And tell what that changes. What was found before stays: the results are a revision of their own in the database,
-    which belongs to the method, the configurations and the code. What is done of it is not done again, so a run that
-    was stopped is gone on with by the same call. Windows of machines whose --config is given are weighed through their
-    regulators, the others by what the recordings say. The bits are the same with any number of workers. Exit codes: 0
-    done, 3 some window could not be read (the others are done all the same).
+    Reports the changes. Earlier results are kept: the new ones form a separate revision in the database, identified by
+    method, configurations and code. The same call continues an interrupted run. Windows of machines whose --config is
+    given are assessed with their regulators, the others with what the recordings contain. The results do not depend
+    on the number of workers.
     """
     from fdhil.config import Identification
     from fdhil.config.fleet import load
 
     if scheduler is not None and workers is not None:
-        raise click.UsageError("--workers are processes of this computer, --scheduler is a cluster: give one of them")
+        raise click.UsageError(
+            "--workers are processes of this computer, --scheduler is a cluster; give only one of them"
+        )
     settings, machines = load(fleet), _by_name(configs)
     with with_extra():
         from fdhil.fleet import reanalysis, sets
@@ -95,7 +103,7 @@ def _by_name(configs: tuple[Path, ...]) -> dict[str, MachineConfig]:
         read = config.load(path)
         name = read.machine.name if read.uplink is None else read.uplink.name_of(read.machine.name)
         if name in machines:
-            raise click.BadParameter(f"{path} is of {name}, which another --config is of, too", param_hint="--config")
+            raise click.BadParameter(f"{path} describes {name}, as another --config does", param_hint="--config")
         machines[name] = read
     return machines
 

@@ -1,4 +1,4 @@
-"""``fdhil offers``: what the works offers to change at this machine, and the operator's answer."""
+"""``fdhil offers``: proposed configuration changes of this machine, and the operator's answers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fdhil import config as machine_config
 from fdhil.cli.audited import audited
 from fdhil.cli.failing import SuggestingGroup, verdict
 from fdhil.cli.fleet import with_extra
-from fdhil.cli.options import AS_JSON, CONFIG, FILE, ConfigFirst
+from fdhil.cli.options import AS_JSON, CONFIG, FILE, ConfigFirst, help_epilog
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from fdhil.fleet.offered import Judged
 
 OFFER = click.argument("offer", type=FILE)
-BY = click.option("--by", required=True, help="Who answers: your name, which the works is told.")
+BY = click.option("--by", required=True, help="Your name, reported to the fleet server.")
 MOST_BY, MOST_REASON = 64, 200
 
 
@@ -28,20 +28,24 @@ MOST_BY, MOST_REASON = 64, 200
 def offers() -> None:
     """List, accept or reject proposed configuration changes.
 
-    An offer is signed, comes by fdhil uplink or as a file, and does nothing by itself. Needs the extra 'fleet'.
+    A proposed change (OFFER) is signed, arrives through fdhil uplink or as a file, and has no effect until it is
+    accepted. Needs the extra 'fleet'.
     """
 
 
-@offers.command("list", cls=ConfigFirst)
+@offers.command(
+    "list",
+    cls=ConfigFirst,
+    epilog=help_epilog("fdhil offers list machine.toml", no="one of FILES cannot be accepted"),
+)
 @CONFIG
 @click.argument("files", nargs=-1, type=FILE)
 @AS_JSON
 @verdict
 def list_(config: Path, files: tuple[Path, ...], as_json: bool) -> int:
-    """List the changes that are proposed for CONFIG's machine.
+    """List the changes proposed for CONFIG's machine, and those in FILES.
 
-    And those of FILES: what each would change, and what that costs. Nothing is changed. Exit 1 when one of FILES cannot
-    be accepted.
+    Shows the new values and what they invalidate. Nothing is changed.
     """
     machine_config.load(config)
     with with_extra():
@@ -55,19 +59,24 @@ def list_(config: Path, files: tuple[Path, ...], as_json: bool) -> int:
     return 1 if any(each.wrong for each in found if each.place in files) else 0
 
 
-@offers.command(cls=ConfigFirst)
+@offers.command(
+    cls=ConfigFirst,
+    epilog=help_epilog(
+        "fdhil offers accept machine.toml friction --by 'A. Smith'", "accepted", "not accepted; nothing was changed"
+    ),
+)
 @CONFIG
 @OFFER
 @BY
-@click.option("--loosens", "may_loosen", is_flag=True, help="A limit may be loosened, where the offer does that.")
+@click.option("--loosens", "may_loosen", is_flag=True, help="Permit the change to loosen limits.")
 @AS_JSON
 @verdict
 def accept(config: Path, offer: Path, by: str, may_loosen: bool, as_json: bool) -> None:
-    """Write the changes of OFFER into CONFIG.
+    """Accept OFFER and write its changes to CONFIG.
 
-    The old file is kept beside it. OFFER is a name of the list, or a file. Signature, time, version and the new
-    configuration are looked at once more. A daemon that runs goes on as it is until it is started anew; nothing is
-    armed by it. Exit 1 when the offer is not accepted: nothing was changed.
+    OFFER is a name from fdhil offers list, or a file. Signature, validity, version and the new configuration are
+    verified again. The old CONFIG is kept next to it. A running daemon uses the new values after a restart; nothing is
+    armed.
     """
     machine = machine_config.load(config)
     by, place = _signed(by), _place(machine, offer)
@@ -81,16 +90,19 @@ def accept(config: Path, offer: Path, by: str, may_loosen: bool, as_json: bool) 
     offers_view.accepted(done, machine, config, as_json)
 
 
-@offers.command(cls=ConfigFirst)
+@offers.command(
+    cls=ConfigFirst,
+    epilog=help_epilog("fdhil offers reject machine.toml friction --by 'A. Smith' --reason 'new screw'", "rejected"),
+)
 @CONFIG
 @OFFER
 @BY
-@click.option("--reason", required=True, help="Why not, for the works.")
+@click.option("--reason", required=True, help="Reason, reported to the fleet server.")
 @AS_JSON
 def reject(config: Path, offer: Path, by: str, reason: str, as_json: bool) -> None:
     """Reject OFFER, with a reason.
 
-    The works is told; nothing else is changed at the machine of CONFIG.
+    The fleet server is informed. The configuration does not change.
     """
     machine = machine_config.load(config)
     by, place, reason = _signed(by), _place(machine, offer), _text("--reason", reason, MOST_REASON)
@@ -106,7 +118,7 @@ def _tell_rejected(done: Judged, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps({"schema": "fdhil-offer-rejected-1", "offer": str(done.offer)}))
         return
-    click.echo(f"{done.offer} is rejected; nothing was changed")
+    click.echo(f"{done.offer} rejected; nothing was changed")
 
 
 def _signed(by: str) -> str:
@@ -114,7 +126,6 @@ def _signed(by: str) -> str:
 
 
 def _text(option: str, text: str, most: int) -> str:
-    """Return a text in one line; ConfigError where it is none, or too long."""
     from fdhil.daemon.journal import printable
 
     if not text.strip() or len(text) > most:
@@ -123,7 +134,7 @@ def _text(option: str, text: str, most: int) -> str:
 
 
 def _place(machine: MachineConfig, offer: Path) -> Path:
-    """Return the file of an offer: the newest of that name which lies here, or the file that was named."""
+    """Return the file of an offer: the newest one of that name in the folder, or the given file."""
     from fdhil.store.offers import lying
 
     if offer.suffix == ".offer" or offer.name != str(offer):
@@ -132,6 +143,8 @@ def _place(machine: MachineConfig, offer: Path) -> Path:
     of_name = {version: path for path, (name, version) in lie.items() if name == str(offer)}
     if not of_name:
         names = ", ".join(sorted({name for name, _ in lie.values()})) or "none"
-        fault = ConfigFault(str(offer), "is no offer that lies here", f"these do: {names}; or name a file, *.offer")
+        fault = ConfigFault(
+            str(offer), "is not a proposed change of this machine", f"choose one of: {names}; or name a file, *.offer"
+        )
         raise ConfigError("OFFER", [fault])
     return of_name[max(of_name)]

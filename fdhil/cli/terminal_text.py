@@ -1,4 +1,4 @@
-"""Text on a terminal: names of machines, programs, files and devices made harmless, and how far a command is."""
+"""Text for a terminal: control characters of foreign names are replaced, and progress is shown."""
 
 import sys
 import unicodedata
@@ -10,7 +10,7 @@ _REPLACEMENT = "\N{REPLACEMENT CHARACTER}"
 
 
 def without_controls(text: str) -> str:
-    """Return text in which each control or direction character but a line's end and a tab is a mark.
+    """Return text with each control or direction character, except newline and tab, replaced by a mark.
 
     >>> without_controls("axis \\x1b[2J X\\n") == "axis \\N{REPLACEMENT CHARACTER}[2J X\\n"
     True
@@ -25,6 +25,6 @@ def _steers(letter: str) -> bool:
 
 
 def print_progress(text: str) -> None:
-    """Print how far a command is to stderr when that is a terminal."""
+    """Print progress to stderr if that is a terminal."""
     if sys.stderr.isatty():
         click.echo(text, err=True)

@@ -344,7 +344,7 @@ def test_adopt_says_what_stands_asks_and_ends_at_zero(
     assert guard.heard[1] == "adopt"
     assert in_the_audit(machine) == [("adopt", None), ("adopt", "done")]
     code, out, _ = fdhil("adopt", machine, "--yes", capsys=capsys)
-    assert (code, out) == (0, "guard: OFF, offset 0: there is nothing to adopt\n")
+    assert (code, out) == (0, "guard: OFF, offset 0; there is nothing to adopt\n")
     assert guard.heard.count("adopt") == 1
 
 

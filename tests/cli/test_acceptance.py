@@ -57,7 +57,7 @@ def test_a_machine_that_is_proven_is_accepted(proven: MachineConfig, tmp_path: P
     assert hashlib.sha256(text.encode()).hexdigest() == document["sha256"]
     shown = html.unescape(page.read_text("utf-8"))
     assert document["sha256"] in shown
-    for words in ("A. Fitter", "Circular test after ISO 230-4", "No point is open", "1 division", "No notice is open"):
+    for words in ("A. Fitter", "Circular test after ISO 230-4", "No open points", "1 division", "No open notices"):
         assert words in shown
     before, after = (document["circle"]["found"][f"predicted, {which}"] for which in ("uncorrected", "corrected"))
     assert after["deviation_both_um"] < 0.3 * before["deviation_both_um"]
@@ -75,7 +75,7 @@ def test_what_is_open_is_named(proven: MachineConfig, tmp_path: Path, capsys: An
         "X: its record is void; run fdhil check with the NC off",
         "Y: its record was made with another configuration; commission it again",
         "circular deviation: 0.001 um are allowed, it is",
-        "contour error: 5 um are allowed, and no --program was given to tell it",
+        "contour error: 5 um are allowed, but no --program was given",
     ):
         assert f"open: {point}" in out
     assert "4 points are open" in out
@@ -87,8 +87,8 @@ def test_a_machine_of_which_nothing_is_known_has_a_report_too(tmp_path: Path, ca
     assert code == 1
     for axis in ("X", "Y"):
         assert f"open: {axis}: not commissioned; run fdhil commission" in out
-        assert f"open: {axis}: no parameters were published, the nominal ones stand in" in out
-    assert "with the nominal parameters" in (tmp_path / "a.html").read_text("utf-8")
+        assert f"open: {axis}: no published parameters, nominal ones are used" in out
+    assert "use the nominal parameters" in (tmp_path / "a.html").read_text("utf-8")
 
 
 def test_a_measured_circle_stands_beside_the_predicted_ones(proven: MachineConfig, tmp_path: Path, capsys: Any) -> None:
@@ -123,13 +123,13 @@ def test_report_has_a_header_passes_open_notices_and_lateness(
     options = ("--out", page, "--customer", "Muster AG", "--site", "Hall 3", "--by", "A. Fitter", *CIRCLE)
     code, out, err = fdhil("acceptance", tmp_path / "machine.toml", *options, capsys=capsys)
     assert (code, err) == (1, f"wrote {page}\n")
-    assert "open: 1 MAJOR notices that nobody has acknowledged" in out
+    assert "open: 1 MAJOR notices are pending" in out
     assert "no limit was set" in out
     shown = html.unescape(page.read_text("utf-8"))
     for words in (
         "Muster AG", "Hall 3", f"X {RECORD.serial}, Y {RECORD.serial}", "pass 1 of p.ngc",
         "LimitActive: an internal limit is active",
-        "No limit was set", f"of {measured['turns']} wake-ups",
+        "No limit was set", f"{measured['turns']} wake-ups",
     ):  # fmt: skip
         assert words in shown, words
     document = json.loads(fdhil("acceptance", tmp_path / "machine.toml", *options, "--json", capsys=capsys)[1])

@@ -44,7 +44,7 @@ def test_a_written_program_that_leaves_the_tolerance_is_no_yes(bench: Path) -> N
     assert invoke(*arguments).exit_code == 0
     result = invoke(*arguments, "--out", out)
     assert result.exit_code == 1
-    assert "2 lines leave the tolerance at every feed that was tried, without the correction" in result.stderr
+    assert "2 lines leave the tolerance at every feed tried, without the correction" in result.stderr
 
 
 @pytest.fixture(scope="module")

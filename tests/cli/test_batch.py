@@ -68,7 +68,7 @@ def test_a_process_that_dies_is_a_sentence(recordings: list[Path], monkeypatch: 
     monkeypatch.setattr(batch, "MANY_FILES", 1)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     monkeypatch.setattr(batch, "_analyse_some", dying)
-    with pytest.raises(FdhilError, match="was ended from outside"):
+    with pytest.raises(FdhilError, match="was killed"):
         list(batch.analyse_files(recordings, SETTINGS))
 
 

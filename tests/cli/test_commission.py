@@ -95,7 +95,7 @@ def test_a_dry_run_says_what_each_step_moves_and_sends_nothing(bench: Bench) -> 
     code, out, _ = bench.commission("--dry-run", "--json")
     plan = json.loads(out)
     assert (code, plan["dry_run"], len(plan["axes"]["X"])) == (0, True, 13)  # it would be asked for the room
-    assert "within the room that you give at up to 500 mm/s" in plan["axes"]["X"][9]["moves"]
+    assert "within the room that you allow at up to 500 mm/s" in plan["axes"]["X"][9]["moves"]
     assert len(json.loads(bench.commission("--dry-run", "--json", "--yes")[1])["axes"]["X"]) == 7
     assert plan["axes"]["X"][0] | {"does": ""} == {"step": "listen", "does": "", "moves": "nothing", "done_utc": None}
     code, _, err = bench.commission("--room", "-10", "60", "--dry-run")
@@ -107,7 +107,7 @@ def test_a_dry_run_says_what_each_step_moves_and_sends_nothing(bench: Bench) -> 
 @pytest.mark.parametrize("room", [("10", "100"), ("-10", "-1"), ("nan", "100"), ("-10", "inf")])
 def test_a_room_that_is_none_is_told(room: tuple[str, str], bench: Bench) -> None:
     code, _, err = bench.commission("--room", *room)
-    assert (code, "--room wants two numbers of mm" in err) == (2, True)
+    assert (code, "--room needs the travel back" in err) == (2, True)
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -119,34 +119,34 @@ def test_what_was_stopped_goes_on_where_it_ended(bench: Bench, monkeypatch: pyte
         stopped.setattr("fdhil.commissioning.steps.watchdog_test", stop)
         code, out, err = bench.commission("--yes")
         assert (code, err.strip()) == (130, "fdhil: stopped by the operator")
-        assert out.endswith("next: run the same command again; it continues with the step that was not finished\n")
+        assert out.endswith("next: run the same command again; it continues with the unfinished step\n")
         assert "axis X: sign test: the axis moved by +" in out
     assert bench.peer.drive.power.state.name == "SWITCH_ON_DISABLED"
     assert load_record(bench.store, "X") is None
 
     code, out, _ = bench.commission("--yes")
     assert code == 0
-    for kept in ("step 4 of 7, sign test: kept, it was done 2", "step 5 of 7, feed-forward test: kept"):
+    for kept in ("step 4 of 7, sign test: skipped, done 2", "step 5 of 7, feed-forward test: skipped"):
         assert kept in out
     assert "step 6 of 7, watchdog test: Sending" in out
-    assert "axis X is not tried by moving it: no --room was given" in out
+    assert "axis X: no trial, because no --room was given" in out
     first = load_record(bench.store, "X")
     assert first is not None
     assert first.watchdog == "proven"
 
     heard = len(bench.peer.heard)
     code, out, _ = bench.commission("--yes")
-    assert (code, "step 3" in out, "watchdog test: kept" in out) == (0, False, True)
+    assert (code, "step 3" in out, "watchdog test: skipped" in out) == (0, False, True)
     assert not {0x000, 0x080, 0x201, 0x301} & set(bench.peer.heard[heard:])
     again = load_record(bench.store, "X")
     assert again is not None
     assert again.sign_test_um == first.sign_test_um
 
     code, out, _ = bench.commission("--yes", "--dry-run")
-    assert out.count("kept if the drive is the same") == 3
+    assert out.count("skipped if the drive is unchanged") == 3
     bench.peer.drive.set_object(0x6085, 0, 1_000_000)  # set up otherwise by its own tool
     code, out, _ = bench.commission("--yes")
-    assert (code, "kept" in out, "step 4 of 7, sign test: Moving" in out) == (0, False, True)
+    assert (code, "skipped" in out, "step 4 of 7, sign test: Moving" in out) == (0, False, True)
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -157,13 +157,13 @@ def test_an_axis_is_tried_where_the_operator_agrees_and_known_to_the_history(
     code, out, err = bench.commission(said="-2 130\n" + 4 * "y\n")
     assert code == 0, err
     for asked in (
-        "How far may axis X go from here",
-        "Now axis X moves 1 mm toward plus at 5 mm/s, and back. Is its way free, and may it?",
+        "How far may axis X move from here",
+        "Axis X will move 1 mm toward plus at 5 mm/s, and back. Is its path free? Start?",
         "The drive went 1 mm toward plus at 5 mm/s, and back. Is that what you saw the table do?",
-        "Now axis X moves 127.4 mm toward plus at 394 mm/s with 4000 mm/s2, and back, 2 times.",
+        "Axis X will move 127.4 mm toward plus at 394 mm/s with 4000 mm/s2, and back, 2 times.",
     ):
         assert asked in err, asked
-    assert "step 10 of 13, test rapids: Moving the axis as fast as G0" in out
+    assert "step 10 of 13, test rapids: Moving the axis at rapid speed" in out
     assert "axis X: identification: R 50" in out or "axis X: identification: R 49" in out
     assert " mohm, L " in out
     assert out.index("axis X: jog: ") < out.index("step 10 of 13") < out.index("axis X: acceptance: ")

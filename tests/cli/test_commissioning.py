@@ -161,7 +161,7 @@ def test_a_scan_lists_the_drives_with_their_eds(fdhil: Said, bench: Bench) -> No
 def test_a_scan_reads_well(fdhil: Said, bench: Bench) -> None:
     code, out, err = fdhil("scan", bench.config())
     assert (code, err) == (0, "")
-    for words in ("no NC is heard; 2 nodes", "pre-operational", "fdhil twin drive", "CiA 402", "none fits"):
+    for words in ("no NC is active; 2 nodes", "pre-operational", "fdhil twin drive", "CiA 402", "no match"):
         assert words in out
 
 
@@ -260,7 +260,7 @@ def test_where_the_guard_took_nothing_of_a_comparison_void_records_stay_so(
     void_record(config.store.directory, "X", "booted")
     code, _, err = fdhil("check", path, "--json")
     assert code == 0
-    assert ("NotOff: a correction is on; run fdhil check again" if answer else "records that are void stay so") in err
+    assert ("NotOff: a correction is on; run fdhil check again" if answer else "void records stay void") in err
     assert is_void(config.store.directory, "X")
     guard.close()
 
@@ -289,7 +289,7 @@ def test_what_is_seen_while_drives_are_compared_speaks_against_them(
     assert code == 0
     assert guard.requests[-1]["touched"] == {"X": 3, "Y": 0}
     assert [is_void(store, axis) for axis in "XY"] == [True, True]
-    assert "RecordVoid: axis X: something was seen against it since it was compared" in err
+    assert "RecordVoid: axis X: its drive changed again after the comparison" in err
     assert "RecordVoid: axis Y: it has booted; run fdhil check again" in err
     guard.close()
     (config.guard_directory / "guard.sock").unlink()
@@ -471,7 +471,7 @@ def undisturbed(fdhil: Said, cut: Bench, *arguments: object, code: int = 0) -> s
 @pytest.mark.usefixtures("real_time")
 def test_a_scan_beside_an_nc_only_listens(fdhil: Said, cut: Bench) -> None:
     said = undisturbed(fdhil, cut, "scan", cut.config())
-    assert "an NC runs it (SYNC heard), so no node was asked" in said
+    assert "an NC runs it (SYNC received), so no node was queried" in said
     assert "operational" in said
 
 

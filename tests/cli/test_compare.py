@@ -60,7 +60,7 @@ def test_models_are_compared_by_their_parameters(tmp_path: Path, capsys: Any) ->
         ("time_s,X_reference_mm\n0,1\n", 3, "is not a pass"),
         ("time_s,X_reference_mm,X_table_mm\n0,1,1\n0.001,nan,1\n", 3, "is not a pass"),
         ("time_s,X_reference_mm,X_table_mm\n0,1,1\n", 3, "is not a pass"),
-        ("X_mm\n", 2, "give two of one kind"),
+        ("X_mm\n", 2, "give two files of one kind"),
         (None, 3, "cannot be read"),
     ],
 )

@@ -288,5 +288,5 @@ def test_it_reads_well(pc: Pc) -> None:
     pc.document["store"]["run_directory"] = str(pc.folder / ("x" * 120))
     result = CliRunner().invoke(doctor, [str(pc.write()), "--offline"], standalone_mode=False)
     assert "1. sockets: " in result.stdout
-    assert "   mend:  give [store] run_directory a shorter one" in result.stdout
-    assert "1 to mend, 0 that could be better" in result.stdout
+    assert "   fix:   choose a shorter [store] run_directory" in result.stdout
+    assert "1 to fix, 0 to improve" in result.stdout

@@ -101,7 +101,7 @@ def test_how_many_wait_and_since_when(tmp_path: Path) -> None:
     machine = recorded(tmp_path)
     waits(machine)
     (trouble,) = examine_uplink(machine.config, True)
-    assert trouble.what == "5 records wait, the oldest since 1970-01-01 00:00"
+    assert trouble.what == "5 records are unsent, the oldest since 1970-01-01 00:00"
 
 
 def test_a_file_of_the_credentials_that_is_not_there(tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_a_machine_that_tells_nobody_is_not_looked_at(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "told"), [(JETSTREAM, ""), (b'INFO {"a":1}\r\n', "JetStream"), (b"220 mail\r\n", "kind")]
+    ("words", "told"), [(JETSTREAM, ""), (b'INFO {"a":1}\r\n', "JetStream"), (b"220 mail\r\n", "greeting")]
 )
 def test_who_answers_is_heard_and_told_nothing(words: bytes, told: str, tmp_path: Path) -> None:
     with answering(words) as (server, sent):

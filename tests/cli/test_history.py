@@ -139,7 +139,7 @@ def test_rapids_that_were_not_believed_are_in_the_report(tmp_path: Path, capsys:
     assert fdhil("report", path, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
     page = (tmp_path / "report.html").read_text()
     assert "None of 3 rapids was believed, most often (3 ×) because of MissingStage(cruise): no plateau." in page
-    assert "Rapids that were not believed: 3 of 3" in page
+    assert "Refused rapids: 3 of 3" in page
     assert "<dt>axis Y</dt><dd>not identified</dd>" in page
     assert "<h2>Axis Y</h2>" in page
 
@@ -173,7 +173,7 @@ def test_an_axis_that_there_is_not_is_refused(worn: Path, capsys: Any) -> None:
     """It is a wrong option, not an empty history."""
     code, _, told = fdhil("history", worn, "--axis", "Q", capsys=capsys)
     assert code == 2
-    assert "Q is no axis" in told
+    assert "has no axis Q" in told
 
 
 def test_every_table_fits_80_columns_and_says_what_its_intervals_are(worn: Path, capsys: Any) -> None:
@@ -199,7 +199,7 @@ def test_history_and_report_tell_what_waits_and_who_acknowledged(tmp_path: Path,
         history.add_notice(Notice("BusDown", "info", "the bus is back"), Stamp(START_S + 9, "boot", 9))
         history.add_acknowledgement(Acknowledgement((1,), "anna", "plug", Stamp(START_S + 60, "boot", 60)))
     out = fdhil("history", path, capsys=capsys)[1]
-    assert "wait to be acknowledged (fdhil acknowledge): 1" in out
+    assert "pending notices (see fdhil acknowledge): 1" in out
     assert "acknowledged by anna" in out
     assert "the bus is back" not in out
     told = json.loads(fdhil("history", path, "--json", capsys=capsys)[1])["notices"]

@@ -78,7 +78,7 @@ def test_the_delay_of_a_slow_sensor_is_told_with_its_deviation(tmp_path: Path) -
     assert set(window["delay_s"]) == {"value", "std", "unit"}
     assert window["delay_s"]["unit"] == "s"
     assert abs(window["delay_s"]["value"] - 0.0012) < 4 * window["delay_s"]["std"] < 2e-4
-    assert "voltage is late by 1.2" in invoke(path).stdout
+    assert "voltage is delayed by 1.2" in invoke(path).stdout
 
 
 @pytest.mark.parametrize("method", ["least_squares", "maximum_likelihood"])

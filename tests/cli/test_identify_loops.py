@@ -46,4 +46,4 @@ def test_people_read_a_table_of_the_loops(filtered: Path) -> None:
     assert result.exit_code == 0
     assert "loops: p_pi_pi" in result.stdout
     assert "speed_filter_s" in result.stdout
-    assert "these loops leave 0." in result.stdout
+    assert "not explained by these loops: 0." in result.stdout

@@ -108,7 +108,7 @@ def test_status_says_what_the_table_did_and_how_it_swings() -> None:
     }
     text = believed({"terms": {"resonance": figures}, "last_window": {"at_table": seen}, "warnings": []})
     assert "resonance 60" in text
-    assert "the table was 46.20 um RMS off in the last rapid" in text
+    assert "table error of 46.20 um RMS in the last rapid" in text
     assert "table" not in believed({"terms": {}, "last_window": {"at_table": None}})
 
 
@@ -123,4 +123,4 @@ def test_a_file_of_another_run_or_kind_is_refused(tmp_path: Path) -> None:
         "is no recording of an accelerometer" in told(invoke(path, "--accelerometer", other, "--json"))["error"]["text"]
     )
     result = CliRunner().invoke(cli, ["identify", str(path), str(path), "--accelerometer", str(other)])
-    assert "belongs to one recording" in str(result.output) + str(result.exception)
+    assert "applies to one recording" in str(result.output) + str(result.exception)

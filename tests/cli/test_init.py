@@ -191,7 +191,7 @@ def test_the_drive_tells_its_scales_and_the_operator_the_rest(
     file = tmp_path / "m.toml"
     code, out, err = fdhil("init", file, said="\n".join(lines) + "\n")
     assert code == 0, err
-    assert err.count("once more") == 4
+    assert err.count("try again") == 4
     assert "node 1 (fdhil twin drive" in err
     made = machine_config.load(file).axis["X"]
     assert (made.drive.profile, made.drive.increments_per_rev, made.nominal.K) == ("fdhil_twin", 65536, 0.8)
@@ -233,7 +233,7 @@ def test_who_goes_away_leaves_nothing(fdhil: Said, tmp_path: Path, monkeypatch: 
     """At a terminal that is the operator's will; else nobody is there, and a file of answers is what helps."""
     code, _, err = fdhil("init", tmp_path / "m.toml", "--offline", said="socketcan\n")
     assert code == 2
-    assert "bus.can0.channel: is asked for, and nobody is there to answer (give --answers FILE)" in err
+    assert "bus.can0.channel: needs an answer, and standard input has ended (give --answers FILE)" in err
     monkeypatch.setattr("fdhil.cli.init.sys", SimpleNamespace(stdin=SimpleNamespace(isatty=lambda: True)))
     code, _, err = fdhil("init", tmp_path / "m.toml", "--offline", said="socketcan\n")
     assert code == 130

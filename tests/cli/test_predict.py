@@ -136,7 +136,7 @@ def test_history_tells_what_a_fixture_costs(bench: Path) -> None:
     assert {(step["axis"], step["what"], step["since_revision"]) for step in steps} >= {("X", "inertia", 2)}
     assert steps[0]["line"] == 3
     assert steps[0]["parameters"] == {"Jt": {"before": 0.075, "now": 0.085}}
-    assert "has changed since revision 2 (Jt 0.075 -> 0.085): it costs" in invoke(*arguments).stdout
+    assert "changed since revision 2 (Jt 0.075 -> 0.085): it costs" in invoke(*arguments).stdout
     assert json.loads(invoke(*arguments, "--since", 3, "--json").stdout)["steps"] == []
     assert invoke(*arguments, "--since", 99).exit_code == 2
     assert invoke("predict", program, "--config", bench / "bench.toml", "--since", 1).exit_code == 2
@@ -183,7 +183,7 @@ def test_a_changed_configuration_is_told_apart_from_the_drives(bench: Path) -> N
     arguments = ["predict", bench / "demand.csv", "--config", config, "--from-history"]
     invoke(*arguments)
     publish(bench, "X", 2, Cd=5.0001)
-    assert "nothing has changed beyond chance since" in invoke(*arguments).stdout
+    assert "no significant change since" in invoke(*arguments).stdout
     config.write_text(config.read_text().replace("position_gain_per_s = 50.0", "position_gain_per_s = 40.0"))
     found = json.loads(invoke(*arguments, "--json").stdout)["compared"]
     assert found["configuration_changed"] is True
@@ -203,7 +203,7 @@ def test_a_store_that_takes_nothing_is_told(bench: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(History, "open", full)
     result = invoke("predict", bench / "demand.csv", "--config", bench / "bench.toml", "--from-history", "--json")
     assert result.exit_code == 0
-    assert "not kept for the next one to compare with: the disk is full" in result.stderr
+    assert "not stored for later comparison: the disk is full" in result.stderr
     assert json.loads(result.stdout)["compared"] is None
 
 
@@ -221,13 +221,13 @@ def test_history_tells_when_a_zone_leaves_the_tolerance(bench: Path) -> None:
         assert crosses["parameter"] == "Jt"
     assert all(zone["std_um"] >= 0 for zone in document["zones"])
     text = invoke(*arguments, "--tolerance-um", 98).stdout
-    assert "is over 98 um" in text
-    assert "will have left 98 um about 1970-" in text  # the newest parameters are of January 1970
+    assert "exceeds 98 um now" in text
+    assert "has probably exceeded 98 um since 1970-" in text  # the newest parameters are of January 1970
 
 
 @pytest.mark.parametrize(
     ("days", "state", "words"),
-    [(6 / 1440, "not_enough_history", "not enough history: 6 min"), (3.0, "not_foreseen", "within 15 days")],
+    [(6 / 1440, "not_enough_history", "6 min of history are too short"), (3.0, "not_foreseen", "within 15 days")],
 )
 def test_no_day_is_told_that_the_history_cannot_know(bench: Path, days: float, state: str, words: str) -> None:
     """A slope as sure as can be, of six minutes or of three days: neither reaches the weeks that it takes."""
@@ -247,10 +247,10 @@ def test_a_date_that_has_passed_is_told_as_such() -> None:
     """The newest parameters may be older than the day that they foresee."""
     entry = {"state": "foreseen", "date": "2999-01-02", "earliest": "2999-01-01", "latest": None}
     entry |= {"axis": "X", "parameter": "Jt"}
-    assert crossing_text(entry, 20.0).startswith("leaves 20 um about 2999-01-02 (2999-01-01 to later)")
+    assert crossing_text(entry, 20.0).startswith("is expected to exceed 20 um about 2999-01-02 (2999-01-01 to later)")
     past = crossing_text(entry | {"date": "2001-01-02"}, 20.0)
-    assert past.startswith("will have left 20 um about 2001-01-02")
-    assert past.endswith("identify anew")
+    assert past.startswith("has probably exceeded 20 um since 2001-01-02")
+    assert past.endswith("identify again")
 
 
 @pytest.mark.parametrize(

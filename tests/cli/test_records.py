@@ -77,7 +77,7 @@ def test_an_export_is_a_recording_that_replays(rapid: Path, tmp_path: Path, caps
     before = rapid.read_bytes()
     code, _, err = fdhil("export", rapid, "--out", rapid, capsys=capsys)
     assert code == 2
-    assert "is also what" in err
+    assert "is also named by" in err
     assert rapid.read_bytes() == before
 
 

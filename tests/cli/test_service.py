@@ -93,13 +93,13 @@ def test_status_as_a_table_and_as_json(machine: Path, tmp_path: Path, capsys: An
     [
         (
             {"state": "lost", "last_state": "ACTIVE", "heard_s_ago": 20.0, "text": "the guard is gone; -38 um stands"},
-            ("guard lost, heard 20 s ago in state ACTIVE", "the guard is gone; -38 um stands"),
+            ("guard lost, last seen 20 s ago in state ACTIVE", "the guard is gone; -38 um stands"),
         ),
         (
             {"state": "FROZEN", "heard_s_ago": 0.3},
             ("guard FROZEN", "-4.6 um on axis X may still be applied; hold the feed, then run fdhil adopt"),
         ),
-        ({"state": "ACTIVE", "heard_s_ago": 7.0}, ("guard ACTIVE when it answered last, 7 s ago",)),
+        ({"state": "ACTIVE", "heard_s_ago": 7.0}, ("guard ACTIVE at its last answer, 7 s ago",)),
     ],
 )
 def test_status_says_what_may_still_be_applied_and_how_old_the_guards_word_is(
@@ -188,7 +188,7 @@ def test_arm_shows_how_far_the_check_of_a_long_program_is(machine: Path, capsys:
     with answering(machine, refused, told | {"refused": 0}, told):
         code, out, err = fdhil("arm", machine, machine.parent / "p.ngc", capsys=capsys)
     assert (code, out) == (1, "")
-    assert "\rchecked 1:23 of the program, line 40, 32 x real time, 2 places refused" in err
+    assert "\rchecked 1:23 of the program, line 40, 32 x real time, 2 positions refused" in err
     assert err.splitlines()[-2:] == ["refused: A: one; do", "also: B: two"]
     (machine.parent / "fdhil-data" / "run" / "daemon.sock").unlink()
     with answering(machine, refused, told):
@@ -273,7 +273,7 @@ def test_lines_of_the_daemon_as_json(capsys: pytest.CaptureFixture[str]) -> None
 def test_terms_and_what_is_warned_of_are_told_beside_the_table() -> None:
     load = {"value": 2.5, "std": 0.01, "low": 2.48, "high": 2.52, "unit": "N.m"}
     axis = {"terms": {"load": load}, "unexplained_um": 0.25, "warnings": ["OneDirection: all moves go one way"]}
-    told = "load 2.50 ±0.02 N.m; 0.25 um of a rapid unexplained; OneDirection: all moves go one way"
+    told = "load 2.50 ±0.02 N.m; 0.25 um of the rapids unexplained; OneDirection: all moves go one way"
     assert believed(axis) == told
     assert believed({"terms": None, "unexplained_um": None, "warnings": []}) == ""
 
@@ -318,7 +318,7 @@ def test_status_tells_what_waits_and_who_acknowledged(machine: Path, tmp_path: P
     with answering(machine, told):
         out = fdhil("status", machine, capsys=capsys)[1]
     assert "X: HeartbeatLost active since 2026-11-22T14:00:00+00:00, 8 times since" in " ".join(out.split())
-    assert "notices that wait to be acknowledged: 3, of them MAJOR 1" in out
+    assert "pending notices: 3, of them MAJOR 1" in out
     assert "41" in out
     assert "(acknowledged by anna)" in " ".join(out.split())
 

@@ -176,4 +176,4 @@ def test_a_sensor_that_is_not_there_is_told(tmp_path: Path, capsys: pytest.Captu
 def test_a_demo_without_a_place_for_its_files_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").touch()
     said = fdhil("demo", "--out", tmp_path / "file" / "out", capsys=capsys)
-    assert_told(said, 3, "cannot be made: Not a directory; choose another --out")
+    assert_told(said, 3, "cannot be created: Not a directory; choose another --out")

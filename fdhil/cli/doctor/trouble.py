@@ -1,13 +1,13 @@
-"""Names one thing that is wrong with a machine's PC, and what mends it."""
+"""A problem found by ``fdhil doctor``."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
-    """What is wrong at ``place``, what it means for the machine, and what mends it; ``code`` is its class.
+    """A problem at ``place``: cause, effect on the machine, and fix; ``code`` is its class.
 
-    ``grave``: fdhil, or what was asked of it, does not work until it is mended; else it works worse than it could.
+    ``grave``: a function fails until it is fixed; otherwise it only works worse than possible.
     """
 
     code: str

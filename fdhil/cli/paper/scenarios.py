@@ -1,4 +1,4 @@
-"""The scenarios that the claims are put to: the paper's machine with one thing or another changed."""
+"""Scenarios of the claims: variations of the paper's machine."""
 
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -11,14 +11,14 @@ from fdhil import config as configuration
 from fdhil.config import MachineConfig
 
 SMOOTHED_S = (0.060, 0.030)
-FAST_MM_S = 500.0  # 20 m/min are more than the 60 rad/s that were measured give at this pitch
+FAST_MM_S = 500.0  # 20 m/min exceed the measured 60 rad/s at this pitch
 
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """A machine and how it is looked at: ``changes`` are keys of its configuration, ``setting`` all else.
+    """A variation of the machine: ``changes`` are keys of its configuration, ``setting`` is everything else.
 
-    ``programmed``: errors are told against the programmed path, not against the demand that the NC makes of it.
+    ``programmed``: errors are relative to the programmed path instead of the NC's demand.
     """
 
     title: str
@@ -34,7 +34,7 @@ def _loop(feedforward: float, smoothing_s: Sequence[float], **regulators: Any) -
     return {**gains, **rapids, **others, "nc.smoothing_s": list(smoothing_s)}
 
 
-# the paper's loops are "PID and/or double PI"; with this gain of the integral the position swings a little
+# the paper's loops are "PID and/or double PI"; with this integral gain the position oscillates slightly
 _DOUBLE_PI = {"structure": "double_pi", "position_ki_per_s2": 1250.0}
 
 
@@ -57,12 +57,12 @@ PATHS: Mapping[str, Scenario] = {
     "double-pi": Scenario("double PI, no feed-forward, smoothing NC", _loop(0.0, SMOOTHED_S, **_DOUBLE_PI)),
     "sharp-double-pi": Scenario("double PI, speed feed-forward 0.5, sharp corners", _loop(0.5, (), **_DOUBLE_PI)),
 }
-"""The loops and NCs that cut the path."""
+"""Control loops and NCs that execute the path."""
 
 DEMANDED = tuple(name for name, scenario in PATHS.items() if not scenario.programmed)
-"""Those whose errors are told against the demand."""
+"""Scenarios with errors relative to the demand."""
 CASCADES = tuple(name for name in DEMANDED if not name.endswith("double-pi"))
-"""Of these, those that the twin's drives have too: P, PI and PI."""
+"""Of these, the loops that the simulator supports: P, PI and PI."""
 
 
 @lru_cache(maxsize=1)
@@ -72,7 +72,7 @@ def _document() -> str:
 
 @lru_cache(maxsize=32)
 def machine(name: str = "") -> MachineConfig:
-    """Return the configuration of a path's scenario; of none, that of ``configs/paper.toml`` itself."""
+    """Return the configuration of a scenario; without a name, that of ``configs/paper.toml``."""
     document = tomllib.loads(_document())
     for key, value in (PATHS[name].changes if name else {}).items():
         *tables, last = key.split(".")
@@ -109,8 +109,8 @@ RECORDINGS: Mapping[str, Scenario] = {
     "force-30": Scenario("a cutting force of 30 N, as in finishing aluminium"),
     "force-300": Scenario("a cutting force of 300 N"),
     "force-3000": Scenario("a cutting force of 3000 N, as in roughing steel"),
-    "operators": Scenario("the operator's own weights, without any machine"),
+    "operators": Scenario("weights of the operator, without a machine"),
 }
-"""What was recorded on the measured machine, or what else a claim is put to."""
+"""Recordings of the measured machine, and other test conditions."""
 
 SCENARIOS: Mapping[str, Scenario] = {**PATHS, **RECORDINGS}
