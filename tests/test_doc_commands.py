@@ -107,6 +107,15 @@ def test_a_command_that_fdhil_does_not_have_is_seen() -> None:
     assert "missing" in faults("fdhil predict --config machine.toml", whole=True)
 
 
+@pytest.mark.parametrize("name", LEAVES)
+def test_help_ends_with_valid_example_and_exit_codes(name: str) -> None:
+    text = LEAVES[name].get_help(click.Context(LEAVES[name], info_name=name))
+    example = re.findall(r"Example:\n\s+(.*)", text)
+    assert example[0].startswith(f"fdhil {name}")
+    assert faults(example[0], whole=True) == ""
+    assert "Exit codes:\n    0  " in text
+
+
 # blocks that other tests run as they stand
 RUN = {
     ("README.md", "python"): "tests/api/test_command_line.py",

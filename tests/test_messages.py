@@ -20,7 +20,7 @@ DOCS = PRODUCT.parent / "docs"
 PAGES = ("reference/refusals.md", "reference/guard.md", "reference/notices.md", "reference/errors.md",
          "explanation/verdicts.md")  # fmt: skip
 # what takes a class, a cause and a next action, in this order (a doctor's trouble: class, place, cause, effect, action)
-CALLS = {"refusal": 3, "Refused": 4, "NotAcknowledged": 3, "Reason": 3, "Trouble": 5}
+CALLS = {"refusal": 3, "Refused": 4, "NotAcknowledged": 3, "Reason": 3, "Trouble": 5, "create_from_error": 4}
 CLASS = re.compile(r"[A-Z][a-z]+[A-Za-z]*(\(\w+\))?")
 
 

@@ -2,22 +2,16 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import click
 
 from fdhil.api.compiling import forewarn
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, CONFIG, FILE, OutputFile, Positive, Writing, help_epilog
+from fdhil.cli.options import AS_JSON, CONFIG, FILE, OutputFile, Positive, Writing
 
 
-@click.command(
-    cls=Writing,
-    epilog=help_epilog(
-        "fdhil acceptance machine.toml --out acceptance.html --circle-um 20",
-        "every point is accepted",
-        "a point is open: a drive not commissioned or identified, or a limit exceeded",
-    ),
-)
+@click.command(cls=Writing)
 @CONFIG
 @click.option("--out", required=True, type=OutputFile(), help="HTML file to write.")
 @click.option("--pdf", type=OutputFile(".pdf"), help="PDF file to write as well (needs chromium).")
@@ -31,7 +25,12 @@ from fdhil.cli.options import AS_JSON, CONFIG, FILE, OutputFile, Positive, Writi
     "--radius-mm", type=Positive(0.1, 10_000.0), default=50.0, show_default=True, help="Radius of the circular test."
 )
 @click.option(
-    "--feed", type=Positive(1.0, 1e6), default=2000.0, show_default=True, help="Feed of the circular test, mm/min."
+    "--feed",
+    "feed_mm_min",
+    type=Positive(1.0, 1e6),
+    default=2000.0,
+    show_default=True,
+    help="Feed of the circular test, mm/min.",
 )
 @click.option(
     "--measured-circle",
@@ -43,21 +42,7 @@ from fdhil.cli.options import AS_JSON, CONFIG, FILE, OutputFile, Positive, Writi
 @click.option("--circle-um", type=Positive(), help="Largest accepted bi-directional circular deviation, um.")
 @AS_JSON
 @verdict
-def acceptance(
-    config: Path,
-    out: Path,
-    pdf: Path | None,
-    by: str,
-    customer: str,
-    site: str,
-    program: Path | None,
-    radius_mm: float,
-    feed: float,
-    measured_circle: Path | None,
-    contour_um: float | None,
-    circle_um: float | None,
-    as_json: bool,
-) -> int:
+def acceptance(config: Path, out: Path, pdf: Path | None, as_json: bool, **options: Any) -> int:
     """Write the acceptance report of CONFIG's machine: commissioning results, parameters, circular test.
 
     Nothing is sent to the drives. The circle and PROGRAM are predicted without and with the correction. A measured
@@ -71,8 +56,7 @@ def acceptance(
     require()
     machine = machine_config.load(config)
     forewarn("predict", "correct")
-    given = (program, radius_mm, feed, measured_circle, contour_um, circle_um)
-    found = find(machine, config, Asked(by, customer, site, *given))
+    found = find(machine, config, Asked(**options))
     document = document_of(found)
     deliver(page_of(found, document), out, pdf)
     if as_json:

@@ -14,7 +14,7 @@ import click
 
 from fdhil.api.compiling import forewarn
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, CONFIG_OPTION, FILE, OutputFile, Positive, Writing, help_epilog
+from fdhil.cli.options import AS_JSON, CONFIG_OPTION, FROM_HISTORY, MODEL, PROGRAM, OutputFile, Positive, Writing
 from fdhil.cli.prediction import inputs
 
 if TYPE_CHECKING:
@@ -26,26 +26,12 @@ if TYPE_CHECKING:
 UNHELD = "{} lines leave the tolerance at every feed tried, without the correction"
 
 
-@click.command(
-    cls=Writing,
-    epilog=help_epilog(
-        "fdhil advise part.ngc --tolerance-um 20 --out slower.ngc",
-        "every line keeps the tolerance at some feed (with --out: without the correction)",
-        "some line leaves the tolerance at every feed",
-        "wrong option, model or configuration",
-        "a file cannot be read or written",
-    ),
-)
-@click.argument("program", type=FILE, metavar="PROGRAM|DEMAND.csv")
+@click.command(cls=Writing)
+@PROGRAM
 @CONFIG_OPTION
-@click.option("--model", "model_path", type=FILE, help="Model file (JSON) with the parameters of each axis.")
-@click.option("--from-history", is_flag=True, help="Use the newest validated parameters of the history.")
-@click.option(
-    "--tolerance-um",
-    type=Positive(),
-    required=True,
-    help="Largest contour error allowed, um.",
-)
+@MODEL
+@FROM_HISTORY
+@click.option("--tolerance-um", type=Positive(), required=True, help="Largest contour error allowed, um.")
 @click.option(
     "--out", type=OutputFile(), help="Write PROGRAM with the feeds that keep the tolerance without the correction."
 )

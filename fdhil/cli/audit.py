@@ -9,16 +9,10 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, CONFIG, help_epilog
+from fdhil.cli.options import AS_JSON, CONFIG
 
 
-@click.command(
-    epilog=help_epilog(
-        "fdhil audit machine.toml --last 50",
-        "every entry is intact",
-        "an entry was changed, removed, moved, or cut off by a power failure",
-    )
-)
+@click.command()
 @CONFIG
 @click.option(
     "--last", type=click.IntRange(min=1), default=20, show_default=True, help="Number of newest entries to show."

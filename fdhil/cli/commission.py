@@ -26,7 +26,7 @@ from fdhil.cli.commission_steps import (
 )
 from fdhil.cli.commission_trial import ask_room, try_commissioned
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, CONFIG, help_epilog
+from fdhil.cli.options import AS_JSON, CONFIG
 from fdhil.errors import ConfigError, ConfigFault, DriveFault
 
 if TYPE_CHECKING:
@@ -43,14 +43,7 @@ NEXT_STOPPED = "next: run the same command again; it continues with the unfinish
 NEXT_REFUSED = "next: correct the cause, then run the same command again; completed steps are kept"
 
 
-@click.command(
-    epilog=help_epilog(
-        "fdhil commission machine.toml --axis X --room -20 200",
-        "commissioned",
-        "refused, by you or because the drive is not set up correctly",
-        trouble="the drive or the bus cannot be reached",
-    )
-)
+@click.command()
 @CONFIG
 @click.option("--axis", "only", help="Axis to commission (default: all, one after the other).")
 @click.option("--room", nargs=2, type=float, metavar="BACK FORWARD",

@@ -13,7 +13,7 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, CONFIG, FILE, help_epilog
+from fdhil.cli.options import AS_JSON, CONFIG, FILE
 from fdhil.cli.terminal_text import print_progress
 from fdhil.errors import DeviceError
 from fdhil.guard.protocol import SOCKET_NAME
@@ -33,13 +33,7 @@ STATES: Mapping[bool | None, tuple[str, str]] = {
 }
 
 
-@click.command(
-    epilog=help_epilog(
-        "fdhil scan machine.toml --eds eds/",
-        "at least one node found",
-        trouble="a bus cannot be reached, or no node is on it",
-    )
-)
+@click.command()
 @CONFIG
 @click.option("--eds", "places", multiple=True, type=FILE,
               help="EDS or DCF file, or folder of such files (default: the folder of CONFIG).")  # fmt: skip
@@ -112,11 +106,7 @@ def _node_row(node: Node, unanswered: str) -> list[str]:
     return [*seen, f"{answers.name or 'unnamed'}\n{profile}", *ids, eds]
 
 
-@click.command(
-    epilog=help_epilog(
-        "fdhil check machine.toml", "no point differs", "a point differs", trouble="a bus cannot be reached"
-    )
-)
+@click.command()
 @CONFIG
 @AS_JSON
 @verdict

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fdhil.cli.options import AS_JSON, FILE, help_epilog
+from fdhil.cli.options import AS_JSON, FILE
 from fdhil.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -21,11 +21,7 @@ Values = Mapping[str, Mapping[str, Mapping[str, Any]]]
 """Axis, parameter, then value, low and high of its 95 % interval (None if unknown)."""
 
 
-@click.command(
-    epilog=help_epilog(
-        "fdhil compare before.csv after.csv", trouble="a file cannot be read or has no comparable content"
-    )
-)
+@click.command()
 @click.argument("before", type=FILE)
 @click.argument("after", type=FILE)
 @AS_JSON

@@ -13,7 +13,7 @@ import click
 
 from fdhil import tables
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, FILE, help_epilog
+from fdhil.cli.options import AS_JSON, FILE
 from fdhil.errors import ConfigError, ConfigFault
 
 if TYPE_CHECKING:
@@ -27,15 +27,7 @@ CANDIDATES = {"voltage": "a motor voltage or duty", "dc_link": "the DC link", "c
 MOST_NAMED = 6
 
 
-@click.command(
-    epilog=help_epilog(
-        "fdhil eds drive.eds",
-        "fdhil can listen to the drive",
-        "fdhil cannot listen to the drive",
-        "wrong option or profile",
-        "the file cannot be read",
-    )
-)
+@click.command()
 @click.argument("file", type=FILE)
 @click.option(
     "--profile", "name", help="Profile to assess with: a packaged name or a TOML file (default: the vendor's)."

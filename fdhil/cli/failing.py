@@ -13,6 +13,7 @@ from typing import Any, ParamSpec, TextIO, TypeVar
 
 import click
 
+from fdhil.cli.epilogs import read_epilog
 from fdhil.cli.terminal_text import without_controls
 from fdhil.errors import ConfigError, ConfigFault, FdhilError
 
@@ -31,7 +32,18 @@ NO_CACHE = (
 
 
 class SuggestingGroup(click.Group):
-    """A group that suggests the command closest in spelling to an unknown one."""
+    """A group that adds the epilog to each command, and suggests the command closest in spelling to an unknown one."""
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Return one command with its epilog, or None if the name is unknown."""
+        command = self.find_command(ctx, cmd_name)
+        if command is not None and command.epilog is None:
+            command.epilog = read_epilog(cmd_name if self.name == "cli" else f"{self.name} {cmd_name}")
+        return command
+
+    def find_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Return one command, or None if the name is unknown."""
+        return super().get_command(ctx, cmd_name)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

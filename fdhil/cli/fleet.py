@@ -1,16 +1,19 @@
 """``fdhil uplink`` sends the records of a machine; ``fdhil fleet`` collects and compares those of all machines."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from fdhil.cli.failing import SuggestingGroup, verdict
-from fdhil.cli.options import AS_JSON, CONFIG, FLEET, LINES, help_epilog
+from fdhil.cli.options import AS_JSON, CONFIG, FLEET, LINES
 from fdhil.errors import FdhilError
+
+if TYPE_CHECKING:
+    from fdhil.config.fleet import Fleet
 
 BY = click.option("--by", default="type", show_default=True, help="Label of [uplink] that groups comparable machines.")
 ELSEWHERE: Mapping[str, str] = {
@@ -31,7 +34,7 @@ def with_extra() -> Iterator[None]:
         raise FdhilError(f"{what}: pip install 'fdhil[fleet]'") from None
 
 
-@click.command(epilog=help_epilog("fdhil uplink machine.toml", "stopped", trouble="the store cannot be read"))
+@click.command()
 @CONFIG
 @LINES
 def uplink(config: Path, as_json: bool) -> None:
@@ -60,10 +63,10 @@ class Questions(SuggestingGroup):
         """Return the names of all commands."""
         return [*super().list_commands(ctx), *ELSEWHERE]
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+    def find_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Return one command, or None if the name is unknown."""
         if cmd_name not in ELSEWHERE:
-            return super().get_command(ctx, cmd_name)
+            return super().find_command(ctx, cmd_name)
         command: click.Command = getattr(import_module(ELSEWHERE[cmd_name]), cmd_name.replace("-", "_"))
         return command
 
@@ -77,11 +80,7 @@ def fleet() -> None:
     """
 
 
-@fleet.command(
-    epilog=help_epilog(
-        "fdhil fleet collect fleet.toml", "stopped", trouble="the server or the database cannot be reached"
-    )
-)
+@fleet.command()
 @FLEET
 @LINES
 def collect(fleet: Path, as_json: bool) -> None:
@@ -102,20 +101,32 @@ def collect(fleet: Path, as_json: bool) -> None:
         run(lambda settings: gather(settings, say_ready), settings)
 
 
-def _answer(fleet: Path, question: str, **given: str | None) -> dict[str, Any]:
-    from fdhil.config.fleet import load
-
-    settings = load(fleet)
+def query_database(settings: "Fleet", question: str, **given: str | None) -> dict[str, Any]:
+    """Return the answer of the database to a question, which is the name of a command."""
     with with_extra():
         from fdhil.fleet import questions, sets
+    functions: Mapping[str, Callable[..., dict[str, Any]]] = {
+        "status": questions.status,
+        "trend": questions.trend,
+        "compare": questions.compare,
+        "outliers": questions.outliers,
+        "services": questions.services,
+    }
     with sets.asking(settings) as db:
-        answer: dict[str, Any] = getattr(questions, question)(db, **given)
+        return functions[question](db, **given)
+
+
+def query_and_print(fleet: Path, question: str, as_json: bool, **given: str | None) -> dict[str, Any]:
+    """Answer a question from the database of ``fleet``, and print the answer."""
+    from fdhil.cli import fleet_view
+    from fdhil.config.fleet import load
+
+    answer = query_database(load(fleet), question, **given)
+    fleet_view.tell(answer, question, as_json)
     return answer
 
 
-@fleet.command(
-    epilog=help_epilog("fdhil fleet status fleet.toml", trouble="the server or the database cannot be reached")
-)
+@fleet.command()
 @FLEET
 @AS_JSON
 def status(fleet: Path, as_json: bool) -> None:
@@ -123,19 +134,10 @@ def status(fleet: Path, as_json: bool) -> None:
 
     Lists the time of the last record, missing records, pending notices and parameter revisions of each.
     """
-    from fdhil.cli import fleet_view
-
-    answer = _answer(fleet, "status")
-    fleet_view.tell(answer, "status", as_json, fleet_view.status)
+    query_and_print(fleet, "status", as_json)
 
 
-@fleet.command(
-    epilog=help_epilog(
-        "fdhil fleet trend fleet.toml --machine mill-7 --axis X --parameter ft",
-        no="no parameters of this axis",
-        trouble="the server or the database cannot be reached",
-    )
-)
+@fleet.command()
 @FLEET
 @click.option("--machine", required=True, help="Fleet name of the machine.")
 @click.option("--axis", required=True, help="Axis letter.")
@@ -147,18 +149,11 @@ def trend(fleet: Path, machine: str, axis: str, parameter: str, as_json: bool) -
 
     Includes temperature, 95 % interval and slope per 30 days.
     """
-    from fdhil.cli import fleet_view
-
-    answer = _answer(fleet, "trend", machine=machine, axis=axis, parameter=parameter)
-    fleet_view.tell(answer, "trend", as_json, fleet_view.trend)
+    answer = query_and_print(fleet, "trend", as_json, machine=machine, axis=axis, parameter=parameter)
     return 0 if answer["sets"] else 1
 
 
-@fleet.command(
-    epilog=help_epilog(
-        "fdhil fleet compare fleet.toml --parameter Jt", trouble="the server or the database cannot be reached"
-    )
-)
+@fleet.command()
 @FLEET
 @click.option("--parameter", required=True, type=PARAMETER, help="Parameter to compare.")
 @BY
@@ -169,20 +164,10 @@ def compare(fleet: Path, parameter: str, by: str, axis: str | None, as_json: boo
 
     Groups the machines by a label of [uplink].
     """
-    from fdhil.cli import fleet_view
-
-    answer = _answer(fleet, "compare", parameter=parameter, by=by, axis=axis)
-    fleet_view.tell(answer, "compare", as_json, fleet_view.compare)
+    query_and_print(fleet, "compare", as_json, parameter=parameter, by=by, axis=axis)
 
 
-@fleet.command(
-    epilog=help_epilog(
-        "fdhil fleet outliers fleet.toml",
-        "no outlier",
-        "at least one outlier",
-        trouble="the server or the database cannot be reached",
-    )
-)
+@fleet.command()
 @FLEET
 @BY
 @click.option("--axis", help="Restrict to one axis letter.")
@@ -195,8 +180,5 @@ def outliers(fleet: Path, by: str, axis: str | None, as_json: bool) -> int:
     and age since the first set or the newest service are taken into account. The false-alarm rate is one in a hundred
     groups per parameter.
     """
-    from fdhil.cli import fleet_view
-
-    answer = _answer(fleet, "outliers", by=by, axis=axis)
-    fleet_view.tell(answer, "outliers", as_json, fleet_view.outliers)
+    answer = query_and_print(fleet, "outliers", as_json, by=by, axis=axis)
     return 1 if answer["outliers"] else 0

@@ -15,7 +15,7 @@ import click
 from fdhil import tables
 from fdhil.cli.failing import verdict
 from fdhil.cli.fleet import BY, with_extra
-from fdhil.cli.options import AS_JSON, FILE, FLEET, help_epilog
+from fdhil.cli.options import AS_JSON, FILE, FLEET
 
 if TYPE_CHECKING:
     from fdhil.config import MachineConfig
@@ -24,12 +24,7 @@ UNREADABLE = 3
 DAY = click.DateTime(["%Y-%m-%d", "%Y-%m-%dT%H:%M:%S"])
 
 
-@click.command(
-    epilog=help_epilog(
-        "fdhil fleet reanalyse fleet.toml --since 2026-01-01 --config machines/mill-7.toml",
-        trouble="a window could not be read (all others were analysed)",
-    )
-)
+@click.command()
 @FLEET
 @click.option("--since", type=DAY, help="Restrict to windows from this day on (UTC).")
 @click.option("--until", type=DAY, help="Restrict to windows before this day (UTC).")

@@ -12,7 +12,7 @@ import click
 
 from fdhil.cli.failing import verdict
 from fdhil.cli.fleet import with_extra
-from fdhil.cli.options import AS_JSON, FILE, FLEET, OutputFile, Writing, help_epilog
+from fdhil.cli.options import AS_JSON, FILE, FLEET, OutputFile, Writing
 
 if TYPE_CHECKING:
     from fdhil.fleet.offer import Change, Offer
@@ -22,7 +22,7 @@ CHANGE = click.argument("change", type=FILE)
 MACHINES = click.option("--machine", "machines", multiple=True, help="Fleet name of a machine; repeatable.")
 
 
-@click.command(epilog=help_epilog("fdhil fleet key rollout.key", "created, or already present"))
+@click.command()
 @click.argument("file", type=FILE)
 @AS_JSON
 def key(file: Path, as_json: bool) -> None:
@@ -42,10 +42,7 @@ def key(file: Path, as_json: bool) -> None:
     click.echo(told)
 
 
-@click.command(
-    cls=Writing,
-    epilog=help_epilog("fdhil fleet sign change.toml --key rollout.key --by 'A. Smith' --out change.offer", "signed"),
-)
+@click.command(cls=Writing)
 @CHANGE
 @click.option("--key", "key_file", type=FILE, required=True, help="Key file to sign with.")
 @click.option("--by", required=True, help="Who signs: your name, which the operators read.")
@@ -75,14 +72,7 @@ def sign(change: Path, key_file: Path, by: str, machines: tuple[str, ...], out: 
     click.echo(f"{offer} is signed; at the machine: fdhil offers list machine.toml {out}")
 
 
-@click.command(
-    epilog=help_epilog(
-        "fdhil fleet stage fleet.toml change.toml --key rollout.key --by 'A. Smith' --count 3",
-        "all machines offered so far accept and validate CHANGE, or a stage was opened or withdrawn",
-        "a machine has not accepted or validated CHANGE, or reported a notice since",
-        trouble="the server or the database cannot be reached",
-    )
-)
+@click.command()
 @FLEET
 @CHANGE
 @click.option("--key", "key_file", type=FILE, help="Key file to sign with; without it no stage is opened.")

@@ -10,14 +10,14 @@ BEYOND = 1000.0  # deviations; larger ones come from peers with identical values
 Lines = Callable[[Mapping[str, Any]], Iterator[str]]
 
 
-def tell(answer: Mapping[str, Any], question: str, as_json: bool, lines: Lines) -> None:
-    """Print an answer as text or as one JSON document."""
+def tell(answer: Mapping[str, Any], question: str, as_json: bool, lines: Lines | None = None) -> None:
+    """Print an answer as text, by default with the ``LINES`` of its question, or as one JSON document."""
     from fdhil.daemon.journal import printable
 
     if as_json:
         click.echo(json.dumps({"schema": f"fdhil-fleet-{question}-1", **answer}))
         return
-    for line in lines(answer):
+    for line in (lines or LINES[question])(answer):
         click.echo(printable(line))
 
 
@@ -138,3 +138,9 @@ def export(answer: Mapping[str, Any]) -> Iterator[str]:
 
 def _number(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.6g}"
+
+
+LINES: Mapping[str, Lines] = {
+    "status": status, "trend": trend, "compare": compare, "outliers": outliers, "service": service,
+    "services": services, "retain": retain, "export": export,
+}  # fmt: skip

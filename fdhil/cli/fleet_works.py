@@ -1,23 +1,19 @@
 """``fdhil fleet``: services, retention, anonymous export and the web page of the fleet."""
 
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import click
 
-from fdhil.cli.fleet import with_extra
-from fdhil.cli.options import AS_JSON, FILE, FLEET, help_epilog
+from fdhil.cli import fleet_view
+from fdhil.cli.fleet import query_and_print, query_database, with_extra
+from fdhil.cli.options import AS_JSON, FILE, FLEET
 from fdhil.cli.terminal_text import print_progress
 from fdhil.config.fleet import load
 
 
-@click.command(
-    epilog=help_epilog(
-        "fdhil fleet service fleet.toml --machine mill-7 --axis X --note 'new ball screw'",
-        trouble="the database cannot be reached",
-    )
-)
+@click.command()
 @FLEET
 @click.option("--machine", required=True, help="Fleet name of the machine.")
 @click.option("--axis", help="Axis letter (default: the whole machine).")
@@ -34,8 +30,6 @@ def service(
 
     Age and maintenance limits count from then. fdhil fleet services shows the effect of each service.
     """
-    from fdhil.cli import fleet_view
-
     if remove and at is None:
         raise click.UsageError("--remove needs the recorded --date")
     when = datetime.now(UTC).replace(microsecond=0) if at is None else at.replace(tzinfo=UTC)
@@ -47,10 +41,10 @@ def service(
             answer = services.remove(db, machine, axis or "", when)
         else:
             answer = services.enter(db, machine, axis or "", when, note)
-    fleet_view.tell(answer, "service", as_json, fleet_view.service)
+    fleet_view.tell(answer, "service", as_json)
 
 
-@click.command(epilog=help_epilog("fdhil fleet services fleet.toml", trouble="the database cannot be reached"))
+@click.command()
 @FLEET
 @click.option("--machine", help="Restrict to one machine.")
 @AS_JSON
@@ -59,14 +53,10 @@ def services(fleet: Path, machine: str | None, as_json: bool) -> None:
 
     Newest first, with the change from the sets before to those after and its 95 % interval.
     """
-    from fdhil.cli import fleet_view
-    from fdhil.cli.fleet import _answer
-
-    answer = _answer(fleet, "services", machine=machine)
-    fleet_view.tell(answer, "services", as_json, fleet_view.services)
+    query_and_print(fleet, "services", as_json, machine=machine)
 
 
-@click.command(epilog=help_epilog("fdhil fleet retain fleet.toml", trouble="the database cannot be reached"))
+@click.command()
 @FLEET
 @AS_JSON
 def retain(fleet: Path, as_json: bool) -> None:
@@ -75,21 +65,15 @@ def retain(fleet: Path, as_json: bool) -> None:
     Deletes whole months of records, and files of windows. Run it once a day by a timer. The first parameters of each
     axis are kept, and deleted records do not count as missing.
     """
-    from fdhil.cli import fleet_view
-
     settings = load(fleet)
     with with_extra():
         from fdhil.fleet import retention, sets
     with sets.entered(settings) as db:
         answer = retention.retain(db, settings, datetime.now(UTC), print_progress)
-    fleet_view.tell(answer, "retain", as_json, fleet_view.retain)
+    fleet_view.tell(answer, "retain", as_json)
 
 
-@click.command(
-    epilog=help_epilog(
-        "fdhil fleet export fleet.toml --anonymous shared/", "exported", trouble="the database cannot be reached"
-    )
-)
+@click.command()
 @FLEET
 @click.option("--anonymous", "folder", type=FILE, required=True, help="New folder to write, without names.")
 @click.option("--label", "labels", multiple=True, help="Label of machines or axes to include; repeatable.")
@@ -101,8 +85,6 @@ def export(fleet: Path, folder: Path, labels: tuple[str, ...], key: Path | None,
     Writes Parquet files: names of machines become keyed digests, times become ages in months, texts and labels are
     omitted except for --label. The key identifies the machines; keep it secret.
     """
-    from fdhil.cli import fleet_view
-
     settings = load(fleet)
     with with_extra():
         from fdhil.fleet import export as given_away
@@ -111,12 +93,10 @@ def export(fleet: Path, folder: Path, labels: tuple[str, ...], key: Path | None,
         answer = given_away.export(
             db, folder, given_away.key_of(key or fleet.parent / "anonymous.key"), labels, print_progress
         )
-    fleet_view.tell(answer, "export", as_json, fleet_view.export)
+    fleet_view.tell(answer, "export", as_json)
 
 
-@click.command(
-    epilog=help_epilog("fdhil fleet web fleet.toml --port 8080", "stopped", trouble="address or database unavailable")
-)
+@click.command()
 @FLEET
 @click.option("--host", help="Address to listen on (default: web.host of FLEET).")
 @click.option("--port", type=click.IntRange(0, 65535), help="TCP port, 0 for a free one (default: web.port of FLEET).")
@@ -131,21 +111,18 @@ def web(fleet: Path, host: str | None, port: int | None, as_json: bool) -> None:
 
     settings = load(fleet)
     with with_extra():
-        from fdhil.fleet import questions, sets
+        from fdhil.fleet import questions as _  # noqa: F401 - a missing library is reported before the start
     from fdhil.web import serving
 
     serving.require()
     from fdhil.web.fleet_app import make_fleet_app
 
-    def ask(question: str, **given: str | None) -> Any:
-        with sets.asking(settings) as db:
-            return getattr(questions, question)(db, **given)
-
     own = placed(settings.web, host, port)
+    ask = partial(query_database, settings)
     serving.serve(own, lambda: make_fleet_app(own, ask), lambda url: tell_ready("all machines", url, as_json))
 
 
-@click.command("web-user", epilog=help_epilog("fdhil fleet web-user fleet.toml anna"))
+@click.command("web-user")
 @FLEET
 @click.argument("name")
 @click.option("--remove", is_flag=True, help="Remove the user.")

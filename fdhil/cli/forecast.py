@@ -122,7 +122,8 @@ def _change_entry(
 ) -> dict[str, Any]:
     from fdhil.prediction.model_terms import values_of
 
-    old, new = ({axis: values_of(p) for axis, p in models.items()} for models in (earlier, models))
+    both = {"before": earlier, "now": models}
+    values = {when: {axis: values_of(p) for axis, p in of.items()} for when, of in both.items()}
     return {
         "line": change.line,
         "where": change.where,
@@ -135,8 +136,7 @@ def _change_entry(
             {
                 "axis": axis,
                 "parameter": name,
-                "before": old[axis].get(name, 0.0),
-                "now": new[axis].get(name, 0.0),
+                **{when: of[axis].get(name, 0.0) for when, of in values.items()},
                 "um": um,
             }
             for axis, name, um in change.by

@@ -10,23 +10,16 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cli.bus_lock import lock_bus
+from fdhil.cli.epilogs import read_epilog
 from fdhil.cli.failing import prepare_streams, run_safely
-from fdhil.cli.options import CONFIG, help_epilog
+from fdhil.cli.options import CONFIG
 from fdhil.errors import DeviceError
 from fdhil.guard.protocol import SETTINGS_NAME
 from fdhil.guard.settings import from_json, to_json
 from fdhil.guard.transmit_socket import connect_bus, greet
 
 
-@click.command(
-    epilog=help_epilog(
-        "fdhil-guard machine.toml",
-        "stopped with all offsets at zero",
-        wrong="wrong configuration",
-        trouble="bus trouble, or an offset may still be applied",
-    ),
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
+@click.command(epilog=read_epilog("guard"), context_settings={"help_option_names": ["-h", "--help"]})
 @CONFIG
 @click.option("--check", is_flag=True, help="Write the settings file and exit, without opening a bus.")
 def guard(config: Path, check: bool) -> None:

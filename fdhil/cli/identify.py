@@ -15,7 +15,7 @@ import click
 from fdhil import report as reports
 from fdhil import tables
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, FILE, OutputFile, Picture, Writing, help_epilog
+from fdhil.cli.options import AS_JSON, FILE, OutputFile, Picture, Writing
 from fdhil.records import INTERVAL_95, unit_of
 from fdhil.report.parameter_view import MEANING, cell, head
 from fdhil.store import suffixes
@@ -32,15 +32,7 @@ BESIDE = "-"  # of --plot without a name
 UNREADABLE = 3
 
 
-@click.command(
-    cls=Writing,
-    epilog=help_epilog(
-        "fdhil identify recordings/ --config machine.toml --write-model model.json",
-        "the pooled parameters of every file are validated",
-        "some pooled parameters are not validated",
-        trouble="a recording cannot be read (all others were identified)",
-    ),
-)
+@click.command(cls=Writing)
 @click.argument("recordings", nargs=-1, required=True, type=FILE, metavar="RECORDING...")
 @click.option("--config", "config_path", type=FILE, help="Machine configuration (TOML).")
 @click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Estimator (default: the best).")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import config as machine_config
-from fdhil.cli.options import AS_JSON, DEFAULT_CONFIG, FILE, OutputFile, Writing, help_epilog
+from fdhil.cli.options import AS_JSON, DEFAULT_CONFIG, FILE, OutputFile, Writing
 from fdhil.errors import ConfigError, ConfigFault, OutputError
 
 if TYPE_CHECKING:
@@ -33,15 +33,7 @@ NEXT = (
 )
 
 
-@click.command(
-    cls=Writing,
-    epilog=help_epilog(
-        "fdhil init machine.toml --from-linuxcnc /home/cnc/mill/mill.ini",
-        "created",
-        wrong="wrong option, or a value is missing or impossible",
-        trouble="a bus, drive or file cannot be reached",
-    ),
-)
+@click.command(cls=Writing)
 @click.argument("file", type=OutputFile(".toml"), default=DEFAULT_CONFIG)
 @click.option("--answers", type=FILE,
               help="Answers (TOML) with the keys of the configuration; disables all prompts.")  # fmt: skip

@@ -93,7 +93,7 @@ class LazyGroup(SuggestingGroup):
         """Return the names of all commands, group by group."""
         return list(COMMANDS)
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+    def find_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import and return one command, or None if the name is unknown."""
         if cmd_name not in COMMANDS:
             return None

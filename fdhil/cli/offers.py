@@ -12,7 +12,7 @@ from fdhil import config as machine_config
 from fdhil.cli.audited import audited
 from fdhil.cli.failing import SuggestingGroup, verdict
 from fdhil.cli.fleet import with_extra
-from fdhil.cli.options import AS_JSON, CONFIG, FILE, ConfigFirst, help_epilog
+from fdhil.cli.options import AS_JSON, CONFIG, FILE, ConfigFirst
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault
 
@@ -33,11 +33,7 @@ def offers() -> None:
     """
 
 
-@offers.command(
-    "list",
-    cls=ConfigFirst,
-    epilog=help_epilog("fdhil offers list machine.toml", no="one of FILES cannot be accepted"),
-)
+@offers.command("list", cls=ConfigFirst)
 @CONFIG
 @click.argument("files", nargs=-1, type=FILE)
 @AS_JSON
@@ -59,12 +55,7 @@ def list_(config: Path, files: tuple[Path, ...], as_json: bool) -> int:
     return 1 if any(each.wrong for each in found if each.place in files) else 0
 
 
-@offers.command(
-    cls=ConfigFirst,
-    epilog=help_epilog(
-        "fdhil offers accept machine.toml friction --by 'A. Smith'", "accepted", "not accepted; nothing was changed"
-    ),
-)
+@offers.command(cls=ConfigFirst)
 @CONFIG
 @OFFER
 @BY
@@ -90,10 +81,7 @@ def accept(config: Path, offer: Path, by: str, may_loosen: bool, as_json: bool) 
     offers_view.accepted(done, machine, config, as_json)
 
 
-@offers.command(
-    cls=ConfigFirst,
-    epilog=help_epilog("fdhil offers reject machine.toml friction --by 'A. Smith' --reason 'new screw'", "rejected"),
-)
+@offers.command(cls=ConfigFirst)
 @CONFIG
 @OFFER
 @BY

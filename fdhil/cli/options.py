@@ -30,6 +30,9 @@ CONFIG = click.argument("config", type=FILE, default=DEFAULT_CONFIG, callback=_c
 CONFIG_OPTION = click.option("--config", "config_path", type=FILE, default=DEFAULT_CONFIG, show_default=True,
                              callback=_check_default, help="Machine configuration (TOML).")  # fmt: skip
 FLEET = click.argument("fleet", type=FILE)
+PROGRAM = click.argument("program", type=FILE, metavar="PROGRAM|DEMAND.csv")
+MODEL = click.option("--model", "model_path", type=FILE, help="Model file (JSON) with the parameters of each axis.")
+FROM_HISTORY = click.option("--from-history", is_flag=True, help="Use the newest validated parameters of the history.")
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout.")
 LINES = click.option("--json", "as_json", is_flag=True, help="Write each log line as a JSON object to stdout.")
 COLUMNS = click.option(
@@ -37,19 +40,6 @@ COLUMNS = click.option(
     type=FILE,
     help="Column map (TOML) that assigns signals and units to the columns of a foreign file.",
 )
-
-
-def help_epilog(
-    example: str,
-    done: str = "done",
-    no: str = "",
-    wrong: str = "wrong option or configuration",
-    trouble: str = "a file or the configuration cannot be read or written",
-) -> str:
-    """Return the end of a help text: an example, and the exit codes 0 to 3, of which 1 only if ``no`` is given."""
-    codes = (done, no, wrong, trouble)
-    lines = [f"  {code}  {meaning}" for code, meaning in enumerate(codes) if meaning]
-    return "\n".join(["\b", "Example:", f"  {example}", "", "\b", "Exit codes:", *lines])
 
 
 class Positive(click.FloatRange):

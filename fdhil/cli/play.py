@@ -18,7 +18,7 @@ from fdhil import config as machine_config
 from fdhil.cli.audited import audited
 from fdhil.cli.consent import agreed, listen_again
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, CONFIG_OPTION, FILE, help_epilog
+from fdhil.cli.options import AS_JSON, CONFIG_OPTION, FILE
 from fdhil.cli.terminal_text import print_progress
 from fdhil.errors import DeviceError, DriveFault
 from fdhil.guard.protocol import SOCKET_NAME
@@ -39,14 +39,7 @@ SIGNALS: Mapping[int, str] = {
 }
 
 
-@click.command(
-    epilog=help_epilog(
-        "fdhil play part.ngc --config bench.toml --go-to-start",
-        "played to the end",
-        "refused, or stopped on the way",
-        trouble="a drive or bus cannot be reached, or failed on the way",
-    )
-)
+@click.command()
 @click.argument("program", type=FILE)
 @CONFIG_OPTION
 @click.option("--go-to-start", is_flag=True, help="Move slowly to the first set-point before the start.")

@@ -14,7 +14,7 @@ import click
 from fdhil import tables
 from fdhil.api.compiling import forewarn
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, CONFIG_OPTION, FILE, OutputFile, Positive, Writing, help_epilog
+from fdhil.cli.options import AS_JSON, CONFIG_OPTION, FROM_HISTORY, MODEL, PROGRAM, OutputFile, Positive, Writing
 from fdhil.records import INTERVAL_95
 from fdhil.report.parameter_view import MEANING
 
@@ -43,7 +43,6 @@ class Asked:
 
 
 def _shared(wanted: Callable[..., int | None]) -> Callable[..., int | None]:
-
     @functools.wraps(wanted)
     def command(**options: Any) -> int | None:
         if options["report"] or options["pdf"]:
@@ -53,32 +52,21 @@ def _shared(wanted: Callable[..., int | None]) -> Callable[..., int | None]:
         own = {name: value for name, value in options.items() if name not in Asked.__dataclass_fields__}
         return wanted(Asked(**{name: options[name] for name in Asked.__dataclass_fields__}), **own)
 
-    for option in reversed(
-        (
-            click.argument("program", type=FILE, metavar="PROGRAM|DEMAND.csv"),
-            CONFIG_OPTION,
-            click.option(
-                "--model", "model_path", type=FILE, help="Model file (JSON) with the parameters of each axis."
-            ),
-            click.option("--from-history", is_flag=True, help="Use the newest validated parameters of the history."),
-            click.option("--out", type=OutputFile(), help="Write a CSV with one row per SYNC period."),
-            click.option("--report", type=OutputFile(), help="Write an HTML page with error map and worst locations."),
-            click.option("--pdf", type=OutputFile(".pdf"), help="Write that page as PDF (needs chromium)."),
-            AS_JSON,
-        )
-    ):
+    for option in (
+        AS_JSON,
+        click.option("--pdf", type=OutputFile(".pdf"), help="Write that page as PDF (needs chromium)."),
+        click.option("--report", type=OutputFile(), help="Write an HTML page with error map and worst locations."),
+        click.option("--out", type=OutputFile(), help="Write a CSV with one row per SYNC period."),
+        FROM_HISTORY,
+        MODEL,
+        CONFIG_OPTION,
+        PROGRAM,
+    ):  # the last one is shown first
         option(command)
     return command
 
 
-@click.command(
-    cls=Writing,
-    epilog=help_epilog(
-        "fdhil predict part.ngc --from-history --tolerance-um 50 --report part.html",
-        wrong="wrong option, model or configuration",
-        trouble="a file cannot be read or written",
-    ),
-)
+@click.command(cls=Writing)
 @_shared
 @click.option("--sensitivity", is_flag=True, help="Show per zone the error change, um, for 1 % of each parameter.")
 @click.option(
@@ -175,16 +163,7 @@ def _with_history(
     return std_um, steps
 
 
-@click.command(
-    cls=Writing,
-    epilog=help_epilog(
-        "fdhil correct part.ngc --from-history --out offsets.csv",
-        "planned",
-        "refused, because no improvement is predicted",
-        "wrong option, model or configuration",
-        "a file cannot be read or written",
-    ),
-)
+@click.command(cls=Writing)
 @_shared
 @click.option("--method", type=click.Choice(list(tables.CORRECTIONS)), help="Correction method (default: the best).")
 @verdict

@@ -9,18 +9,12 @@ from pathlib import Path
 
 import click
 
-from fdhil.cli.options import FILE, help_epilog
+from fdhil.cli.options import FILE
 
 _SPOOL_CHARACTERS = 8_000_000
 
 
-@click.command(
-    epilog=help_epilog(
-        "fdhil interpret part.ngc --config machine.toml",
-        wrong="wrong option, configuration or program",
-        trouble="the program cannot be read",
-    )
-)
+@click.command()
 @click.argument("program", type=FILE)
 @click.option("--config", "config_path", type=FILE, help="Machine configuration (TOML) with NC dialect and axes.")
 @click.option("--json", "as_document", is_flag=True, help="Print one JSON document instead of a table.")

@@ -7,17 +7,14 @@ import click
 
 from fdhil import config as machine_config
 from fdhil import tables
-from fdhil.cli.options import CONFIG, LINES, OutputFile, Writing, help_epilog
+from fdhil.cli.options import CONFIG, LINES, OutputFile, Writing
 from fdhil.config import MachineConfig
 from fdhil.errors import FdhilError
 
 EXTRAS: Mapping[str, str] = {"prometheus": "web", "mtconnect": ""}  # other extras have the name of the protocol
 
 
-@click.command(
-    cls=Writing,
-    epilog=help_epilog("fdhil publish mqtt machine.toml", "stopped", trouble="the server or broker cannot be reached"),
-)
+@click.command(cls=Writing)
 @click.argument("protocol", type=click.Choice(list(tables.PUBLISHERS)))
 @CONFIG
 @click.option(

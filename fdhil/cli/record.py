@@ -10,7 +10,7 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, CONFIG, OutputFile, Positive, Writing, help_epilog
+from fdhil.cli.options import AS_JSON, CONFIG, OutputFile, Positive, Writing
 
 if TYPE_CHECKING:
     from fdhil.drivers import Record
@@ -20,15 +20,7 @@ _SHOWN_GAPS = 5
 NOTHING_MOVED = "nothing moved; start the program on the NC while the recording waits"
 
 
-@click.command(
-    cls=Writing,
-    epilog=help_epilog(
-        "fdhil record machine.toml --out part.csv",
-        "recorded completely",
-        "samples were lost, or nothing moved",
-        trouble="the bus cannot be reached, or the file cannot be written",
-    ),
-)
+@click.command(cls=Writing)
 @CONFIG
 @click.option("--out", required=True, type=OutputFile(), help="Demand CSV to write; use the suffix .csv.")
 @click.option("--seconds", type=Positive(), help="Maximum duration of the recording, s.")

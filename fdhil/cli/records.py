@@ -13,7 +13,7 @@ from fdhil import config as machine_config
 from fdhil import tables
 from fdhil.api.compiling import forewarn
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, COLUMNS, CONFIG, FILE, OutputFile, Writing, help_epilog
+from fdhil.cli.options import AS_JSON, COLUMNS, CONFIG, FILE, OutputFile, Writing
 from fdhil.errors import RecordingError
 from fdhil.store import suffixes
 
@@ -23,14 +23,7 @@ if TYPE_CHECKING:
 HEALTH = ("slopes", "trends", "limits", "changes", "windows")
 
 
-@click.command(
-    epilog=help_epilog(
-        "fdhil replay windows/w00000001-X.parquet --config machine.toml",
-        "every window is validated",
-        "a window is not validated, or there is none",
-        trouble="a recording cannot be read",
-    )
-)
+@click.command()
 @click.argument("recordings", type=FILE, nargs=-1, required=True, metavar="RECORDING...")
 @click.option("--config", "config", type=FILE, help="Machine configuration (default: from the recordings).")
 @click.option(
@@ -119,10 +112,7 @@ def _config_of(window: Window) -> machine_config.MachineConfig:
     return machine_config.parse({"machine": machine, "axis": {window.axis: axis}}, "recording", made_up=True)
 
 
-@click.command(
-    cls=Writing,
-    epilog=help_epilog("fdhil history machine.toml --axis X --plot trends.svg", trouble="the store cannot be read"),
-)
+@click.command(cls=Writing)
 @CONFIG
 @click.option("--axis", help="Restrict to one axis.")
 @click.option(
@@ -168,10 +158,7 @@ def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) ->
     show_notices(notices)
 
 
-@click.command(
-    cls=Writing,
-    epilog=help_epilog("fdhil export rapid.parquet --out rapid.mat", trouble="a file cannot be read or written"),
-)
+@click.command(cls=Writing)
 @click.argument("recording", type=FILE)
 @click.option("--out", required=True, type=OutputFile(), help="File to write.")
 @click.option(
@@ -199,9 +186,7 @@ def export(recording: Path, out: Path, format_name: str | None, columns: Path | 
         click.echo(json.dumps({"schema": "fdhil-export-1", "recording": str(recording), "file": str(out)} | told))
 
 
-@click.command(
-    cls=Writing, epilog=help_epilog("fdhil report machine.toml --out report.html", trouble="the store cannot be read")
-)
+@click.command(cls=Writing)
 @CONFIG
 @click.option("--out", required=True, type=OutputFile(), help="HTML file to write.")
 @click.option("--pdf", type=OutputFile(".pdf"), help="PDF file to write as well (needs chromium).")

@@ -17,7 +17,7 @@ from fdhil import tables
 from fdhil.cli.audited import write_after, write_before
 from fdhil.cli.consent import agreed
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, CONFIG, FILE, LINES, ConfigFirst, help_epilog
+from fdhil.cli.options import AS_JSON, CONFIG, FILE, LINES, ConfigFirst
 from fdhil.cli.terminal_text import without_controls
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, DriveFault
 
@@ -29,13 +29,7 @@ WATCH_S = 1.0
 UNASKED = "hold the feed and run it again, with --yes without a terminal"
 
 
-@click.command(
-    epilog=help_epilog(
-        "fdhil run machine.toml",
-        "stopped with all offsets at zero",
-        trouble="a device cannot be reached, or an offset may still be applied (see the last line)",
-    )
-)
+@click.command()
 @CONFIG
 @click.option(
     "--method",
@@ -73,7 +67,7 @@ def _ask(
     return ask(load(config).run_directory / SOCKET_NAME, request, timeout_s, progress)
 
 
-@click.command(epilog=help_epilog("fdhil status machine.toml --watch", trouble="the daemon cannot be reached"))
+@click.command()
 @CONFIG
 @click.option("--watch", is_flag=True, help="Repeat every second until Ctrl-C (with --json: one line each).")
 @AS_JSON
@@ -108,15 +102,7 @@ def _show_status(config: Path, as_json: bool) -> None:
         show(answer)
 
 
-@click.command(
-    cls=ConfigFirst,
-    epilog=help_epilog(
-        "fdhil arm machine.toml part.ngc",
-        "armed",
-        "refused, with code, cause and next action",
-        trouble="the daemon or the program cannot be reached",
-    ),
-)
+@click.command(cls=ConfigFirst)
 @CONFIG
 @click.argument("program", type=FILE, required=False)
 @click.option("--method", type=click.Choice(list(tables.CORRECTIONS)), help="Correction method (default: the best).")
@@ -182,14 +168,7 @@ class _Shown:
             click.echo(err=True)
 
 
-@click.command(
-    epilog=help_epilog(
-        "fdhil disarm machine.toml",
-        "disarmed, zero read back",
-        "zero was not reached",
-        trouble="neither daemon nor guard can be reached",
-    )
-)
+@click.command()
 @CONFIG
 @AS_JSON
 @verdict
@@ -207,9 +186,7 @@ def disarm(config: Path, as_json: bool) -> None:
         _tell(answer, as_json)
 
 
-@click.command(
-    cls=ConfigFirst, epilog=help_epilog("fdhil acknowledge machine.toml 12 13", trouble="the daemon cannot be reached")
-)
+@click.command(cls=ConfigFirst)
 @CONFIG
 @click.argument("numbers", type=int, nargs=-1, metavar="NUMBER...")
 @click.option("--all", "everything", is_flag=True, help="Acknowledge all pending notices.")
@@ -248,14 +225,7 @@ def _disarm_at_the_guard(config: Path, silent: DeviceError) -> Mapping[str, Any]
         raise ConnectError("machine", text) from None
 
 
-@click.command(
-    epilog=help_epilog(
-        "fdhil adopt machine.toml",
-        "zero was read back",
-        "the guard refuses, or zero was not reached",
-        trouble="the guard cannot be reached, or the ramp was not confirmed",
-    )
-)
+@click.command()
 @CONFIG
 @click.option("--yes", is_flag=True, help="Do not ask for confirmation.")
 @AS_JSON

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fdhil.cli.options import CONFIG, FILE, OutputFile, Writing, help_epilog
+from fdhil.cli.options import CONFIG, FILE, OutputFile, Writing
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -26,15 +26,11 @@ SHOW_S = 1.0
 SHOWN_MM = 0.01  # smaller motion counts as standstill
 
 
-@click.command(cls=Writing, epilog=help_epilog("fdhil sim configs/sim.toml --program part.ngc", "stopped"))
+@click.command(cls=Writing)
 @CONFIG
 @click.option("--json", "as_json", is_flag=True, help="Write events as JSON lines to stdout; the first is 'ready'.")
 @click.option("--faults", type=FILE, help="Fault script (TOML) with faults and their times.")
-@click.option(
-    "--demand",
-    type=FILE,
-    help="Demand CSV to play at the start; - reads it row by row from standard input.",
-)
+@click.option("--demand", type=FILE, help="Demand CSV to play at the start; - reads it row by row from standard input.")
 @click.option("--program", type=FILE, help="NC program to play at the start.")
 @click.option(
     "--trace", type=OutputFile(), help="Record reference, true table position and offset of the first motion (CSV)."

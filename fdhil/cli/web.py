@@ -8,13 +8,13 @@ from pathlib import Path
 import click
 
 from fdhil import config as machine_config
-from fdhil.cli.options import AS_JSON, CONFIG, ConfigFirst, help_epilog
+from fdhil.cli.options import AS_JSON, CONFIG, ConfigFirst
 from fdhil.config.users import Role
 from fdhil.config.web import Web
 from fdhil.errors import ConfigError, ConfigFault
 
 
-@click.command(epilog=help_epilog("fdhil web machine.toml --port 8080", "stopped", trouble="address unavailable"))
+@click.command()
 @CONFIG
 @click.option("--host", help="Address to listen on (default: web.host of CONFIG).")
 @click.option("--port", type=click.IntRange(0, 65535), help="TCP port, 0 for a free one (default: web.port of CONFIG).")
@@ -45,7 +45,7 @@ def placed(web: Web, host: str | None, port: int | None) -> Web:
     return web.model_copy(update=given)
 
 
-@click.command("web-user", cls=ConfigFirst, epilog=help_epilog("fdhil web-user machine.toml anna --role operate"))
+@click.command("web-user", cls=ConfigFirst)
 @CONFIG
 @click.argument("name")
 @click.option(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil.child import stopping_in_order
-from fdhil.cli.options import AS_JSON, FOLDER, help_epilog
+from fdhil.cli.options import AS_JSON, FOLDER
 
 if TYPE_CHECKING:
     from fdhil.cli.demo.realistic import Realistic
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from fdhil.records import Parameters
 
 
-@click.command(epilog=help_epilog("fdhil demo --out demo/", trouble="a process failed, or a file cannot be written"))
+@click.command()
 @click.option("--out", type=FOLDER, default=Path("out"), show_default=True,
               help="Folder for report, recordings and logs.")  # fmt: skip
 @click.option("--realtime", is_flag=True, help="Run the simulator in real time instead of as fast as possible.")

@@ -148,18 +148,10 @@ def _identified(loop: Loop) -> Section:
     pictures = []
     for axis, (window, fit_percent) in loop.cold.items():
         found = loop.published[axis][0].parameters
-        pictures.append(
-            (
-                f"Axis {axis}: voltage, current and speed of one rapid move, as measured (Figure 4 of the paper)",
-                figures.signals(window),
-            )
-        )
-        pictures.append(
-            (
-                f"Axis {axis}: speed of model and drive for the measured voltage, and their difference (Figure 8)",
-                figures.model_against_drive(window, found, fit_percent),
-            )
-        )
+        caption = f"Axis {axis}: voltage, current and speed of one rapid move, as measured (Figure 4 of the paper)"
+        pictures.append((caption, figures.signals(window)))
+        caption = f"Axis {axis}: speed of model and drive for the measured voltage, and their difference (Figure 8)"
+        pictures.append((caption, figures.model_against_drive(window, found, fit_percent)))
     received, lost = loop.frames
     return Section(
         "Identified during rapid moves",
@@ -174,21 +166,14 @@ def _drifted(loop: Loop) -> Section:
     pictures = []
     for axis, warm in loop.warm.items():
         cold, first, last = loop.cold[axis][0], loop.published[axis][0], loop.published[axis][-1]
-        cases = [
-            (f"{first.temperature_c:.1f} degC", cold, first.parameters),
-            (f"{last.temperature_c:.1f} degC", warm, last.parameters),
-        ]
-        pictures.append(
-            (
-                f"Axis {axis}: torque of a rapid move with cold and with warm slide-ways, from the model (Figure 5)",
-                figures.torque(cases),
-            )
-        )
+        cases = [(f"{found.temperature_c:.1f} degC", window, found.parameters)
+                 for window, found in ((cold, first), (warm, last))]  # fmt: skip
+        caption = f"Axis {axis}: torque of a rapid move with cold and with warm slide-ways, from the model (Figure 5)"
+        pictures.append((caption, figures.torque(cases)))
     for symbol, meaning, number in (("ft", "Viscous friction", 6), ("Cd", "Coulomb friction", 7)):
         series = {axis: _series(sets, symbol) for axis, sets in loop.published.items()}
-        caption = (
-            f"{meaning} {symbol} over the temperature of the slide-ways, with its 95 % intervals (Figure {number})"
-        )
+        what = f"{meaning} {symbol} over the temperature of the slide-ways"
+        caption = f"{what}, with its 95 % intervals (Figure {number})"
         pictures.append((caption, figures.drift(symbol, UNITS[symbol], series)))
     return Section(
         "Drift with the slide-ways' temperature",

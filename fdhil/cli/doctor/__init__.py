@@ -13,7 +13,7 @@ import click
 from fdhil import config as machine_config
 from fdhil.cli.doctor.trouble import Trouble
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, CONFIG, Positive, help_epilog
+from fdhil.cli.options import AS_JSON, CONFIG, Positive
 from fdhil.cli.terminal_text import print_progress
 from fdhil.daemon.clock import newest_record_s
 
@@ -25,15 +25,7 @@ if TYPE_CHECKING:
 SCHEMA = "fdhil-doctor-1"
 
 
-@click.command(
-    epilog=help_epilog(
-        "fdhil doctor machine.toml",
-        "no serious problem",
-        "a serious problem",
-        "wrong option or configuration; correct it before all else",
-        "the store cannot be read or written",
-    )
-)
+@click.command()
 @CONFIG
 @click.option("--offline", is_flag=True, help="Examine only this PC; do not access buses and sensors.")
 @click.option("--latency", "seconds", type=Positive(1.0, 86_400.0), metavar="SECONDS",

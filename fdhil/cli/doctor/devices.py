@@ -38,8 +38,7 @@ def examine_devices(
     try:
         found = check_machine(config.model_copy(update={"axis": axes}), say)
     except DeviceError as error:
-        what, _, mend = str(error).partition("; ")
-        yield Trouble(type(error).__name__, error.device, what, "no drive can be received", mend)
+        yield Trouble.create_from_error(type(error).__name__, error.device, error, "no drive can be received")
         return
     yield from troubles_of([each for each in found if each[0] not in recorded or each[1].point != POINT])
 
@@ -71,8 +70,9 @@ def examine_daemon(config: MachineConfig) -> Iterator[Trouble]:
     try:
         difference = config_difference(ask(config.run_directory / DAEMON_SOCKET, {"request": "status"}), config.digest)
     except DeviceError as error:
-        what, _, mend = str(error).partition("; ")
-        yield Trouble("DaemonSilent", "daemon", what, "nothing is identified, and nothing can be armed", mend)
+        yield Trouble.create_from_error(
+            "DaemonSilent", "daemon", error, "nothing is identified, and nothing can be armed"
+        )
         return
     if difference:
         what, _, mend = difference.partition("; ")
@@ -88,10 +88,8 @@ def examine_guard(config: MachineConfig) -> Iterator[Trouble]:
         with GuardClient(config.guard_directory) as guard:
             state = str(guard.status().get("state"))
     except DeviceError as error:
-        what, _, mend = str(error).partition("; ")
-        yield Trouble(
-            "GuardSilent", "guard", what, "nothing can be armed, and applied offsets remain in the drives", mend
-        )
+        means = "nothing can be armed, and applied offsets remain in the drives"
+        yield Trouble.create_from_error("GuardSilent", "guard", error, means)
         return
     if state == "FROZEN":
         what = "it holds the offsets (FROZEN), because the state of the drives is unknown"

@@ -28,8 +28,7 @@ def examine_offers(config: MachineConfig) -> Iterator[Trouble]:
     try:
         offers = waiting(folder, config.store.directory)
     except StoreError as error:
-        what, _, mend = str(error).partition("; ")
-        yield Trouble("OffersUnread", PLACE, what, MEANS, mend)
+        yield Trouble.create_from_error("OffersUnread", PLACE, error, MEANS)
         return
     for offer in offers:
         means = "nothing changes until an operator answers"

@@ -51,8 +51,7 @@ def _history(folder: Path) -> Iterator[Trouble]:
             pass
     except StoreError as error:
         if error.code != "NoHistory":
-            what, _, mend = str(error).partition("; ")
-            yield Trouble(error.code, "store", what, "earlier parameters are unavailable", mend)
+            yield Trouble.create_from_error(error.code, "store", error, "earlier parameters are unavailable")
 
 
 def _user() -> str:
@@ -67,8 +66,7 @@ def examine_secrets(config: MachineConfig) -> Iterator[Trouble]:
         try:
             read_token(config.run_directory)
         except DeviceError as error:
-            what, _, mend = str(error).partition("; ")
-            yield Trouble("TokenOpen", "token", what, "nothing can be armed", mend)
+            yield Trouble.create_from_error("TokenOpen", "token", error, "nothing can be armed")
     for name, axis in config.axis.items():
         if axis.correction is not None:
             yield from _record(config, name)
@@ -83,8 +81,7 @@ def _run_directory(folder: Path) -> Iterator[Trouble]:
     try:
         check_rights(folder)
     except DeviceError as error:
-        what, _, mend = str(error).partition("; ")
-        yield Trouble("RunDirectoryOpen", "sockets", what, "commands may reach a foreign program", mend)
+        yield Trouble.create_from_error("RunDirectoryOpen", "sockets", error, "commands may reach a foreign program")
     except OSError:
         pass  # unreadable; programs that use it report the reason
 
@@ -95,8 +92,7 @@ def _record(config: MachineConfig, axis: str) -> Iterator[Trouble]:
     try:
         record = load_record(directory, axis, config.store.commissioning_key, may_lack_key=True)
     except StoreError as error:
-        what, _, mend = str(error).partition("; ")
-        yield Trouble(RECORD_BAD, place, what, means, mend)
+        yield Trouble.create_from_error(RECORD_BAD, place, error, means)
         return
     if record is None:
         mend = f"{COMMISSION} with the NC off and the axis free to move"

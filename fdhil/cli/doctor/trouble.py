@@ -1,6 +1,7 @@
 """A problem found by ``fdhil doctor``."""
 
 from dataclasses import dataclass
+from typing import Self
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,3 +17,9 @@ class Trouble:
     means: str
     mend: str
     grave: bool = True
+
+    @classmethod
+    def create_from_error(cls, code: str, place: str, error: Exception, means: str, grave: bool = True) -> Self:
+        """Return the problem that an error states, whose sentence has cause and fix, separated by a semicolon."""
+        what, _, mend = str(error).partition("; ")
+        return cls(code, place, what, means, mend, grave)

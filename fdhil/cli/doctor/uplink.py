@@ -33,8 +33,7 @@ def examine_uplink(config: MachineConfig, offline: bool) -> Iterator[Trouble]:
         password_of(config.uplink, "NATS server", "uplink")
         secret_in(config.uplink.credentials_file, "NATS server", "[uplink] credentials_file")
     except ConnectError as error:
-        what, _, mend = str(error).partition("; ")
-        yield Trouble("UplinkCredentials", PLACE, what, "nothing is sent", mend)
+        yield Trouble.create_from_error("UplinkCredentials", PLACE, error, "nothing is sent")
     if not offline:
         yield from _server(config.uplink)
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from fdhil.child import stopping_in_order
-from fdhil.cli.options import AS_JSON, FOLDER, help_epilog
+from fdhil.cli.options import AS_JSON, FOLDER
 from fdhil.errors import OutputError
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 RUNS = 50
 
 
-@click.command(epilog=help_epilog("fdhil paper --out paper/", trouble="a file cannot be written"))
+@click.command()
 @click.option("--out", type=FOLDER, required=True,
               help="Folder for paper.html, paper.json and pictures.")  # fmt: skip
 @click.option("--runs", type=click.IntRange(2, 10_000), default=RUNS, show_default=True,
@@ -32,7 +32,7 @@ def paper(out: Path, runs: int, pdf: bool, as_json: bool) -> None:
     """Test the claims of the paper behind fdhil on simulated machines.
 
     Each claim is tested in several scenarios, variations of configs/paper.toml. It holds, holds with a condition, or is
-    not reproduced. Only simulates; needs about half a minute.
+    not reproduced. Runs only simulations, for about half a minute.
     """
     from importlib.metadata import version
 

@@ -65,15 +65,15 @@ CASCADES = tuple(name for name in DEMANDED if not name.endswith("double-pi"))
 """Of these, the loops that the simulator supports: P, PI and PI."""
 
 
-@lru_cache(maxsize=1)
-def _document() -> str:
-    return files("fdhil.cli.paper").joinpath("paper.toml").read_text("utf-8")
+@lru_cache
+def _read_text(name: str) -> str:
+    return files("fdhil.cli.paper").joinpath(name).read_text("utf-8")
 
 
 @lru_cache(maxsize=32)
 def machine(name: str = "") -> MachineConfig:
     """Return the configuration of a scenario; without a name, that of ``configs/paper.toml``."""
-    document = tomllib.loads(_document())
+    document = tomllib.loads(_read_text("paper.toml"))
     for key, value in (PATHS[name].changes if name else {}).items():
         *tables, last = key.split(".")
         table = document
@@ -84,32 +84,7 @@ def machine(name: str = "") -> MachineConfig:
 
 
 RECORDINGS: Mapping[str, Scenario] = {
-    "no-noise": Scenario("one rapid of the measured machine, sensors with hardly any noise"),
-    "noise-0.1": Scenario("one rapid, white noise of 0.1 % of the full scale of figure 4 (70 V, A, rad/s)"),
-    "noise-0.5": Scenario("one rapid, white noise of 0.5 % of that scale"),
-    "noise-1": Scenario("one rapid, white noise of 1 % of that scale"),
-    "ten-rapids": Scenario("ten rapids a temperature, half of them at 24 rad/s, white noise of 0.5 % of that scale"),
-    "no-lowpass": Scenario("no low-pass on any signal"),
-    "lowpass-40": Scenario("a zero-phase low-pass of 40 Hz on every signal"),
-    "lowpass-150": Scenario("a zero-phase low-pass of 150 Hz on every signal"),
-    "quick-no-lowpass": Scenario("the simulator's drive in a rapid of 500 mm/s and 4 m/s2, no low-pass"),
-    "quick-40": Scenario("the same, a zero-phase low-pass of 40 Hz on every signal"),
-    "quick-150": Scenario("the same, a zero-phase low-pass of 150 Hz on every signal"),
-    "load-0": Scenario("nothing pulls at the axis, noise of 0.1 %"),
-    "load-1": Scenario("a constant load of 1 N.m pulls at the axis, as a weight does; noise of 0.1 %"),
-    "load-1-both-ways": Scenario("the same load, a rapid each way identified together"),
-    "backlash-5": Scenario("5 um of backlash, noise of 0.1 %"),
-    "backlash-20": Scenario("20 um of backlash, noise of 0.1 %"),
-    "backlash-100": Scenario("100 um of backlash, noise of 0.1 %"),
-    "residuals": Scenario("whiteness of what least squares leaves of [5] and [6]"),
-    "innovations": Scenario("whiteness of the innovations of maximum likelihood"),
-    "operation-10-s": Scenario("a cut of 10 s while the slide-ways warm by 2 K with 600 s"),
-    "operation-1-min": Scenario("a cut of a minute while they do"),
-    "operation-10-min": Scenario("a cut of ten minutes while they do"),
-    "force-30": Scenario("a cutting force of 30 N, as in finishing aluminium"),
-    "force-300": Scenario("a cutting force of 300 N"),
-    "force-3000": Scenario("a cutting force of 3000 N, as in roughing steel"),
-    "operators": Scenario("weights of the operator, without a machine"),
+    name: Scenario(title) for name, title in tomllib.loads(_read_text("recordings.toml")).items()
 }
 """Recordings of the measured machine, and other test conditions."""
 
