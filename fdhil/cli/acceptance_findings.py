@@ -86,7 +86,7 @@ class Findings:
     open_points: Sequence[str]
 
 
-def find(machine: MachineConfig, config: Path, asked: Asked) -> Findings:
+def find(machine: MachineConfig, config: Path, options: Asked) -> Findings:
     """Gather the content. Raises ConfigError, StoreError, ProgramError, RecordingError."""
     proofs = {axis: _proof(machine, axis) for axis in machine.axis}
     passes: Sequence[Mapping[str, Any]] = []
@@ -103,19 +103,19 @@ def find(machine: MachineConfig, config: Path, asked: Asked) -> Findings:
     identified = known >= set(machine.axis)
     linear = [axis for axis in ("X", "Y", "Z") if axis in machine.axis]
     plane = (linear[0], linear[1]) if len(linear) > 1 else None
-    circles = _circles(config, asked, plane, identified) if plane else {}
-    path = _planned(asked.program, config, identified) if asked.program else None
+    circles = _circles(config, options, plane, identified) if plane else {}
+    path = _planned(options.program, config, identified) if options.program else None
     points = [f"{axis}: {proof.against}" for axis, proof in proofs.items() if proof.against]
     points += [
         f"{axis}: no published parameters, nominal ones are used; run the daemon while the axis makes rapids"
         for axis in machine.axis
         if axis not in known
     ]
-    points += _beyond(asked, circles, path)
+    points += _beyond(options, circles, path)
     if major := sum(notice["severity"] == "MAJOR" for notice in notices):
         points.append(f"{major} MAJOR notices are pending; see fdhil status, then fdhil acknowledge")
     made = datetime.now(UTC).isoformat(timespec="seconds")
-    known_by = (machine, asked, made, proofs, histories, identified, plane, circles, path)
+    known_by = (machine, options, made, proofs, histories, identified, plane, circles, path)
     return Findings(*known_by, passes, notices, read_latency(machine), points)
 
 
@@ -140,19 +140,20 @@ def _planned(program: Path, config: Path, from_history: bool) -> Correction:
     return correction.plan(reference, models, machine)
 
 
-def _circles(config: Path, asked: Asked, plane: tuple[str, str], from_history: bool) -> dict[str, Circular]:
+def _circles(config: Path, options: Asked, plane: tuple[str, str], from_history: bool) -> dict[str, Circular]:
     with tempfile.TemporaryDirectory(prefix="fdhil-circle-") as folder:
         program = Path(folder) / "circle.ngc"
-        program.write_text(circle_program(plane, asked.radius_mm, asked.feed_mm_min), "ascii")
+        program.write_text(circle_program(plane, options.radius_mm, options.feed_mm_min), "ascii")
         planned = _planned(program, config, from_history)
     cases = {"predicted, uncorrected": planned.before}
     if not planned.refused:
         cases["predicted, corrected"] = planned.after
     found = {
-        label: evaluate(_table_mm(predicted, plane), asked.radius_mm, (0.0, 0.0)) for label, predicted in cases.items()
+        label: evaluate(_table_mm(predicted, plane), options.radius_mm, (0.0, 0.0))
+        for label, predicted in cases.items()
     }
-    if asked.measured_circle is not None:
-        found["measured"] = evaluate(read_path(asked.measured_circle, plane), asked.radius_mm)
+    if options.measured_circle is not None:
+        found["measured"] = evaluate(read_path(options.measured_circle, plane), options.radius_mm)
     return found
 
 
@@ -179,32 +180,32 @@ def read_path(path: Path, plane: tuple[str, str]) -> Float:
     return np.array(rows)
 
 
-def _beyond(asked: Asked, circles: Mapping[str, Circular], path: Correction | None) -> list[str]:
+def _beyond(options: Asked, circles: Mapping[str, Circular], path: Correction | None) -> list[str]:
     # a limit without a result to compare is open as well
     points = []
-    if asked.circle_um is not None:
+    if options.circle_um is not None:
         circle = circles.get("measured") or circles.get("predicted, corrected") or circles.get("predicted, uncorrected")
-        if circle is None or circle.both_um > asked.circle_um:
+        if circle is None or circle.both_um > options.circle_um:
             found = "no circle is possible" if circle is None else f"it is {circle.both_um:.1f} um"
-            points.append(f"circular deviation: {asked.circle_um:g} um are allowed, {found}")
-    if asked.contour_um is not None:
+            points.append(f"circular deviation: {options.circle_um:g} um are allowed, {found}")
+    if options.contour_um is not None:
         if path is None:
-            points.append(f"contour error: {asked.contour_um:g} um are allowed, but no --program was given")
-        elif (largest := float((path.before if path.refused else path.after).contour_um.max())) > asked.contour_um:
-            points.append(f"contour error: {asked.contour_um:g} um are allowed, it is {largest:.1f} um")
+            points.append(f"contour error: {options.contour_um:g} um are allowed, but no --program was given")
+        elif (largest := float((path.before if path.refused else path.after).contour_um.max())) > options.contour_um:
+            points.append(f"contour error: {options.contour_um:g} um are allowed, it is {largest:.1f} um")
     return points
 
 
 def document_of(found: Findings) -> dict[str, Any]:
     """Return the content as JSON; ``sha256`` covers all other entries, with sorted keys and without spaces."""
-    machine, asked = found.machine, found.asked
+    machine, options = found.machine, found.asked
     document: dict[str, Any] = {
         "schema": SCHEMA,
         "made_utc": found.made_utc,
         "made_by": f"fdhil {version('fdhil')}",
-        "by": asked.by,
-        "customer": asked.customer,
-        "site": asked.site,
+        "by": options.by,
+        "customer": options.customer,
+        "site": options.site,
         "machine": {
             "name": machine.machine.name,
             "config_digest": machine.digest,
@@ -213,16 +214,16 @@ def document_of(found: Findings) -> dict[str, Any]:
         "axes": {axis: _axis_document(found, axis) for axis in machine.axis},
         "circle": {
             "plane": "".join(found.plane or ()),
-            "radius_mm": asked.radius_mm,
-            "feed_mm_min": asked.feed_mm_min,
-            "limit_um": asked.circle_um,
+            "radius_mm": options.radius_mm,
+            "feed_mm_min": options.feed_mm_min,
+            "limit_um": options.circle_um,
             "found": {label: _circle_document(circle) for label, circle in found.circles.items()},
         },
         "program": _program_document(found),
         "passes": list(found.passes),
         "notices": list(found.notices),
         "latency": found.latency,
-        "limits_set": bool(asked.limits),
+        "limits_set": bool(options.limits),
         "open": list(found.open_points),
         "accepted": not found.open_points,
     }

@@ -108,17 +108,17 @@ def _parameters(found: Findings) -> Section:
 
 
 def _circular(found: Findings) -> Section:
-    asked = found.asked
+    options = found.asked
     columns = [_circle_cells(circle) for circle in found.circles.values()]
     rows = [[what, *cells] for what, *cells in zip(CIRCLE_ROWS, *columns, strict=True)]
     whose = "identified" if found.identified else "nominal"
     pictures = [
-        (f"Circular test, {label}: radius {asked.radius_mm:g} mm", polar(circle, found.plane or ("X", "Y")))
+        (f"Circular test, {label}: radius {options.radius_mm:g} mm", polar(circle, found.plane or ("X", "Y")))
         for label, circle in found.circles.items()
     ]
     return Section(
         f"Circular test after ISO 230-4, plane {''.join(found.plane or ())}",
-        f"Radius {asked.radius_mm:g} mm, feed {asked.feed_mm_min:g} mm/min, both directions, the middle 360 degrees of "
+        f"Radius {options.radius_mm:g} mm, feed {options.feed_mm_min:g} mm/min, both directions, middle 360 degrees of "
         f"each run; predictions use the {whose} parameters. G is the distance of two concentric circles that enclose a "
         "run, H the distance of both runs at one angle, F the deviation outside (+) or inside (-) the programmed "
         "circle, relative to the least-squares centre. F includes the contraction by the NC's smoothing.",

@@ -25,13 +25,13 @@ DISK_S = 5.0  # a hanging disk delays the removal of an offset by no more than t
 
 
 @contextmanager
-def audited(machine: MachineConfig, what: str, **told: str) -> Iterator[dict[str, str]]:
+def audited(machine: MachineConfig, what: str, **details: str) -> Iterator[dict[str, str]]:
     """Record the request ``what``, run the block, then record its result.
 
     Entries of the yielded dictionary are added to the result. A killed command leaves the request without a result.
     Raises StoreError, before the block runs, if the request cannot be recorded.
     """
-    _append(machine, {"asked": what, **told})
+    _append(machine, {"asked": what, **details})
     ended = {"result": "Stopped", "text": "interrupted before its end"}
     more: dict[str, str] = {}
     try:
@@ -41,7 +41,7 @@ def audited(machine: MachineConfig, what: str, **told: str) -> Iterator[dict[str
         ended = {"result": type(error).__name__, "text": str(error)}
         raise
     finally:
-        _try(machine, {"answered": what, **told, **ended}, what)
+        _try(machine, {"answered": what, **details, **ended}, what)
 
 
 def write_before(machine: MachineConfig, what: str) -> None:

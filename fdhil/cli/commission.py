@@ -87,29 +87,29 @@ def commission(
     if axes[0] not in machine.axis:
         fault = ConfigFault("--axis", f"there is no axis {only}", f"one of {', '.join(machine.axis)}")
         raise ConfigError(str(config), [fault])
-    asked = Asked(room_of(room), yes, again, as_json)
+    options = Asked(room_of(room), yes, again, as_json)
     if dry_run:
-        return _tell_plan(machine, axes, asked)
+        return _tell_plan(machine, axes, options)
     done: dict[str, Any] = {}
     refused = None
     with _stopped_like_ctrl_c():
         for axis in axes:
             try:
-                done[axis] = _set_pdos(machine, axis, asked) if set_pdos else _commission_axis(machine, axis, asked)
+                done[axis] = _set_pdos(machine, axis, options) if set_pdos else _commission_axis(machine, axis, options)
             except DriveFault as fault_found:
                 refused = str(fault_found)
                 break
             except (KeyboardInterrupt, click.Abort):
-                asked.say(NEXT_STOPPED)
+                options.say(NEXT_STOPPED)
                 raise
     if as_json:
         click.echo(json.dumps({"schema": SCHEMA, "axes": done, "refused": refused}))
     if refused is not None:
         click.echo(f"refused: {refused}", err=True)
-        asked.say(NEXT_REFUSED)
+        options.say(NEXT_REFUSED)
     else:
         tried = set_pdos or all(found["trial"] is not None for found in done.values())
-        asked.say(NEXT_PDOS if set_pdos else NEXT if tried else NEXT_UNTRIED)
+        options.say(NEXT_PDOS if set_pdos else NEXT if tried else NEXT_UNTRIED)
     return int(refused is not None)
 
 
@@ -139,30 +139,30 @@ def _progress_of(machine: MachineConfig, axis: str) -> Progress:
     return Progress(machine.store.directory, axis, machine.store.commissioning_key)
 
 
-def _tell_plan(machine: MachineConfig, axes: list[str], asked: Asked) -> int:
+def _tell_plan(machine: MachineConfig, axes: list[str], options: Asked) -> int:
     from fdhil.report.parameter_view import minute
 
     plans: dict[str, list[dict[str, Any]]] = {}
     refused = None
     for axis in axes:
         try:
-            plans[axis] = planned(machine, axis, asked.room, not asked.yes, _progress_of(machine, axis))
+            plans[axis] = planned(machine, axis, options.room, not options.yes, _progress_of(machine, axis))
         except DriveFault as fault:
             refused = str(fault)
             break
-    if asked.quiet:
+    if options.quiet:
         click.echo(json.dumps({"schema": SCHEMA, "dry_run": True, "axes": plans, "refused": refused}))
     for axis, steps in plans.items():
-        asked.say(f"axis {axis}, planned steps (nothing is sent now):")
+        options.say(f"axis {axis}, planned steps (nothing is sent now):")
         for number, step in enumerate(steps, 1):
             done = f" Done {minute(step['done_utc'])}, skipped if the drive is unchanged." if step["done_utc"] else ""
-            asked.say(f"  {number} of {len(steps)}, {step['step']}: {told(step['does'], step['moves'])}{done}")
+            options.say(f"  {number} of {len(steps)}, {step['step']}: {told(step['does'], step['moves'])}{done}")
     if refused is not None:
         click.echo(f"refused: {refused}", err=True)
     return int(refused is not None)
 
 
-def _commission_axis(machine: MachineConfig, axis: str, asked: Asked) -> dict[str, Any]:
+def _commission_axis(machine: MachineConfig, axis: str, options: Asked) -> dict[str, Any]:
     from fdhil.cli.bus_lock import lock_bus
     from fdhil.commissioning import steps
     from fdhil.commissioning.hal_proof import commission_hal
@@ -172,52 +172,52 @@ def _commission_axis(machine: MachineConfig, axis: str, asked: Asked) -> dict[st
     progress = _progress_of(machine, axis)
     if progress.doubt:
         click.echo(progress.doubt, err=True)
-    if asked.again:
+    if options.again:
         progress.forget()
-    if asked.room is None and not asked.yes and tried_by_moving(machine, axis):
-        asked = replace(asked, room=ask_room(axis, machine.axis[axis].unit))
-    if asked.room is not None and not hal:
-        trial_moves(machine, axis, asked.room)  # too little room is refused before anything is sent
+    if options.room is None and not options.yes and tried_by_moving(machine, axis):
+        options = replace(options, room=ask_room(axis, machine.axis[axis].unit))
+    if options.room is not None and not hal:
+        trial_moves(machine, axis, options.room)  # too little room is refused before anything is sent
     bus = machine.bus[machine.axis[axis].drive.bus]
     with lock_bus(bus), audited(machine, "commission", axis=axis) as ended:  # the guard reads the record when it starts
         own = HAL_STEPS if hal else STEPS
-        total = len(own) + (len(TRIAL) if asked.room is not None and not hal else 0)
-        guide = Guide(axis, asked, own, progress, 0, total)
-        report = _asking(machine, axis, asked, guide)
+        total = len(own) + (len(TRIAL) if options.room is not None and not hal else 0)
+        guide = Guide(axis, options, own, progress, 0, total)
+        report = _asking(machine, axis, options, guide)
         if hal:
             record = commission_hal(machine, axis, report)
         else:
             record = steps.commission(machine, axis, report, progress, guide.result)
         path = save_record(record, machine.store.directory, machine.store.commissioning_key)
         ended["text"] = f"record {record.digest[:16]}"
-        asked.say(
+        options.say(
             f"axis {axis} is commissioned: moved {record.sign_test_um:+.1f} um, "
             f"{FEEDFORWARD[record.offset_in_feedforward]}, watchdog {record.watchdog}; record {path}"
         )
-        further = Guide(axis, asked, TRIAL, progress, len(own), total)
-        tried = None if hal else try_commissioned(machine, record, asked, progress, further)
+        further = Guide(axis, options, TRIAL, progress, len(own), total)
+        tried = None if hal else try_commissioned(machine, record, options, progress, further)
     return {**asdict(record), "record": str(path), "digest": record.digest, "trial": tried}
 
 
-def _asking(machine: MachineConfig, axis: str, asked: Asked, guide: Guide) -> Callable[[str], None]:
+def _asking(machine: MachineConfig, axis: str, options: Asked, guide: Guide) -> Callable[[str], None]:
     guide.moves = moves_of(machine, axis)
 
     def report(step: str) -> None:
-        if step in ("enable", "move") and not asked.yes:
+        if step in ("enable", "move") and not options.yes:
             _ask(machine, axis)
         guide(step)
 
     return report
 
 
-def _set_pdos(machine: MachineConfig, axis: str, asked: Asked) -> dict[str, Any]:
+def _set_pdos(machine: MachineConfig, axis: str, options: Asked) -> dict[str, Any]:
     from fdhil.cli.bus_lock import lock_bus
     from fdhil.commissioning.master import Master
     from fdhil.commissioning.pdo_setup import set_up_pdos
     from fdhil.drivers.cia402.profile_file import load_profile
 
     profile = load_profile(machine.axis[axis].drive)
-    if not asked.yes:
+    if not options.yes:
         question = f"Write the PDO mapping of profile {profile.name} to drive {axis} and save it there?"
         confirm(axis, question, "nothing was written; start again, with --yes without a terminal")
     bus = machine.bus[machine.axis[axis].drive.bus]
@@ -225,7 +225,7 @@ def _set_pdos(machine: MachineConfig, axis: str, asked: Asked) -> dict[str, Any]
         done = set_up_pdos(master)
     written = ", ".join(done.written) or "none, all match the profile"
     kept = {True: ", saved in the drive", False: ", NOT saved: lost when the drive is off", None: ""}[done.saved]
-    if not asked.quiet:
+    if not options.quiet:
         click.echo(f"axis {axis}: PDOs written: {written}{kept}")
     return {"pdos_written": list(done.written), "saved": done.saved}
 

@@ -45,9 +45,9 @@ class Guide:
     """
 
     def __init__(
-        self, axis: str, asked: Asked, steps: Mapping[str, str], progress: Progress, first: int, total: int
+        self, axis: str, options: Asked, steps: Mapping[str, str], progress: Progress, first: int, total: int
     ) -> None:
-        self._axis, self._asked, self._steps, self._first, self._total = axis, asked, steps, first, total
+        self._axis, self._asked, self._steps, self._first, self._total = axis, options, steps, first, total
         self.moves: dict[str, str] = {}
         self._shown_s: float | None = None
         progress.on_kept = self.kept

@@ -23,15 +23,15 @@ if TYPE_CHECKING:
 
 
 def try_commissioned(
-    machine: MachineConfig, record: CommissioningRecord, asked: Asked, progress: Progress, guide: Guide
+    machine: MachineConfig, record: CommissioningRecord, options: Asked, progress: Progress, guide: Guide
 ) -> dict[str, Any] | None:
     """Run the trial of a commissioned axis; None without a room. Raises DriveFault if it is refused."""
     from fdhil.api.compiling import forewarn
     from fdhil.commissioning.trial import Operator, try_axis
 
-    axis, room = record.axis, asked.room
+    axis, room = record.axis, options.room
     if room is None:
-        asked.say(f"axis {axis}: no trial, because no --room was given; units, signs and model are unproven")
+        options.say(f"axis {axis}: no trial, because no --room was given; units, signs and model are unproven")
         return None
     guide.moves = trial_moves(machine, axis, room)
 
@@ -44,7 +44,7 @@ def try_commissioned(
         guide(step)
 
     def ask_to_move(way: str) -> None:
-        if not asked.yes:
+        if not options.yes:
             advice = "the axis was not moved and its record stays valid; start again when it may move"
             confirm(axis, f"Axis {axis} will move {way}. Is its path free? Start?", advice)
 
@@ -54,7 +54,7 @@ def try_commissioned(
             guide.moves["return"] = found["return"]
 
     def saw(question: str) -> bool | None:
-        return None if asked.yes else agreed(question)
+        return None if options.yes else agreed(question)
 
     settings = machine.axis[axis]
     operator = Operator(report, saw, result, lambda mm: guide.show_position(settings.shown(mm, form=".3f")))

@@ -53,11 +53,11 @@ def eds(file: Path, name: str | None, as_json: bool) -> int:
     suggested = suggest_profile(device)
     profile = read_profile(name or suggested, file)
     found = abilities(device, profile)
-    alike = {what: named_alike(device, what) for what in ("voltage", "dc_link", "current")}
+    candidates = {what: named_alike(device, what) for what in ("voltage", "dc_link", "current")}
     if as_json:
-        click.echo(json.dumps(_document(device, profile, suggested, found, alike)))
+        click.echo(json.dumps(_document(device, profile, suggested, found, candidates)))
     else:
-        _show(device, profile, suggested, found, alike)
+        _show(device, profile, suggested, found, candidates)
     return int(any(ability.what == "listen" and ability.answer == "no" for ability in found))
 
 
@@ -66,7 +66,7 @@ def _document(
     profile: DriveProfile,
     suggested: str,
     found: Sequence[Ability],
-    alike: Mapping[str, Sequence[DeviceObject]],
+    candidates: Mapping[str, Sequence[DeviceObject]],
 ) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
@@ -86,15 +86,15 @@ def _document(
         "suggested_profile": suggested,
         "notes": [*profile.notes, *device.doubts],
         "abilities": [asdict(ability) for ability in found],
-        "named_alike": {what: [_object(at) for at in objects] for what, objects in alike.items()},
+        "named_alike": {what: [_object(at) for at in objects] for what, objects in candidates.items()},
         "pdos": [_pdo(spec) for spec in (*profile.rpdos, *profile.tpdos)],
     }
 
 
 def _object(at: DeviceObject) -> dict[str, Any]:
     in_tpdo = "yes" if at.in_tpdo else "perhaps" if at.perhaps_in_tpdo else "no"
-    said = {"index": at.key[0], "sub": at.key[1], "name": at.name, "bits": at.bits, "signed": at.signed}
-    return said | {"access": at.access, "in_tpdo": in_tpdo}
+    entry = {"index": at.key[0], "sub": at.key[1], "name": at.name, "bits": at.bits, "signed": at.signed}
+    return entry | {"access": at.access, "in_tpdo": in_tpdo}
 
 
 def _pdo(spec: PdoSpec) -> dict[str, Any]:
@@ -113,7 +113,7 @@ def _show(
     profile: DriveProfile,
     suggested: str,
     found: Sequence[Ability],
-    alike: Mapping[str, Sequence[DeviceObject]],
+    candidates: Mapping[str, Sequence[DeviceObject]],
 ) -> None:
     from rich import box
     from rich.table import Table
@@ -135,7 +135,7 @@ def _show(
         why = f"{ability.why}; {ability.advice}" if ability.advice else ability.why
         table.add_row(Text(ability.what), Text(ability.answer, COLOURS[ability.answer]), Text(why))
     out.print(table)
-    for what, objects in alike.items():
+    for what, objects in candidates.items():
         if objects:
             out.print(Text(f"by name, may be {CANDIDATES[what]}: {_named(objects)}"), soft_wrap=True)
     for note in (*profile.notes, *device.doubts) if device.is_drive else device.doubts:

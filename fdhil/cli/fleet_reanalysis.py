@@ -78,16 +78,16 @@ def reanalyse(
     from fdhil.cli import fleet_reanalysis_view as view
     from fdhil.cli import fleet_view
 
-    asked = Method(Identification(method=method), machines, settings.objects.directory.resolve(), code_digest())
+    chosen = Method(Identification(method=method), machines, settings.objects.directory.resolve(), code_digest())
     scope = reanalysis.Scope(_utc(since), _utc(until), machine, axis)
     forewarn("identify")
     count = (os.cpu_count() or 1) if workers is None else workers
-    with with_extra(), entered(scheduler, count) as crew, _bar() as progress:
-        revision = reanalysis.reanalyse(settings, asked, scope, crew, progress)
+    with with_extra(), entered(scheduler, count) as pool, _bar() as progress:
+        revision = reanalysis.reanalyse(settings, chosen, scope, pool, progress)
     with sets.asking(settings) as db:
-        told = changes(db, revision, by)
-    fleet_view.tell(told, "reanalyse", as_json, view.changes)
-    return UNREADABLE if told["unreadable"] else 0
+        answer = changes(db, revision, by)
+    fleet_view.tell(answer, "reanalyse", as_json, view.changes)
+    return UNREADABLE if answer["unreadable"] else 0
 
 
 def _by_name(configs: tuple[Path, ...]) -> dict[str, MachineConfig]:

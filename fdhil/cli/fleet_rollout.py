@@ -34,12 +34,12 @@ def key(file: Path, as_json: bool) -> None:
     with with_extra():
         from fdhil.fleet.offer import make_key, public_key
     made = not file.exists()
-    told = make_key(file) if made else public_key(file)
+    public = make_key(file) if made else public_key(file)
     if as_json:
-        click.echo(json.dumps({"schema": "fdhil-fleet-key-1", "file": str(file), "made": made, "public_key": told}))
+        click.echo(json.dumps({"schema": "fdhil-fleet-key-1", "file": str(file), "made": made, "public_key": public}))
         return
     click.echo(f"{file} {'created' if made else 'exists already'}; its public key, for [offers] trust of each machine:")
-    click.echo(told)
+    click.echo(public)
 
 
 @click.command(cls=Writing)
@@ -60,8 +60,8 @@ def sign(change: Path, key_file: Path, by: str, machines: tuple[str, ...], out: 
         from fdhil.fleet.rollout import offer_of, read_change
     from fdhil.store.output import open_output
 
-    told, days = read_change(change)
-    offer = offer_of(told, days, by, 1, machines)
+    proposal, days = read_change(change)
+    offer = offer_of(proposal, days, by, 1, machines)
     document = signed(offer, key_file)
     with open_output(out) as file:
         file.write(document)
@@ -104,7 +104,7 @@ def stage(
     settings = load(fleet)
     with with_extra():
         from fdhil.fleet import rollout
-    told, days = rollout.read_change(change)
+    proposal, days = rollout.read_change(change)
     if key_file is not None and not by:
         raise click.UsageError("--key signs a stage; name the signer with --by")
     if key_file is not None and withdraw:
@@ -112,16 +112,16 @@ def stage(
 
     async def work() -> tuple[Standing, Offer | None, list[str]]:
         async with rollout.entered(settings) as db:
-            found = await rollout.standing(db, told)
+            found = await rollout.standing(db, proposal)
             if key_file is None:
-                return found, None, await rollout.take_back(settings, found, told.name) if withdraw else []
+                return found, None, await rollout.take_back(settings, found, proposal.name) if withdraw else []
             names = rollout.chosen(found, count, machines, despite)
-            offer = rollout.offer_of(told, days, by, found.stage + 1, names)
-            await rollout.open_stage(settings, db, offer, told, key_file, despite)
+            offer = rollout.offer_of(proposal, days, by, found.stage + 1, names)
+            await rollout.open_stage(settings, db, offer, proposal, key_file, despite)
             return found, offer, []
 
     found, opened, withdrawn = asyncio.run(work())
-    _tell(told, found, opened, withdrawn, as_json)
+    _tell(proposal, found, opened, withdrawn, as_json)
     return 1 if any(each.against for each in found.offered) and opened is None and not withdraw else 0
 
 

@@ -93,17 +93,17 @@ def _pictures(history: AxisHistory) -> list[tuple[str, str]]:
     return pictures
 
 
-def _health_tables(told: Mapping[str, Any] | None) -> list[Table]:
-    if told is None:
+def _health_tables(health: Mapping[str, Any] | None) -> list[Table]:
+    if health is None:
         return []
     slopes = Table(
         head=["parameter", "per kelvin", "per day", "maintenance limit"],
-        rows=slope_rows(told),
+        rows=slope_rows(health),
         caption=f"Slopes since the last change; {MEANING}",
     )
     changes = Table(
         head=["time", "window", "parameters that changed", "likely cause"],
-        rows=[[_minute(c["time"]), str(c["window"]), moved(c), c["cause"]] for c in told["changes"]],
+        rows=[[_minute(c["time"]), str(c["window"]), moved(c), c["cause"]] for c in health["changes"]],
         caption="Changes",
     )
     return [table for table in (slopes, changes) if table.rows]

@@ -98,10 +98,12 @@ def init(
 def running_pins() -> list[str]:
     """Return the pins of the running HAL; empty if it does not run or is not accessible."""
     try:
-        asked = subprocess.run(["halcmd", "-s", "show", "pin"], capture_output=True, text=True, timeout=10, check=True)
+        listing = subprocess.run(
+            ["halcmd", "-s", "show", "pin"], capture_output=True, text=True, timeout=10, check=True
+        )
     except (OSError, subprocess.SubprocessError):
         return []
-    return [words[4] for line in asked.stdout.splitlines() if len(words := line.split()) > 4]
+    return [words[4] for line in listing.stdout.splitlines() if len(words := line.split()) > 4]
 
 
 def _hal_text(text: str, file: Path, nc: Machine, draft: Draft) -> str:
@@ -154,24 +156,24 @@ def _ask(asked: Asked) -> Any:
     while True:
         default = None if asked.proposal is None else str(asked.proposal.value)
         try:
-            said = str(click.prompt("  value", default=default, show_default=default is not None, err=True)).strip()
+            answer = str(click.prompt("  value", default=default, show_default=default is not None, err=True)).strip()
         except click.Abort as stopped:
             if sys.stdin.isatty() or not isinstance(stopped.__context__, EOFError):
                 raise
             fault = ConfigFault(asked.path, "needs an answer, and standard input has ended", "give --answers FILE")
             raise ConfigError("standard input", [fault]) from None
-        if said == default:
+        if answer == default:
             return None
         try:
-            return asked.check(said)
+            return asked.check(answer)
         except ConfigError as error:
             click.echo(f"  {error.faults[0].what}; try again", err=True)
 
 
 def _document(draft: Draft, file: Path, text: str, dry_run: bool) -> dict[str, Any]:
     values = [
-        {"path": path, "value": told.value, "source": told.source, "guessed": told.guessed}
-        for path, told in draft.values.items()
+        {"path": path, "value": setting.value, "source": setting.source, "guessed": setting.guessed}
+        for path, setting in draft.values.items()
     ]
     return {
         "schema": SCHEMA,
@@ -186,10 +188,10 @@ def _document(draft: Draft, file: Path, text: str, dry_run: bool) -> dict[str, A
 def _guesses(draft: Draft) -> list[str]:
     # equal guesses of several axes become one line
     places: dict[tuple[str, str, str], list[str]] = {}
-    for path, told in draft.values.items():
-        if told.guessed:
+    for path, setting in draft.values.items():
+        if setting.guessed:
             where, axis, key = path.split(".", 2) if path.startswith("axis.") else ("", "", path)
-            places.setdefault((key, str(told.value), told.source), []).append(f"{where}.{axis}" if axis else "")
+            places.setdefault((key, str(setting.value), setting.source), []).append(f"{where}.{axis}" if axis else "")
     return [
         f"{key}{' of ' if axes[0] else ''}{', '.join(axes)} = {value}: {source}"
         for (key, value, source), axes in places.items()

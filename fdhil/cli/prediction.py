@@ -80,7 +80,7 @@ def _shared(wanted: Callable[..., int | None]) -> Callable[..., int | None]:
     metavar="REVISION",
     help="Compare inertia and friction with this revision (needs --from-history; default: the last step).",
 )
-def predict(asked: Asked, sensitivity: bool, tolerance_um: float | None, since: int | None) -> None:
+def predict(options: Asked, sensitivity: bool, tolerance_um: float | None, since: int | None) -> None:
     """Predict the path error of a PROGRAM (NC program or demand CSV) before it is cut.
 
     Uses the nominal parameters of the configuration unless --model or --from-history is given. Programs are interpreted
@@ -90,31 +90,31 @@ def predict(asked: Asked, sensitivity: bool, tolerance_um: float | None, since: 
     inertia or friction are shown with their cost. The prediction is stored; the next one of the same program shows the
     change of each zone and the parameters that caused it.
     """
-    if not asked.from_history and (tolerance_um is not None or since is not None):
+    if not options.from_history and (tolerance_um is not None or since is not None):
         raise click.UsageError("--tolerance-um and --since need --from-history")
-    reference, models, config = inputs(asked.program, asked.config_path, asked.model_path, asked.from_history)
+    reference, models, config = inputs(options.program, options.config_path, options.model_path, options.from_history)
     from fdhil import prediction
     from fdhil.correction.document import prediction_document
 
     forewarn("predict")
     predicted = prediction.predict(reference, models, config)
     columns = _prediction_columns(predicted)
-    document = {"schema": "fdhil-predict-1", "program": str(asked.program), **prediction_document(predicted, models)}
+    document = {"schema": "fdhil-predict-1", "program": str(options.program), **prediction_document(predicted, models)}
     um_per_percent = None
     if sensitivity or tolerance_um is not None:
         um_per_percent = prediction.sensitivity_um(predicted, models, config)
         for zone, per_axis in zip(document["zones"], um_per_percent, strict=True):
             zone["um_per_percent"] = per_axis
     steps: Sequence[Step] = ()
-    if asked.from_history:
+    if options.from_history:
         std_um, steps = _with_history(
-            document, asked.program, predicted, models, config, since, um_per_percent, tolerance_um
+            document, options.program, predicted, models, config, since, um_per_percent, tolerance_um
         )
         columns["contour_std_um"] = (std_um, 4)
-    if asked.out is not None:
-        _write(asked.out, columns)
-    _report(asked, config, predicted)
-    if asked.as_json:
+    if options.out is not None:
+        _write(options.out, columns)
+    _report(options, config, predicted)
+    if options.as_json:
         click.echo(json.dumps(document, allow_nan=False))
         return
     from fdhil.cli import forecast
@@ -167,12 +167,12 @@ def _with_history(
 @_shared
 @click.option("--method", type=click.Choice(list(tables.CORRECTIONS)), help="Correction method (default: the best).")
 @verdict
-def correct(asked: Asked, method: str | None) -> int:
+def correct(options: Asked, method: str | None) -> int:
     """Plan the offsets that correct the path error of a PROGRAM (NC program or demand CSV).
 
     Nothing is sent. A correction without a predicted improvement is refused with advice, and its offsets are 0.
     """
-    reference, models, config = inputs(asked.program, asked.config_path, asked.model_path, asked.from_history)
+    reference, models, config = inputs(options.program, options.config_path, options.model_path, options.from_history)
     from fdhil import correction
     from fdhil.api.machine import held_out_max_um
     from fdhil.correction.document import correction_document
@@ -180,38 +180,40 @@ def correct(asked: Asked, method: str | None) -> int:
     from fdhil.store.known_gain import known_gain
 
     forewarn("predict", "correct")
-    held_out_um = {} if asked.model_path is None else load_model_file(asked.model_path).held_out_um
-    largest_um = held_out_max_um(reference, config, "history" if asked.from_history else asked.model_path)
+    held_out_um = {} if options.model_path is None else load_model_file(options.model_path).held_out_um
+    largest_um = held_out_max_um(reference, config, "history" if options.from_history else options.model_path)
     planned = correction.plan(reference, models, config, method, largest_um)
-    predicted = known_gain(planned, models, config, asked.from_history, held_out_um)
-    if asked.out is not None:
-        _write(asked.out, _correction_columns(planned))
-    _report(asked, config, planned, predicted)
-    if asked.as_json:
-        click.echo(json.dumps(correction_document(str(asked.program), planned, predicted, models), allow_nan=False))
+    predicted = known_gain(planned, models, config, options.from_history, held_out_um)
+    if options.out is not None:
+        _write(options.out, _correction_columns(planned))
+    _report(options, config, planned, predicted)
+    if options.as_json:
+        click.echo(json.dumps(correction_document(str(options.program), planned, predicted, models), allow_nan=False))
     else:
         _show_correction(planned, predicted, models)
     return 1 if planned.refused else 0
 
 
-def _report(asked: Asked, config: MachineConfig, found: Prediction | Correction, predicted: Gain | None = None) -> None:
-    if asked.report is None and asked.pdf is None:
+def _report(
+    options: Asked, config: MachineConfig, found: Prediction | Correction, predicted: Gain | None = None
+) -> None:
+    if options.report is None and options.pdf is None:
         return
     from fdhil.records import Prediction
     from fdhil.report import deliver
     from fdhil.report.path import correction_page, prediction_page
 
-    name, machine = asked.program.name, config.machine.name
+    name, machine = options.program.name, config.machine.name
     parameters = "the nominal parameters of the configuration"
-    if asked.from_history:
+    if options.from_history:
         parameters = "the newest parameters of the history"
-    elif asked.model_path is not None:
-        parameters = f"the parameters of {asked.model_path.name}"
+    elif options.model_path is not None:
+        parameters = f"the parameters of {options.model_path.name}"
     if isinstance(found, Prediction):
         page = prediction_page(name, machine, found, parameters)
     else:
         page = correction_page(name, machine, found, parameters, predicted)
-    deliver(page, asked.report, asked.pdf)
+    deliver(page, options.report, options.pdf)
 
 
 def inputs(

@@ -132,7 +132,7 @@ def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) ->
 
     if plot is not None:
         require()
-    rows, told = read_history(machine, axis, partial(click.echo, err=True))
+    rows, health = read_history(machine, axis, partial(click.echo, err=True))
     notices = read_notices(machine, axis)
     if axis is not None and axis not in machine.axis and not rows:
         raise click.BadParameter(
@@ -141,12 +141,12 @@ def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) ->
     if plot is not None:
         from fdhil.cli.history_plot import write_plot
 
-        write_plot(by_axis(machine, rows, told), plot)
+        write_plot(by_axis(machine, rows, health), plot)
     if as_json:
-        parts = {key: {name: of_axis[key] for name, of_axis in told.items()} for key in HEALTH}
+        parts = {key: {name: of_axis[key] for name, of_axis in health.items()} for key in HEALTH}
         click.echo(json.dumps({"schema": "fdhil-history-1", "revisions": rows, "notices": notices} | parts))
         return
-    if not rows and not told and not notices:
+    if not rows and not health and not notices:
         click.echo("no parameters published yet")
         return
     from fdhil.cli.history_view import show_health, show_notices
@@ -154,7 +154,7 @@ def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) ->
 
     if rows:
         show_history(rows)
-    show_health(told)
+    show_health(health)
     show_notices(notices)
 
 
@@ -178,12 +178,12 @@ def export(recording: Path, out: Path, format_name: str | None, columns: Path | 
     """
     from fdhil.cli.export_file import export_file
 
-    told = export_file(recording, out, format_name, columns)
+    result = export_file(recording, out, format_name, columns)
     for what, happened in (("left_out", "omitted from"), ("reduced", "reduced in")):
-        for kind, count in told.get(what, {}).items():
+        for kind, count in result.get(what, {}).items():
             click.echo(f"{count} {kind}: {happened} {out}", err=True)
     if as_json:
-        click.echo(json.dumps({"schema": "fdhil-export-1", "recording": str(recording), "file": str(out)} | told))
+        click.echo(json.dumps({"schema": "fdhil-export-1", "recording": str(recording), "file": str(out)} | result))
 
 
 @click.command(cls=Writing)
@@ -200,8 +200,8 @@ def report(config: Path, out: Path, pdf: Path | None, as_json: bool) -> None:
     from fdhil.cli.history_report import write_report
     from fdhil.report.history_reading import by_axis, read_history, read_notices, read_refusals
 
-    rows, told = read_history(machine, tell=partial(click.echo, err=True))
+    rows, health = read_history(machine, tell=partial(click.echo, err=True))
     refused = read_refusals(machine)
-    write_report(machine, by_axis(machine, rows, told, refused), refused, out, pdf, read_notices(machine))
+    write_report(machine, by_axis(machine, rows, health, refused), refused, out, pdf, read_notices(machine))
     if as_json:
         click.echo(json.dumps({"schema": "fdhil-report-1", "file": str(out), "revisions": len(rows)}))

@@ -56,11 +56,11 @@ def show(status: Mapping[str, Any], console: Console | None = None) -> None:
     out.print(escape(f"correction: {status['state']}, guard {_guard(guard)}{loads}"))
     if lateness := guard.get("lateness"):
         out.print(lateness_line(lateness["recent"]))
-    stands = status.get("may_stand", {"nothing": True})
+    residual = status.get("may_stand", {"nothing": True})
     if guard.get("state") == "lost":
         out.print(f"[red]{escape(guard['text'])}[/red]")
-    elif not stands["nothing"] and guard.get("state") in ("OFF", "FROZEN"):
-        out.print(f"[red]{escape(stands['text'])}[/red]; hold the feed, then run fdhil adopt")
+    elif not residual["nothing"] and guard.get("state") in ("OFF", "FROZEN"):
+        out.print(f"[red]{escape(residual['text'])}[/red]; hold the feed, then run fdhil adopt")
     if guard.get("shadow_um"):
         would = ", ".join(f"{axis} {offset:+.1f} um" for axis, offset in guard["shadow_um"].items())
         out.print(escape(f"shadow mode, not sent: {would}"))
@@ -69,8 +69,8 @@ def show(status: Mapping[str, Any], console: Console | None = None) -> None:
         out.print(escape(f"armed: {armed['program']}, {armed['promise']}"))
     for refused in (armed.get("check") or {}).get("refused", []):
         out.print(f"[red]the correction ends early: {escape(refused)}[/red]")
-    for told in status.get("passes", [])[-SHOWN_PASSES:]:
-        out.print(escape(told["text"]))
+    for one in status.get("passes", [])[-SHOWN_PASSES:]:
+        out.print(escape(one["text"]))
     if checking := status.get("checking"):
         out.print(escape(f"checking {checking['program']}: {checking['checked_s']:.0f} s, line {checking['line']}"))
     if status["store"]["fault"]:
@@ -85,12 +85,12 @@ def show(status: Mapping[str, Any], console: Console | None = None) -> None:
             f"[red]{escape(where + alarm['code'])}[/red] active since {alarm['since']}{often}: {escape(alarm['text'])}"
         )
     out.print(_axes_table(status["axes"]))
-    for axis, told in status["axes"].items():
-        if unused := _unused(told):
+    for axis, found in status["axes"].items():
+        if unused := _unused(found):
             out.print(escape(f"{axis}: {unused}"))
-        if text := believed(told):
+        if text := believed(found):
             out.print(escape(f"{axis}: {text}"))
-        if (loops := told.get("loops")) and (line := loops_line(loops)):
+        if (loops := found.get("loops")) and (line := loops_line(loops)):
             out.print(escape(f"{axis}: {line}"))
     if (waiting := status.get("unacknowledged") or {}).get("count"):
         out.print(f"pending notices: {waiting['count']}, of them MAJOR {waiting['MAJOR']}")
@@ -177,13 +177,13 @@ def counted(counters: Mapping[str, Any]) -> str:
     """Return the frame counters as text: received, lost, and all others that are not 0."""
     if not counters:
         return "frames: none"
-    told = f"frames received {grouped(counters.get('frames', 0))}, lost {grouped(counters.get('lost', 0))}"
+    text = f"frames received {grouped(counters.get('frames', 0))}, lost {grouped(counters.get('lost', 0))}"
     parts = []
     for name, count in counters.items():
         where, _, what = name.rpartition(".")
         if count and what in COUNTED:
             parts.append(f"{where}: {COUNTED[what]} {grouped(count)}" if where else f"{COUNTED[what]} {grouped(count)}")
-    return escape(f"{told} ({'; '.join(parts)})" if parts else told)
+    return escape(f"{text} ({'; '.join(parts)})" if parts else text)
 
 
 def _unused(axis: Mapping[str, Any]) -> str:
@@ -195,14 +195,14 @@ def _unused(axis: Mapping[str, Any]) -> str:
         )
     if moves.get("without_plateau"):
         reasons.append(f"{moves['without_plateau']} too short for a plateau")
-    return f"{moves.get('seen', 0)} moves seen; not used: {', '.join(reasons)}" if reasons else ""
+    return f"{moves.get('seen', 0)} moves detected; not used: {', '.join(reasons)}" if reasons else ""
 
 
 def believed(axis: Mapping[str, Any]) -> str:
     """Return additional terms, unexplained error at the table, and warnings of an axis as text."""
     terms = ", ".join(
-        f"{name} {cell(name, told['value'], half_of(told), ' ')} {told['unit']}"
-        for name, told in (axis.get("terms") or {}).items()
+        f"{name} {cell(name, term['value'], half_of(term), ' ')} {term['unit']}"
+        for name, term in (axis.get("terms") or {}).items()
     )
     left, table = axis.get("unexplained_um"), (axis.get("last_window") or {}).get("at_table")
     seen = f"table error of {table['error_rms_um']:.2f} um RMS in the last rapid" if table else ""
@@ -215,8 +215,10 @@ def _axes_table(axes: Mapping[str, Any]) -> Table:
     for text in ("axis", "windows\nok/not", "rev", *map(head, PARAMETERS)):
         table.add_column(text, no_wrap=True)
     for name, axis in axes.items():
-        told = axis["parameters"]
-        cells = [cell(p, told[p]["value"], half_of(told[p])) for p in PARAMETERS] if told else ["-"] * len(PARAMETERS)
+        found = axis["parameters"]
+        cells = (
+            [cell(p, found[p]["value"], half_of(found[p])) for p in PARAMETERS] if found else ["-"] * len(PARAMETERS)
+        )
         table.add_row(name, f"{axis['accepted']}/{axis['refused']}", str(axis["revision"] or "-"), *cells)
     return table
 
@@ -247,7 +249,7 @@ def show_history(rows: Sequence[Mapping[str, Any]], console: Console | None = No
             table.add_column(text, no_wrap=True)
         for row in of_axis[-newest:]:
             degrees = "-" if row["temperature_c"] is None else f"{row['temperature_c']:.1f}"
-            cells = [cell(name, told["value"], half_of(told)) for name, told in row["parameters"].items()]
+            cells = [cell(name, found["value"], half_of(found)) for name, found in row["parameters"].items()]
             time = row["time"][5:16].replace("T", "\n")
             table.add_row(str(row["revision"]), time, degrees, str(row["windows_used"]), *cells)
         courses = [sparkline([row["parameters"][name]["value"] for row in of_axis[-COURSE:]]) for name in names]

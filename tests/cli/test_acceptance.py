@@ -1,4 +1,4 @@
-"""acceptance: what was proven, what is open, the circle and the path, under one hash."""
+"""``fdhil acceptance``: commissioning, open points, circular test, program and hash."""
 
 from __future__ import annotations
 
@@ -34,7 +34,6 @@ def machine_of(folder: Path) -> MachineConfig:
 
 @pytest.fixture(name="proven")
 def _proven(tmp_path: Path) -> MachineConfig:
-    """A machine whose drives were commissioned and identified."""
     machine = machine_of(tmp_path)
     with History.open(machine.store.directory) as history:
         for axis in ("X", "Y"):
@@ -46,7 +45,6 @@ def _proven(tmp_path: Path) -> MachineConfig:
 
 
 def test_a_machine_that_is_proven_is_accepted(proven: MachineConfig, tmp_path: Path, capsys: Any) -> None:
-    """The page and JSON say the same, under a hash that anybody can form again."""
     page = tmp_path / "acceptance.html"
     options = ("--out", page, "--by", "A. Fitter", "--circle-um", "12", *CIRCLE, "--json")
     code, out, _ = fdhil("acceptance", tmp_path / "machine.toml", *options, capsys=capsys)
@@ -65,7 +63,7 @@ def test_a_machine_that_is_proven_is_accepted(proven: MachineConfig, tmp_path: P
 
 
 def test_what_is_open_is_named(proven: MachineConfig, tmp_path: Path, capsys: Any) -> None:
-    """A void record, another configuration, a limit that is not kept: each with what to do, and exit 1."""
+    """Each open point has an action, and the exit code is 1."""
     void_record(proven.store.directory, "X", "booted")
     save_record(replace(RECORD, axis="Y", config_digest="other"), proven.store.directory)
     options = ("--out", tmp_path / "a.html", "--circle-um", "0.001", "--contour-um", "5", *CIRCLE)
@@ -92,7 +90,7 @@ def test_a_machine_of_which_nothing_is_known_has_a_report_too(tmp_path: Path, ca
 
 
 def test_a_measured_circle_stands_beside_the_predicted_ones(proven: MachineConfig, tmp_path: Path, capsys: Any) -> None:
-    """5 um outside one way and 3 um inside the other; it decides, as it was measured."""
+    """The circle is 5 um too large in one direction and 3 um too small in the other; the measured value decides."""
     angle = np.linspace(0.0, 2.5 * np.pi, 4000)
     ways = [
         (10.0 + um * 1e-3) * np.column_stack([np.cos(at), np.sin(at)]) for at, um in ((angle, 5), (angle[::-1], -3))

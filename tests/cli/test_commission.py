@@ -1,4 +1,4 @@
-"""``fdhil commission`` on a simulated drive inside this process: plans, resuming, and the set-ups that it refuses."""
+"""``fdhil commission`` with a simulated drive in this process: plans, continuation, refused setups."""
 
 from __future__ import annotations
 
@@ -40,14 +40,12 @@ TRUE = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075}
 
 @dataclass
 class Bench:
-    """A drive on a bus of this process, and the command that commissions it."""
-
     peer: DrivePeer
     file: Path
     capsys: pytest.CaptureFixture[str]
 
     def commission(self, *arguments: str, said: str | io.StringIO = "") -> tuple[int, str, str]:
-        """Run the command, whose operator says these lines; return exit code, stdout and stderr."""
+        """Run the command with these answers; return exit code, stdout and stderr."""
         sys.stdin = said if isinstance(said, io.StringIO) else io.StringIO(said)
         sys.argv[1:] = ["commission", str(self.file), *arguments]
         code = run_safely(cli)
@@ -55,7 +53,6 @@ class Bench:
         return code, heard.out, heard.err
 
     def say(self, old: str, new: str) -> None:
-        """Change what the configuration says."""
         text = self.file.read_text()
         assert old in text
         self.file.write_text(text.replace(old, new, 1))
@@ -94,7 +91,7 @@ def test_a_dry_run_says_what_each_step_moves_and_sends_nothing(bench: Bench) -> 
         assert words in out, words
     code, out, _ = bench.commission("--dry-run", "--json")
     plan = json.loads(out)
-    assert (code, plan["dry_run"], len(plan["axes"]["X"])) == (0, True, 13)  # it would be asked for the room
+    assert (code, plan["dry_run"], len(plan["axes"]["X"])) == (0, True, 13)  # because the room would be prompted for
     assert "within the room that you allow at up to 500 mm/s" in plan["axes"]["X"][9]["moves"]
     assert len(json.loads(bench.commission("--dry-run", "--json", "--yes")[1])["axes"]["X"]) == 7
     assert plan["axes"]["X"][0] | {"does": ""} == {"step": "listen", "does": "", "moves": "nothing", "done_utc": None}
@@ -144,7 +141,7 @@ def test_what_was_stopped_goes_on_where_it_ended(bench: Bench, monkeypatch: pyte
 
     code, out, _ = bench.commission("--yes", "--dry-run")
     assert out.count("skipped if the drive is unchanged") == 3
-    bench.peer.drive.set_object(0x6085, 0, 1_000_000)  # set up otherwise by its own tool
+    bench.peer.drive.set_object(0x6085, 0, 1_000_000)  # changed by the vendor's tool
     code, out, _ = bench.commission("--yes")
     assert (code, "skipped" in out, "step 4 of 7, sign test: Moving" in out) == (0, False, True)
 
@@ -176,7 +173,7 @@ def test_an_axis_is_tried_where_the_operator_agrees_and_known_to_the_history(
         assert newest.set.parameters.as_dict()[name] == pytest.approx(true, rel=0.01), name
 
     beats = bench.peer.heard.count(0x700 + machine_config.load(bench.file).play.node_id)
-    assert beats > 4  # the drive stops by itself when this process is gone
+    assert beats > 4  # the drive stops by itself after this process ends
     assert [bench.peer.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
 
     heard = len(bench.peer.heard)
@@ -203,7 +200,6 @@ def test_who_does_not_agree_is_not_moved(said: str, code: int, bench: Bench) -> 
 
 
 def without(peer: DrivePeer, index: int) -> None:
-    """Take an object out of the drive."""
     dictionary = peer.drive.dictionary
     dictionary.indices.discard(index)
     for key in [key for key in dictionary.entries if key >> 8 == index]:
@@ -211,7 +207,7 @@ def without(peer: DrivePeer, index: int) -> None:
 
 
 def other_eds(bench: Bench) -> None:
-    """The configuration names the EDS of another maker's drive, and the profile that is made from it."""
+    """The configuration names the EDS of another vendor's drive, with the profile derived from it."""
     eds = write_eds("elmo", bench.file.parent)
     bench.say("node_id = 1\n", f'node_id = 1\nprofile = "cia402"\neds = "{eds.name}"\n')
 
@@ -250,7 +246,6 @@ WRONG: dict[str, tuple[Callable[[Bench], None], str, bool]] = {
 
 
 def in_the_audit(bench: Bench) -> list[tuple[str, str, str | None]]:
-    """What was asked or answered, of which axis, and with which result."""
     found = [entry for entry, wrong in audit.entries(bench.store) if wrong is None]
     return [(entry.get("asked") or entry["answered"], entry["axis"], entry.get("result")) for entry in found]
 
@@ -328,10 +323,10 @@ def test_an_nc_that_is_switched_on_in_the_sign_test_leaves_no_record(what: str, 
 @pytest.mark.parametrize(
     ("question", "sync"),
     [
-        (1, 0),  # how far the axis may go
+        (1, 0),  # prompt for the room
         (2, 0),  # before the drive is switched on
-        (3, A_FEW),  # before it jogs: our SYNC runs, the drive is off
-        (4, A_FEW),  # whether the table moved: the drive is on
+        (3, A_FEW),  # before the jog: SYNC runs, the drive is off
+        (4, A_FEW),  # prompt whether the table moved: the drive is on
     ],
 )
 def test_nothing_begins_where_an_nc_came_while_a_question_stood(question: int, sync: int, bench: Bench) -> None:

@@ -1,4 +1,4 @@
-"""The demonstration's realistic machine: its configuration, and its page whether it was believed or refused."""
+"""The realistic machine of the demonstration: configuration, page, and refused corrections."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ from pathlib import Path
 from fdhil.child import stopping_in_order
 from fdhil.cli.demo import loop
 from fdhil.cli.demo.machines import machine_document
-loop._commission = lambda stage: None  # nothing is armed here
+loop._commission = lambda stage: None  # arming is not needed here
 with stopping_in_order(), loop.running(Path(sys.argv[1]), False, lambda text: None, machine_document()) as stage:
     loop._await(lambda: stage.ask("status")["may_stand"]["nothing"], "the guard did not read the drives", stage)
     print(stage.twin.pid, *(process.pid for process in stage.others), flush=True)

@@ -1,4 +1,4 @@
-"""fdhil doctor --latency: how late a PC wakes up, as a histogram; too late is a trouble."""
+"""``fdhil doctor --latency``: wake-up latency of a PC as a histogram; a slow PC is a problem."""
 
 from __future__ import annotations
 
@@ -15,8 +15,6 @@ from tests.daemon.shop import BENCH, fdhil
 
 
 class Pc:
-    """A PC with a clock of its own, which wakes each sleeper late by the next of these times."""
-
     def __init__(self, *late_s: float) -> None:
         self._late_s, self._count, self._now_s = late_s, 0, 100.0
 

@@ -1,4 +1,4 @@
-"""``fdhil identify`` with what was seen at the table: columns of the recording, or a printer's accelerometer file."""
+"""``fdhil identify`` with measurements at the table: columns of the recording, or an accelerometer file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SOFT = Mechanics(resonance_hz=HERTZ)
 
 @cache
 def signals() -> dict[str, bench.Array]:
-    """Return the columns of two rapids of an axis whose screw gives, the table's place among them."""
+    """Return the columns of two rapids of an axis with a compliant screw, including the table position."""
     run = real_plant.run(SOFT, DEMAND_M, None, 1e-3)
     told = real_plant.reported(run, SOFT, Sensors(noise=0.001, speed="difference"), 1)
     return {**told, "table_mm": np.round(1e3 * run.table_m, 4)}
@@ -38,7 +38,7 @@ def written(folder: Path, table: bool) -> Path:
 
 
 def printed(folder: Path, begin_s: float = 4321.0, lead: int = 400) -> Path:
-    """Write what an ADXL345 with 3200 samples a second makes of the same run: y against the axis, gravity on z."""
+    """Write the data of an ADXL345 at 3200 samples/s in the same run: y opposite to the axis, gravity on z."""
     place = real_plant.run(SOFT, DEMAND_M, None, real_plant.STEP_S).table_m
     push = np.gradient(np.gradient(place, real_plant.STEP_S), real_plant.STEP_S)
     push = np.convolve(push, np.ones(10) / 10, "same")[::10]  # every 0.3125 ms

@@ -1,4 +1,4 @@
-"""The command line as a whole: the list of commands, exit codes, and no traceback for wrong input."""
+"""The command line as a whole: list of commands, exit codes, no tracebacks."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_the_list_is_in_the_order_of_the_workflow() -> None:
 def test_the_entry_point_shows_no_advice_of_libraries(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It is for developers, who ask for it; the processes that a command starts show none either."""
+    """Warnings of libraries are for developers; child processes hide them as well."""
     monkeypatch.setattr("sys.argv", ["fdhil", "--version"])
     monkeypatch.setattr("sys.warnoptions", [])
     monkeypatch.setenv("PYTHONWARNINGS", "")

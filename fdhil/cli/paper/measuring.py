@@ -104,12 +104,12 @@ def _architecture() -> Claim:
         Trial(name, "sound rapids accepted", float(_outcome(noise).verdict.accepted), "of 1", least=1.0)
         for name, noise in sound
     ]
-    told = [(name, _outcome(0.001, trouble)) for name, trouble in wrong]
+    outcomes = [(name, _outcome(0.001, trouble)) for name, trouble in wrong]
     trials += [
         Trial(name, "rapids of another structure refused", float(not outcome.verdict.accepted), "of 1", least=1.0)
-        for name, outcome in told
+        for name, outcome in outcomes
     ]
-    reasons = [[name, outcome.verdict.reasons[0].text] for name, outcome in told if outcome.verdict.reasons]
+    reasons = [[name, outcome.verdict.reasons[0].text] for name, outcome in outcomes if outcome.verdict.reasons]
     return make_claim("figure-2", trials, tables=[Table(("scenario", "reason of the refusal"), reasons)])
 
 
