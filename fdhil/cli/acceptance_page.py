@@ -5,7 +5,6 @@ from typing import Any
 
 from fdhil.cli.acceptance_findings import NO_LIMIT, AxisProof, Findings
 from fdhil.cli.doctor.latency import latency_text
-from fdhil.prediction.circular import Circular
 from fdhil.report import Page, Section, Table
 from fdhil.report.circular import polar
 from fdhil.report.history_verdict import LATEST_HEAD, latest_rows
@@ -109,7 +108,10 @@ def _parameters(found: Findings) -> Section:
 
 def _circular(found: Findings) -> Section:
     options = found.asked
-    columns = [_circle_cells(circle) for circle in found.circles.values()]
+    columns = [
+        [f"{um:.2f}" for um in (*circle.deviations_um, circle.both_um, circle.hysteresis_um, *circle.radial_um)]
+        for circle in found.circles.values()
+    ]
     rows = [[what, *cells] for what, *cells in zip(CIRCLE_ROWS, *columns, strict=True)]
     whose = "identified" if found.identified else "nominal"
     pictures = [
@@ -140,11 +142,6 @@ def _running(found: Findings) -> Section:
     none = [what for what, rows in (("No pass with the correction.", passes), ("No open notices.", notices))
             if not rows]  # fmt: skip
     return Section("In operation", " ".join([*none, late]), tables)
-
-
-def _circle_cells(circle: Circular) -> list[str]:
-    values = (*circle.deviations_um, circle.both_um, circle.hysteresis_um, *circle.radial_um)
-    return [f"{value:.2f}" for value in values]
 
 
 def _signatures(found: Findings, document: Mapping[str, Any]) -> Section:

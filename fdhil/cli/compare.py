@@ -35,8 +35,13 @@ def compare(before: Path, after: Path, as_json: bool) -> None:
     kinds = [_kind(path) for path in (before, after)]
     if kinds[0] != kinds[1]:
         raise click.UsageError(f"{before} is a {kinds[0]}, {after} a {kinds[1]}; give two files of one kind")
-    document = {"schema": SCHEMA, "kind": kinds[0]}
-    document |= _passes(before, after) if kinds[0] == "pass" else _models(kinds[0], before, after)
+    document: dict[str, Any] = {"schema": SCHEMA, "kind": kinds[0]}
+    if kinds[0] == "pass":
+        found = {"before": read_pass(before), "after": read_pass(after)}
+        old_um, new_um = (found[when]["contour"]["rms_um"] for when in ("before", "after"))
+        document |= {**found, "gain": old_um / new_um if new_um > 0.0 else None}
+    else:
+        document |= _models(kinds[0], before, after)
     if as_json:
         click.echo(json.dumps(document, allow_nan=False))
     else:
@@ -53,12 +58,6 @@ def _kind(path: Path) -> str:
         except OSError as error:
             raise RecordingError(f"{path} cannot be read ({error.strerror}): check the path") from None
     return "recording"
-
-
-def _passes(before: Path, after: Path) -> dict[str, Any]:
-    found = {"before": read_pass(before), "after": read_pass(after)}
-    left_um = found["after"]["contour"]["rms_um"]
-    return {**found, "gain": found["before"]["contour"]["rms_um"] / left_um if left_um > 0.0 else None}
 
 
 def read_pass(path: Path) -> dict[str, Any]:

@@ -5,6 +5,7 @@ import functools
 import io
 import json
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -21,6 +22,7 @@ SCHEMA = "fdhil-error-1"
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
 STOPPED = 130
+SURROGATES = re.compile("[\ud800-\udfff]")  # stand for bytes that are not text
 STANDARD_ERROR = 2
 WRONG_CALL = 2
 TROUBLE = 3
@@ -57,7 +59,7 @@ class SuggestingGroup(click.Group):
 
 def run_safely(command: click.Command) -> int:
     """Run a click command and return its exit code; report errors on stderr, or with ``--json`` on stdout."""
-    if broken := next((each for each in sys.argv[1:] if not _is_text(each)), None):
+    if broken := next((each for each in sys.argv[1:] if SURROGATES.search(each)), None):
         text = f"{broken!a} is not valid text in this computer's encoding, {sys.getfilesystemencoding()}"
         return tell("BadParameter", f"{text}; rename the file, or retype the argument", WRONG_CALL)
     try:
@@ -92,14 +94,6 @@ def run_safely(command: click.Command) -> int:
     except MemoryError:
         return tell("MemoryError", "out of memory; give a smaller file, or free memory", TROUBLE)
     return int(result or 0)
-
-
-def _is_text(argument: str) -> bool:
-    try:
-        argument.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def verdict(command: Callable[Given, Result]) -> Callable[Given, Result]:

@@ -144,11 +144,8 @@ def _lines(change: Change, found: Standing, opened: Offer | None) -> Iterator[st
         names = _named(opened.machines)
         yield f"{opened}, stage {opened.stage}, is proposed to {names}; their operators accept or reject it"
     else:
-        yield f"{change.name} version {change.version}: {len(found.left)} machines remain{_behind(found.left)}"
-
-
-def _behind(left: Sequence[str]) -> str:
-    return f" ({_named(left)})" if left else ""
+        names = f" ({_named(found.left)})" if found.left else ""
+        yield f"{change.name} version {change.version}: {len(found.left)} machines remain{names}"
 
 
 def _named(machines: Sequence[str]) -> str:

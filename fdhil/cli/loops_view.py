@@ -11,7 +11,6 @@ from fdhil.records import INTERVAL_95
 if TYPE_CHECKING:
     from fdhil.api.analysis import FileResult
     from fdhil.config import Axis
-    from fdhil.records import LoopEstimate
 
 
 def loops_line(status: Mapping[str, Any]) -> str:
@@ -20,11 +19,6 @@ def loops_line(status: Mapping[str, Any]) -> str:
         return ""
     gains = ", ".join(f"{name} {figures['value']:.4g}" for name, figures in status["gains"].items())
     return f"loops {status['structure']}, {gains}; {'; '.join((*status['reasons'], *status['warnings']))}"
-
-
-def _each(found: LoopEstimate) -> list[tuple[str, float, float]]:
-    stds = (math.sqrt(found.covariance[k, k]) for k in range(len(found.names)))
-    return list(zip(found.names, found.values.tolist(), stds, strict=True))
 
 
 def show_loops(result: FileResult, axis: Axis | None, console: Any) -> None:
@@ -44,7 +38,8 @@ def show_loops(result: FileResult, axis: Axis | None, console: Any) -> None:
     console.print(f"loops: {found.structure}{status}", style="italic")
     for head in ("regulators", "found", "configured", "unit"):
         table.add_column(head, justify="left" if head in ("regulators", "unit") else "right", no_wrap=True)
-    for name, value, std in _each(found):
+    for k, (name, value) in enumerate(zip(found.names, found.values.tolist(), strict=True)):
+        std = math.sqrt(found.covariance[k, k])
         configured = configured_value(regulators, name)
         shown = "-" if configured is None else f"{configured:.5g}"
         table.add_row(name, f"{value:.4g} ± {INTERVAL_95 * std:.2g}", shown, UNITS[name])

@@ -17,7 +17,7 @@ from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault
 
 if TYPE_CHECKING:
-    from fdhil.fleet.offered import Judged
+    pass
 
 OFFER = click.argument("offer", type=FILE)
 BY = click.option("--by", required=True, help="Your name, reported to the fleet server.")
@@ -70,7 +70,7 @@ def accept(config: Path, offer: Path, by: str, may_loosen: bool, as_json: bool) 
     armed.
     """
     machine = machine_config.load(config)
-    by, place = _signed(by), _place(machine, offer)
+    by, place = _text("--by", by, MOST_BY), _place(machine, offer)
     with with_extra():
         from fdhil.fleet.offered import accept as write
     from fdhil.cli import offers_view
@@ -93,24 +93,16 @@ def reject(config: Path, offer: Path, by: str, reason: str, as_json: bool) -> No
     The fleet server is informed. The configuration does not change.
     """
     machine = machine_config.load(config)
-    by, place, reason = _signed(by), _place(machine, offer), _text("--reason", reason, MOST_REASON)
+    by, place, reason = _text("--by", by, MOST_BY), _place(machine, offer), _text("--reason", reason, MOST_REASON)
     with with_extra():
         from fdhil.fleet.offered import reject as note
     with audited(machine, "reject an offer", offer=str(offer), by=by) as ended:
         done = note(place, config, by, reason)
         ended["text"] = reason
-    _tell_rejected(done, as_json)
-
-
-def _tell_rejected(done: Judged, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps({"schema": "fdhil-offer-rejected-1", "offer": str(done.offer)}))
-        return
-    click.echo(f"{done.offer} rejected; nothing was changed")
-
-
-def _signed(by: str) -> str:
-    return _text("--by", by, MOST_BY)
+    else:
+        click.echo(f"{done.offer} rejected; nothing was changed")
 
 
 def _text(option: str, text: str, most: int) -> str:

@@ -224,11 +224,9 @@ def inputs(
         raise click.UsageError("--model and --from-history exclude each other; give only one of them")
     from fdhil.api.machine import Machine, read_inputs
 
-    return read_inputs(program, Machine.load(config_path), "history" if from_history else model_path, _warn)
+    print_note = functools.partial(click.echo, err=True)
 
-
-def _warn(text: str) -> None:
-    click.echo(text, err=True)
+    return read_inputs(program, Machine.load(config_path), "history" if from_history else model_path, print_note)
 
 
 def _covariances(reference: Trajectory, past: Past) -> dict[str, Float]:

@@ -54,13 +54,10 @@ def interpret(program: Path, config_path: Path | None, as_document: bool, max_bl
             found = [asdict(note) for note in notes.found]
             spool.write("\n]" + (f', "notes": {json.dumps(found)}' if found else "") + "}\n")
         else:
-            spool.writelines(_row(as_json(motion)) for motion in motions)
+            for row in map(as_json, motions):
+                values = "  ".join(f"{key} {value}" for key, value in row.items() if key not in ("line", "kind"))
+                spool.write(f"{row['line']:>7}  {row['kind']:<6}  {values}\n")
         spool.seek(0)
         shutil.copyfileobj(spool, sys.stdout)
     for note in () if as_document else notes.found:
         click.echo(f"note, {note}; {note.advice}", err=True)
-
-
-def _row(motion: dict[str, object]) -> str:
-    values = "  ".join(f"{key} {value}" for key, value in motion.items() if key not in ("line", "kind"))
-    return f"{motion['line']:>7}  {motion['kind']:<6}  {values}\n"

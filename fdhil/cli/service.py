@@ -203,11 +203,8 @@ def acknowledge(config: Path, numbers: tuple[int, ...], everything: bool, note: 
     if everything:
         waiting = _ask(config, {"request": "status"})["unacknowledged"]["newest"]
         chosen = {"up_to": max((notice["number"] for notice in waiting), default=0)}
-    _tell(_ask(config, {"request": "acknowledge", "by": _user(), "note": note, **chosen}), as_json)
-
-
-def _user() -> str:
-    return os.environ.get("SUDO_USER") or os.environ.get("USER") or f"user {os.getuid()}"
+    user = os.environ.get("SUDO_USER") or os.environ.get("USER") or f"user {os.getuid()}"
+    _tell(_ask(config, {"request": "acknowledge", "by": user, "note": note, **chosen}), as_json)
 
 
 def _disarm_at_the_guard(config: Path, silent: DeviceError) -> Mapping[str, Any]:

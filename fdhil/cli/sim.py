@@ -16,8 +16,6 @@ from fdhil.cli.options import CONFIG, FILE, OutputFile, Writing
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from fdhil.config import MachineConfig
-    from fdhil.records import Trajectory
     from fdhil.sim.service import SimService
 
 LINGER_S = 10.0
@@ -65,13 +63,16 @@ def _serve(path: Path, as_json: bool, script: Path | None, play: Path | None, tr
     import signal
 
     from fdhil import config
+    from fdhil.program import load_trajectory
     from fdhil.sim import fault_script
     from fdhil.sim.service import SimService
 
     machine = config.load(path)
     entries = [] if script is None else fault_script.load(script, tuple(machine.axis))
-    tell = _tell_json if as_json else _tell
-    service = SimService(machine, tell, _load, panel_fd=_panel_descriptor(), faults=entries)
+
+    service = SimService(
+        machine, _tell_json if as_json else _tell, load_trajectory, panel_fd=_panel_descriptor(), faults=entries
+    )
 
     def stop(*_: object) -> None:
         service.stop()
@@ -125,12 +126,6 @@ def _stop_when_left(service: SimService, stop: Callable[[], None]) -> None:
 
     signal.signal(signal.SIGALRM, look)
     signal.setitimer(signal.ITIMER_REAL, LOOK_S, LOOK_S)
-
-
-def _load(path: Path, machine: MachineConfig) -> Trajectory:
-    from fdhil.program import load_trajectory
-
-    return load_trajectory(path, machine)
 
 
 def _panel_descriptor() -> int | None:

@@ -17,11 +17,10 @@ def without_controls(text: str) -> str:
     """
     if text.isprintable():
         return text
-    return "".join(_REPLACEMENT if _steers(letter) else letter for letter in text)
-
-
-def _steers(letter: str) -> bool:
-    return letter not in _LAYOUT and unicodedata.category(letter) in ("Cc", "Cf", "Zl", "Zp", "Cs")
+    return "".join(
+        _REPLACEMENT if one not in _LAYOUT and unicodedata.category(one) in ("Cc", "Cf", "Zl", "Zp", "Cs") else one
+        for one in text
+    )
 
 
 def print_progress(text: str) -> None:

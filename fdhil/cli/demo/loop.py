@@ -103,9 +103,8 @@ def _start_twin(out: Path, realtime: bool, say: Say, stack: ExitStack, document:
     (out / "twin.toml").write_text(to_toml(document), "utf-8")
     twin = stack.enter_context(Twin(out / "twin.toml", out / "twin.log"))
     document["bus"] = twin.ready["buses"]
-    for axis, sensor in twin.ready[
-        "modbus"
-    ].items():  # the simulated voltage sensors also measure the slide-way temperature
+    # the simulated voltage sensors also measure the slide-way temperature
+    for axis, sensor in twin.ready["modbus"].items():
         document["axis"][axis]["temperature"] = {**sensor, "period_s": 0.2}
     (out / "machine.toml").write_text(to_toml(document), "utf-8")
     folder = Path(__file__).parent
@@ -188,7 +187,11 @@ def play_shuttle(stage: Stage) -> None:
     """Play the shuttle program and wait until all its rapids are analysed."""
     before = _analysed(stage)
     stage.twin.play(stage.programs["shuttle"])
-    _await(lambda: _settled(stage, before), "the rapids of the shuttle were not analysed", stage)
+    _await(
+        lambda: all(now >= before[axis] + RAPIDS for axis, now in _analysed(stage).items()),
+        "the rapids of the shuttle were not analysed",
+        stage,
+    )
 
 
 def published_of(found: ParameterSet) -> Published:
@@ -206,10 +209,6 @@ def true_plants(config: MachineConfig) -> dict[str, Parameters]:
 def _analysed(stage: Stage) -> dict[str, int]:
     axes = stage.ask("status")["axes"]
     return {axis: found["accepted"] + found["refused"] for axis, found in axes.items()}
-
-
-def _settled(stage: Stage, before: Mapping[str, int]) -> bool:
-    return all(now >= before[axis] + RAPIDS for axis, now in _analysed(stage).items())
 
 
 def cut(stage: Stage, label: str, celsius: float, method: str | None = None) -> None:

@@ -18,8 +18,6 @@ from fdhil.cli.terminal_text import print_progress
 from fdhil.daemon.clock import newest_record_s
 
 if TYPE_CHECKING:
-    from rich.text import Text
-
     from fdhil.config import MachineConfig
 
 SCHEMA = "fdhil-doctor-1"
@@ -98,21 +96,16 @@ def _seen(place: str, examine: Callable[[], Iterator[Trouble]]) -> Iterator[Trou
 
 
 def _show(found: list[Trouble]) -> None:
+    from rich.text import Text
+
     from fdhil.cli.status_view import open_console
 
     out = open_console()
     for number, trouble in enumerate(found, 1):
-        out.print(_told(number, trouble), soft_wrap=True)
+        head = Text.assemble((f"{number}. {trouble.place}: ", "red" if trouble.grave else "yellow"), trouble.what)
+        out.print(head.append(f"\n   means: {trouble.means}\n   fix:   {trouble.mend}"), soft_wrap=True)
     grave = sum(trouble.grave for trouble in found)
     if found:
         out.print(f"{grave} to fix, {len(found) - grave} to improve; fix the first and run it again")
     else:
         out.print("no problem found")
-
-
-def _told(number: int, trouble: Trouble) -> Text:
-    from rich.text import Text
-
-    colour = "red" if trouble.grave else "yellow"
-    head = Text.assemble((f"{number}. {trouble.place}: ", colour), trouble.what)
-    return head.append(f"\n   means: {trouble.means}\n   fix:   {trouble.mend}")

@@ -31,7 +31,9 @@ def examine_store(config: MachineConfig) -> Iterator[Trouble]:
         yield Trouble("StoreNoFolder", "store", what, means, mend)
         return
     if not may_write(base):
-        mend = f"give this user ({_user()}) write permission, or correct [store] directory"
+        mend = (
+            f"give this user ({os.environ.get('USER') or os.getuid()}) write permission, or correct [store] directory"
+        )
         yield Trouble("StoreReadOnly", "store", f"{base} is not writable", means, mend)
     free = shutil.disk_usage(base).free
     if free < LEAST_FREE_BYTES:
@@ -52,10 +54,6 @@ def _history(folder: Path) -> Iterator[Trouble]:
     except StoreError as error:
         if error.code != "NoHistory":
             yield Trouble.create_from_error(error.code, "store", error, "earlier parameters are unavailable")
-
-
-def _user() -> str:
-    return os.environ.get("USER") or str(os.getuid())
 
 
 def examine_secrets(config: MachineConfig) -> Iterator[Trouble]:

@@ -29,12 +29,11 @@ def counts(claims: Sequence[Claim]) -> dict[str, int]:
 
 def summary_rows(claims: Sequence[Claim]) -> list[list[str]]:
     """Return one row per claim, with the columns of ``SUMMARY_HEAD``."""
-    return [[claim.title, claim.verdict.value, _shown(claim), claim.source] for claim in claims]
-
-
-def _shown(claim: Claim) -> str:
-    shown = sum(claim.shown_by(scenario) for scenario in claim.scenarios)
-    return f"{shown} of {len(claim.scenarios)} scenarios"
+    shown = [sum(map(claim.shown_by, claim.scenarios)) for claim in claims]
+    return [
+        [claim.title, claim.verdict.value, f"{count} of {len(claim.scenarios)} scenarios", claim.source]
+        for claim, count in zip(claims, shown, strict=True)
+    ]
 
 
 def page(claims: Sequence[Claim]) -> Page:
