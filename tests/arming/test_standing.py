@@ -445,4 +445,4 @@ def test_disarm_without_a_daemon_asks_the_guard(machine: Path, guard: Guard, cap
     assert (code, STANDS in err, "run fdhil adopt" in err) == (1, True, True)
     guard.close()
     code, _, err = fdhil("disarm", machine, capsys=capsys)
-    assert (code, "unknown what is applied" in err) == (3, True)
+    assert (code, "the applied offset is unknown" in err) == (3, True)

@@ -192,8 +192,8 @@ def test_an_axis_is_tried_where_the_operator_agrees_and_known_to_the_history(
 def test_who_does_not_agree_is_not_moved(said: str, code: int, bench: Bench) -> None:
     got, out, err = bench.commission(said=said)
     assert (got, "jog: " in out) == (code, False)
-    assert ("is not tried by moving it" in out) is (code == 0)
-    assert ("not confirmed; the axis was not moved, its record holds" in err) is ("130" in said)
+    assert ("no trial, because" in out) is (code == 0)
+    assert ("not confirmed; the axis was not moved and its record stays valid" in err) is ("130" in said)
     assert ("'far' is not two numbers" in err) is ("far" in said)
     assert (load_record(bench.store, "X") is None) is ("far" in said)
     assert bench.peer.drive.power.state.name == "SWITCH_ON_DISABLED"

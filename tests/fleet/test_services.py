@@ -74,7 +74,7 @@ def asked(works: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., tupl
 async def test_a_service_is_entered_and_what_it_changed_is_told(
     asked: Callable[..., tuple[int, str]], database: Postgres, tmp_path: Path
 ) -> None:
-    assert "no service was entered" in asked("services")[1]
+    assert "no service recorded yet" in asked("services")[1]
     assert due(asked) == []  # as far as is known it rises and falls
     day = (BEGIN + timedelta(days=SERVICED)).date().isoformat()
     words = ("--machine", "mill-1", "--axis", "X", "--date", day)
