@@ -45,7 +45,7 @@ def key(file: Path, as_json: bool) -> None:
 @click.command(cls=Writing)
 @CHANGE
 @click.option("--key", "key_file", type=FILE, required=True, help="Key file to sign with.")
-@click.option("--by", required=True, help="Who signs: your name, which the operators read.")
+@click.option("--by", required=True, help="Name of the signer, shown to the operators.")
 @MACHINES
 @click.option("--out", type=OutputFile(".offer"), required=True, help="File to write, for transfer to the machines.")
 @AS_JSON
@@ -76,7 +76,7 @@ def sign(change: Path, key_file: Path, by: str, machines: tuple[str, ...], out: 
 @FLEET
 @CHANGE
 @click.option("--key", "key_file", type=FILE, help="Key file to sign with; without it no stage is opened.")
-@click.option("--by", default="", help="Who signs: your name, which the operators read.")
+@click.option("--by", default="", help="Name of the signer, shown to the operators.")
 @click.option("--count", type=click.IntRange(min=1), help="Number of machines in the stage (default: all remaining).")
 @MACHINES
 @click.option("--despite", default="", help="Reason for opening a stage although earlier machines are not ready.")

@@ -60,7 +60,7 @@ def services(fleet: Path, machine: str | None, as_json: bool) -> None:
 @FLEET
 @AS_JSON
 def retain(fleet: Path, as_json: bool) -> None:
-    """Delete the records and windows older than [retention] of FLEET allows.
+    """Delete records that [retention] of FLEET does not keep.
 
     Deletes whole months of records, and files of windows. Run it once a day by a timer. The first parameters of each
     axis are kept, and deleted records do not count as missing.

@@ -39,9 +39,9 @@ def offers() -> None:
 @AS_JSON
 @verdict
 def list_(config: Path, files: tuple[Path, ...], as_json: bool) -> int:
-    """List the changes proposed for CONFIG's machine, and those in FILES.
+    """List the proposed changes of CONFIG's machine.
 
-    Shows the new values and what they invalidate. Nothing is changed.
+    Includes those in FILES. Shows the new values and what they invalidate. Nothing is changed.
     """
     machine_config.load(config)
     with with_extra():
