@@ -302,7 +302,7 @@ def test_nobody_moves_without_a_yes(fdhil: Said, bench: Bench) -> None:
             assert code == 1
             assert "step 2 of 7, compare" in out
             assert "step 3" not in out
-            assert "the axis moves by 10 um" in err
+            assert "the axis will move by 10 um" in err
             assert "nothing was moved or written" in err
     assert 0x601 in heard
     assert not {0x000, 0x080, 0x201, 0x301} & set(heard)
