@@ -112,7 +112,6 @@ def _sources(
 
 
 def _telling(source: Source) -> Source:
-    """Return a source that shows each trial run and the path duration on a terminal."""
     if not sys.stderr.isatty():
         return source
     at, trials = source.at, itertools.count(1)

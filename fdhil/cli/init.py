@@ -107,7 +107,6 @@ def running_pins() -> list[str]:
 
 
 def _hal_text(text: str, file: Path, nc: Machine, draft: Draft) -> str:
-    """Return the HAL file that loads the bridge and connects the offsets of axes with a correction."""
     from fdhil.commissioning.init.hal_file import correction_hal, splices_of
 
     machine = machine_config.parse(machine_config.toml_document(text.encode(), str(file)), str(file), file.parent)
@@ -139,7 +138,6 @@ def _look(places: Sequence[Path], folder: Path) -> Look:
 
 
 def _can_interface() -> Told | None:
-    """Return the name of this PC's first CAN interface, or None."""
     from fdhil.commissioning.init.told import Told
 
     found = [place.parent.name for place in sorted(INTERFACES.glob("*/type")) if place.read_text().strip() == CAN_TYPE]

@@ -114,7 +114,6 @@ def _text(option: str, text: str, most: int) -> str:
 
 
 def _place(machine: MachineConfig, offer: Path) -> Path:
-    """Return the file of an offer: the newest one of that name in the folder, or the given file."""
     from fdhil.store.offers import lying
 
     if offer.suffix == ".offer" or offer.name != str(offer):

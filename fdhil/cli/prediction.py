@@ -263,7 +263,6 @@ def _correction_columns(planned: Correction) -> dict[str, tuple[Float, int]]:
 
 
 def _write(path: Path, columns: Mapping[str, tuple[Float, int]]) -> None:
-    """Write columns as CSV with a header line. Raises OutputError if the file cannot be written."""
     import numpy as np
 
     from fdhil.store.output import open_output
