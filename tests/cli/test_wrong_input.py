@@ -113,7 +113,9 @@ def test_bytes_that_are_no_text_are_told(arguments: tuple[str, ...], tmp_path: P
     command = [sys.executable, "-m", "fdhil", *arguments, os.fsdecode(b"k\xe4se")]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100)
     assert done.returncode == 2
-    assert "'k\\udce4se' is not valid text" in (json.loads(done.stdout)["error"]["text"] if done.stdout else done.stderr)
+    assert "'k\\udce4se' is not valid text" in (
+        json.loads(done.stdout)["error"]["text"] if done.stdout else done.stderr
+    )
     assert "Traceback" not in done.stderr
 
 
