@@ -1,4 +1,4 @@
-"""Every command that a document shows is one that fdhil has, and those that need no machine run as they stand."""
+"""Every documented command exists, and those without a machine run unchanged."""
 
 from __future__ import annotations
 
@@ -40,7 +40,6 @@ WINDOW = "configs/fdhil-data/windows/w00000001-X.parquet"
 
 
 def blocks(page: Path, language: str) -> Iterator[str]:
-    """Yield the page's fenced blocks of a language."""
     for found, body in re.findall(r"^```(\w+)\n(.*?)^```", page.read_text("utf-8"), re.MULTILINE | re.DOTALL):
         if found == language:
             yield body
@@ -55,13 +54,11 @@ def lines(page: Path) -> list[str]:
 
 
 def mentions(page: Path) -> list[str]:
-    """Return the commands that stand within a sentence; what they work on may be left out there."""
     found = re.findall(r"`(fdhil(?:-guard)? [^`]*)`", " ".join(page.read_text("utf-8").split()))
     return [line for line in found if not line.startswith("fdhil --")]
 
 
 def chosen(line: str) -> tuple[click.Command, list[str]]:
-    """Return the command of a line and its arguments; UsageError where fdhil has none of that name."""
     program, *words = shlex.split(line)
     if program == "fdhil-guard":
         return guard, words
@@ -72,7 +69,7 @@ def chosen(line: str) -> tuple[click.Command, list[str]]:
 
 
 def faults(line: str, whole: bool) -> str:
-    """Return what is wrong with a command line; options and, where it is ``whole``, the number of arguments."""
+    """Return the fault of a command line: options and, if ``whole``, the number of arguments."""
     try:
         command, words = chosen(line)
         context = click.Context(command)
@@ -107,7 +104,16 @@ def test_a_command_that_fdhil_does_not_have_is_seen() -> None:
     assert "missing" in faults("fdhil predict --config machine.toml", whole=True)
 
 
-# blocks that other tests run as they stand
+@pytest.mark.parametrize("name", LEAVES)
+def test_help_ends_with_valid_example_and_exit_codes(name: str) -> None:
+    text = LEAVES[name].get_help(click.Context(LEAVES[name], info_name=name))
+    example = re.findall(r"Example:\n\s+(.*)", text)
+    assert example[0].startswith(f"fdhil {name}")
+    assert faults(example[0], whole=True) == ""
+    assert "Exit codes:\n    0  " in text
+
+
+# blocks that other tests run unchanged
 RUN = {
     ("README.md", "python"): "tests/api/test_command_line.py",
     ("an-hour.md", "sh"): "tests/cli/test_tutorial.py",
@@ -120,7 +126,7 @@ GENERATED = ("benchmarks.md", "index.md")
 
 
 def untried(page: Path) -> Iterator[str]:
-    """Yield the first line of each block that no test tries and that does not say why."""
+    """Yield the first line of each block without a test and without a reason."""
     for before, language, body in re.findall(r"([^\n]*)\n```(\w*)\n(.*?)^```", page.read_text("utf-8"), re.M | re.S):
         commands = language in ("sh", "bash") and re.search(r"^fdhil(-guard)? ", body, re.MULTILINE)
         told = re.fullmatch(r"<!-- not run: \S.* -->", before)
@@ -145,7 +151,7 @@ def test_block_that_is_not_tried_is_found(tmp_path: Path) -> None:
 
 @pytest.fixture
 def house(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of configs/ with a store in which one rapid and a set of parameters are kept, as after ``fdhil run``."""
+    """A copy of configs/ with a store of one rapid and one parameter set, as after ``fdhil run``."""
     shutil.copytree(ROOT / "configs", tmp_path / "configs")
     machine = config.load(tmp_path / "configs" / "sim.toml")
     store = OutcomeStore(machine)
@@ -175,14 +181,12 @@ def test_the_first_commands_run_as_they_stand(page: str, house: Path, capsys: py
 
 
 def spoilt(text: str, change: Callable[[list[list[str]]], list[list[str]]]) -> str:
-    """Return a recording's text with its rows changed."""
     head, _, body = text.partition("time_s")
     names, *rows = [line.split(",") for line in f"time_s{body}".splitlines()]
     return head + "\n".join(",".join(row) for row in [names, *change(rows)]) + "\n"
 
 
 def scaled(column: int) -> Callable[[list[list[str]]], list[list[str]]]:
-    """Return the change that multiplies a column by 1.2."""
     return lambda rows: [[*row[:column], f"{1.2 * float(row[column]):.6f}", *row[column + 1 :]] for row in rows]
 
 
@@ -200,7 +204,7 @@ def scaled(column: int) -> Callable[[list[list[str]]], list[list[str]]]:
 def test_the_tutorial_says_what_becomes_of_a_spoilt_rapid(
     change: Callable[[list[list[str]]], list[list[str]]], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Without the data sheet a gain that is wrong all the time is another drive; all else is refused by name."""
+    """Without a data sheet a constant gain error looks like another drive; every other damage is refused by code."""
     text = bench.as_csv(bench.run(bench.Plant(), bench.shuttle()), 0.001)
     assert text.partition("time_s")[2].startswith(",voltage_V,current_A,speed_rad_per_s,")
     (tmp_path / "rapid.csv").write_text(spoilt(text, change))
@@ -210,7 +214,6 @@ def test_the_tutorial_says_what_becomes_of_a_spoilt_rapid(
 
 
 def merged(document: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """Return a document with a part of another file put in."""
     for key, value in changes.items():
         document[key] = merged(document.get(key, {}), value) if isinstance(value, dict) else value
     return document
@@ -222,7 +225,7 @@ def test_every_piece_of_a_configuration_can_be_put_into_one(page: Path) -> None:
         piece = tomllib.loads(text)
         if "columns" in piece:
             ColumnMap.model_validate(piece)
-        # not the simulated machine's own script, nor a drive's profile
+        # neither a fault script nor a drive profile
         elif {"database", "retention"} & set(piece):
             Fleet.model_validate(piece)
         elif "set" in piece:

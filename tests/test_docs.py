@@ -1,4 +1,4 @@
-"""What is generated is what the code says, and what the documents link to exists."""
+"""Generated documents are current, and links resolve."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def test_the_code_overview_names_what_exists() -> None:
 
 @pytest.mark.usefixtures("processes")
 def test_the_generated_files_are_current() -> None:
-    """In a process of its own: click remembers how a command was last asked for help."""
+    """In a separate process, because click caches the help option."""
     command = [sys.executable, str(ROOT / "docs" / "generate.py"), "--check"]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
 def uncommented(text: str, *chosen: str) -> str:
-    """Return the template with the # taken from the chosen settings, and from all of the chosen sections."""
+    """Return the template with the chosen settings and sections uncommented."""
     lines, section = [], ""
     for line in text.splitlines():
         bare = line[1:] if re.match(r"#[A-Za-z\[]", line) else line
@@ -115,7 +115,7 @@ def test_every_link_between_documents_leads_somewhere(page: Path) -> None:
     "table", [name for name, value in vars(tables).items() if isinstance(value, dict) and name.isupper()]
 )
 def test_being_listed_is_being_tested(table: str) -> None:
-    """Each table has a suite that runs over all its entries; a new entry is in it by being listed."""
+    """The suite of each table runs over all its entries."""
     runs_over_all = re.compile(rf"(parametrize\(.*|params=list\(|for name in )tables\.{table}\b")
     assert any(runs_over_all.search(path.read_text("utf-8")) for path in (ROOT / "tests").glob("**/test_*.py"))
 

@@ -1,4 +1,4 @@
-"""Every class that an operator may read has effect and next action in the documents, and its cause where it arises."""
+"""Every code visible to an operator is documented with effect and action, and has its cause in the code."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ DOCS = PRODUCT.parent / "docs"
 PAGES = ("reference/refusals.md", "reference/guard.md", "reference/notices.md", "reference/errors.md",
          "explanation/verdicts.md")  # fmt: skip
 # what takes a class, a cause and a next action, in this order (a doctor's trouble: class, place, cause, effect, action)
-CALLS = {"refusal": 3, "Refused": 4, "NotAcknowledged": 3, "Reason": 3, "Trouble": 5}
+CALLS = {"refusal": 3, "Refused": 4, "NotAcknowledged": 3, "Reason": 3, "Trouble": 5, "create_from_error": 4}
 CLASS = re.compile(r"[A-Z][a-z]+[A-Za-z]*(\(\w+\))?")
 
 
 @cache
 def calls() -> tuple[tuple[str, str, int, bool], ...]:
-    """Return class, place and count of the words of each call, and whether its last word says something."""
+    """Return code, location and number of words of each call, and whether the last word is a text."""
     return tuple(_calls())
 
 
@@ -56,7 +56,7 @@ def _name(call: ast.Call) -> str:
 
 
 def documented() -> set[str]:
-    """Return the classes that begin a row of a table, whose other cells are not empty."""
+    """Return the codes in the first cell of table rows whose other cells are not empty."""
     found: set[str] = set()
     for page in PAGES:
         for line in (DOCS / page).read_text("utf-8").splitlines():

@@ -1,1 +1,1 @@
-"""The command line: one file per group of commands, loaded when called so that ``fdhil --help`` is instant."""
+"""Command line of fdhil. Modules of commands are imported on call, so that ``fdhil --help`` is instant."""

@@ -1,7 +1,8 @@
-"""``fdhil acceptance``: what is handed over with a machine: what was proven, what it is, and how well it runs."""
+"""``fdhil acceptance``: the report that is handed over with a machine: proofs, parameters and accuracy."""
 
 import json
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -12,46 +13,40 @@ from fdhil.cli.options import AS_JSON, CONFIG, FILE, OutputFile, Positive, Writi
 
 @click.command(cls=Writing)
 @CONFIG
-@click.option("--out", required=True, type=OutputFile(), help="The HTML file to write.")
-@click.option("--pdf", type=OutputFile(".pdf"), help="Also print it as PDF (needs chromium).")
-@click.option("--by", default="", metavar="NAME", help="The operator who proved it; stands above the signature.")
-@click.option("--customer", default="", metavar="NAME", help="Who receives the machine.")
-@click.option("--site", default="", metavar="PLACE", help="Where the machine stands.")
-@click.option("--program", type=FILE, metavar="PROGRAM", help="An NC program or demand CSV: its contour error is told.")
+@click.option("--out", required=True, type=OutputFile(), help="HTML file to write.")
+@click.option("--pdf", type=OutputFile(".pdf"), help="PDF file to write as well (needs chromium).")
+@click.option("--by", default="", metavar="NAME", help="Operator who ran the tests; printed above the signature.")
+@click.option("--customer", default="", metavar="NAME", help="Customer who receives the machine.")
+@click.option("--site", default="", metavar="PLACE", help="Site of the machine.")
+@click.option(
+    "--program", type=FILE, metavar="PROGRAM", help="NC program or demand CSV to predict the contour error of."
+)
 @click.option(
     "--radius-mm", type=Positive(0.1, 10_000.0), default=50.0, show_default=True, help="Radius of the circular test."
 )
-@click.option("--feed", type=Positive(1.0, 1e6), default=2000.0, show_default=True, help="Its feed, mm/min.")
+@click.option(
+    "--feed",
+    "feed_mm_min",
+    type=Positive(1.0, 1e6),
+    default=2000.0,
+    show_default=True,
+    help="Feed of the circular test, mm/min.",
+)
 @click.option(
     "--measured-circle",
     type=FILE,
     metavar="CSV",
-    help="Columns X_mm,Y_mm of that circle as measured at the table, in both directions.",
+    help="Circle measured at the table in both directions: columns X_mm,Y_mm.",
 )
-@click.option("--contour-um", type=Positive(), help="The largest contour error of PROGRAM that is accepted.")
-@click.option("--circle-um", type=Positive(), help="The largest bi-directional circular deviation that is accepted.")
+@click.option("--contour-um", type=Positive(), help="Largest accepted contour error of PROGRAM, um.")
+@click.option("--circle-um", type=Positive(), help="Largest accepted bi-directional circular deviation, um.")
 @AS_JSON
 @verdict
-def acceptance(
-    config: Path,
-    out: Path,
-    pdf: Path | None,
-    by: str,
-    customer: str,
-    site: str,
-    program: Path | None,
-    radius_mm: float,
-    feed: float,
-    measured_circle: Path | None,
-    contour_um: float | None,
-    circle_um: float | None,
-    as_json: bool,
-) -> int:
-    """Write the acceptance report of CONFIG's machine: what was proven of each drive, parameters, circular test.
+def acceptance(config: Path, out: Path, pdf: Path | None, as_json: bool, **options: Any) -> int:
+    """Write the acceptance report of CONFIG's machine: commissioning results, parameters, circular test.
 
-    Nothing is sent. The circle, and PROGRAM where there is one, are predicted without and with the correction; a
-    circle that was measured is evaluated beside them (ISO 230-4). Exit 1 when a point is open: a drive that is not
-    commissioned or not identified, or a limit that is not kept.
+    Nothing is sent to the drives. The circle and PROGRAM are predicted without and with the correction. A measured
+    circle is evaluated alongside (ISO 230-4).
     """
     from fdhil import config as machine_config
     from fdhil.cli.acceptance_findings import NO_LIMIT, Asked, document_of, find
@@ -61,8 +56,7 @@ def acceptance(
     require()
     machine = machine_config.load(config)
     forewarn("predict", "correct")
-    given = (program, radius_mm, feed, measured_circle, contour_um, circle_um)
-    found = find(machine, config, Asked(by, customer, site, *given))
+    found = find(machine, config, Asked(**options))
     document = document_of(found)
     deliver(page_of(found, document), out, pdf)
     if as_json:
@@ -72,6 +66,6 @@ def acceptance(
             click.echo(f"open: {point}")
         if not found.asked.limits:
             click.echo(NO_LIMIT)
-        state = "accepted" if not found.open_points else f"{len(found.open_points)} points are open"
-        click.echo(f"{machine.machine.name}: {state}; SHA-256 of what the report says: {document['sha256']}")
+        state = f"{len(found.open_points)} points are open" if found.open_points else "accepted"
+        click.echo(f"{machine.machine.name}: {state}; SHA-256 of the report's content: {document['sha256']}")
     return 1 if found.open_points else 0

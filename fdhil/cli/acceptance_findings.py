@@ -1,4 +1,4 @@
-"""Gathers what an acceptance report says, and which points are open, each by a rule."""
+"""Content of an acceptance report and the rules of its open points."""
 
 import csv
 import hashlib
@@ -30,13 +30,13 @@ from fdhil.report.history_course import AxisHistory
 from fdhil.report.history_reading import PASS, by_axis, read_history, read_notices, read_passes
 
 SCHEMA = "fdhil-acceptance-1"
-NO_LIMIT = "no limit was set: give --circle-um and --contour-um what the machine must keep"
+NO_LIMIT = "no limit was set: give the required accuracy with --circle-um and --contour-um"
 NEWEST_PASSES = 20
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What was asked for: see ``fdhil acceptance --help``."""
+    """Options of ``fdhil acceptance``."""
 
     by: str
     customer: str
@@ -50,13 +50,13 @@ class Asked:
 
     @property
     def limits(self) -> Sequence[float]:
-        """The limits that were set."""
+        """Limits that were set, um."""
         return [um for um in (self.contour_um, self.circle_um) if um is not None]
 
 
 @dataclass(frozen=True, slots=True)
 class AxisProof:
-    """What was proven of one drive: its record and when each step was done; what speaks against it, or nothing."""
+    """Commissioning of one drive: record, time of each step, and the objection, or an empty text."""
 
     record: CommissioningRecord | None
     steps: Mapping[str, str]
@@ -65,10 +65,10 @@ class AxisProof:
 
 @dataclass(frozen=True, slots=True)
 class Findings:
-    """All that the report says. ``circles`` are by how they were found; ``plane`` is empty where no two axes move.
+    """Content of the report. ``circles`` are by their origin; ``plane`` is None without two linear axes.
 
-    ``passes`` are the last that were cut corrected, ``notices`` those that nobody has acknowledged, both as JSON has
-    notices; ``latency`` is what fdhil doctor --latency measured last.
+    ``passes`` are the latest corrected passes and ``notices`` the pending notices, both as JSON entries; ``latency`` is
+    the latest result of fdhil doctor --latency.
     """
 
     machine: MachineConfig
@@ -86,8 +86,8 @@ class Findings:
     open_points: Sequence[str]
 
 
-def find(machine: MachineConfig, config: Path, asked: Asked) -> Findings:
-    """Gather everything; ConfigError, StoreError, ProgramError, RecordingError where something cannot be read."""
+def find(machine: MachineConfig, config: Path, options: Asked) -> Findings:
+    """Gather the content. Raises ConfigError, StoreError, ProgramError, RecordingError."""
     proofs = {axis: _proof(machine, axis) for axis in machine.axis}
     passes: Sequence[Mapping[str, Any]] = []
     notices: Sequence[Mapping[str, Any]] = []
@@ -103,19 +103,19 @@ def find(machine: MachineConfig, config: Path, asked: Asked) -> Findings:
     identified = known >= set(machine.axis)
     linear = [axis for axis in ("X", "Y", "Z") if axis in machine.axis]
     plane = (linear[0], linear[1]) if len(linear) > 1 else None
-    circles = _circles(config, asked, plane, identified) if plane else {}
-    path = _planned(asked.program, config, identified) if asked.program else None
+    circles = _circles(config, options, plane, identified) if plane else {}
+    path = _planned(options.program, config, identified) if options.program else None
     points = [f"{axis}: {proof.against}" for axis, proof in proofs.items() if proof.against]
     points += [
-        f"{axis}: no parameters were published, the nominal ones stand in; let the daemon see some rapids"
+        f"{axis}: no published parameters, nominal ones are used; run the daemon while the axis makes rapids"
         for axis in machine.axis
         if axis not in known
     ]
-    points += _beyond(asked, circles, path)
+    points += _beyond(options, circles, path)
     if major := sum(notice["severity"] == "MAJOR" for notice in notices):
-        points.append(f"{major} MAJOR notices that nobody has acknowledged; see fdhil status, then fdhil acknowledge")
+        points.append(f"{major} MAJOR notices are pending; see fdhil status, then fdhil acknowledge")
     made = datetime.now(UTC).isoformat(timespec="seconds")
-    known_by = (machine, asked, made, proofs, histories, identified, plane, circles, path)
+    known_by = (machine, options, made, proofs, histories, identified, plane, circles, path)
     return Findings(*known_by, passes, notices, read_latency(machine), points)
 
 
@@ -140,19 +140,20 @@ def _planned(program: Path, config: Path, from_history: bool) -> Correction:
     return correction.plan(reference, models, machine)
 
 
-def _circles(config: Path, asked: Asked, plane: tuple[str, str], from_history: bool) -> dict[str, Circular]:
+def _circles(config: Path, options: Asked, plane: tuple[str, str], from_history: bool) -> dict[str, Circular]:
     with tempfile.TemporaryDirectory(prefix="fdhil-circle-") as folder:
         program = Path(folder) / "circle.ngc"
-        program.write_text(circle_program(plane, asked.radius_mm, asked.feed_mm_min), "ascii")
+        program.write_text(circle_program(plane, options.radius_mm, options.feed_mm_min), "ascii")
         planned = _planned(program, config, from_history)
     cases = {"predicted, uncorrected": planned.before}
     if not planned.refused:
         cases["predicted, corrected"] = planned.after
     found = {
-        label: evaluate(_table_mm(predicted, plane), asked.radius_mm, (0.0, 0.0)) for label, predicted in cases.items()
+        label: evaluate(_table_mm(predicted, plane), options.radius_mm, (0.0, 0.0))
+        for label, predicted in cases.items()
     }
-    if asked.measured_circle is not None:
-        found["measured"] = evaluate(read_path(asked.measured_circle, plane), asked.radius_mm)
+    if options.measured_circle is not None:
+        found["measured"] = evaluate(read_path(options.measured_circle, plane), options.radius_mm)
     return found
 
 
@@ -162,7 +163,7 @@ def _table_mm(predicted: Prediction, plane: tuple[str, str]) -> Float:
 
 
 def read_path(path: Path, plane: tuple[str, str]) -> Float:
-    """Return the columns of a measured path (n, 2), mm. RecordingError where the file has none."""
+    """Return a measured path (n, 2), mm. Raises RecordingError if the file has none."""
     names = [f"{axis}_mm" for axis in plane]
     try:
         with path.open(encoding="utf-8", newline="") as file:
@@ -171,40 +172,40 @@ def read_path(path: Path, plane: tuple[str, str]) -> Float:
         raise RecordingError(f"{path} cannot be read ({error.strerror}); check the path") from None
     except (KeyError, TypeError, ValueError, csv.Error):
         text = (
-            f"{path} is no measured path: a CSV with the columns {', '.join(names)} and a number in each row is needed"
+            f"{path} is not a measured path; provide a CSV with the columns {', '.join(names)} and numbers in each row"
         )
         raise RecordingError(text) from None
     if not rows or not np.isfinite(rows).all():
-        raise RecordingError(f"{path} holds no path, or a place that is no number; export it again")
+        raise RecordingError(f"{path} has no rows, or a value that is not finite; export it again")
     return np.array(rows)
 
 
-def _beyond(asked: Asked, circles: Mapping[str, Circular], path: Correction | None) -> list[str]:
-    """Return the limits that are not kept; a limit without anything to compare it with is open too."""
+def _beyond(options: Asked, circles: Mapping[str, Circular], path: Correction | None) -> list[str]:
+    # a limit without a result to compare is open as well
     points = []
-    if asked.circle_um is not None:
-        told = circles.get("measured") or circles.get("predicted, corrected") or circles.get("predicted, uncorrected")
-        if told is None or told.both_um > asked.circle_um:
-            found = "no circle could be run" if told is None else f"it is {told.both_um:.1f} um"
-            points.append(f"circular deviation: {asked.circle_um:g} um are allowed, {found}")
-    if asked.contour_um is not None:
+    if options.circle_um is not None:
+        circle = circles.get("measured") or circles.get("predicted, corrected") or circles.get("predicted, uncorrected")
+        if circle is None or circle.both_um > options.circle_um:
+            found = "no circle is possible" if circle is None else f"it is {circle.both_um:.1f} um"
+            points.append(f"circular deviation: {options.circle_um:g} um are allowed, {found}")
+    if options.contour_um is not None:
         if path is None:
-            points.append(f"contour error: {asked.contour_um:g} um are allowed, and no --program was given to tell it")
-        elif (largest := float((path.before if path.refused else path.after).contour_um.max())) > asked.contour_um:
-            points.append(f"contour error: {asked.contour_um:g} um are allowed, it is {largest:.1f} um")
+            points.append(f"contour error: {options.contour_um:g} um are allowed, but no --program was given")
+        elif (largest := float((path.before if path.refused else path.after).contour_um.max())) > options.contour_um:
+            points.append(f"contour error: {options.contour_um:g} um are allowed, it is {largest:.1f} um")
     return points
 
 
 def document_of(found: Findings) -> dict[str, Any]:
-    """Return what the report says as JSON has it; ``sha256`` is over all the rest, keys sorted, no spaces."""
-    machine, asked = found.machine, found.asked
+    """Return the content as JSON; ``sha256`` covers all other entries, with sorted keys and without spaces."""
+    machine, options = found.machine, found.asked
     document: dict[str, Any] = {
         "schema": SCHEMA,
         "made_utc": found.made_utc,
         "made_by": f"fdhil {version('fdhil')}",
-        "by": asked.by,
-        "customer": asked.customer,
-        "site": asked.site,
+        "by": options.by,
+        "customer": options.customer,
+        "site": options.site,
         "machine": {
             "name": machine.machine.name,
             "config_digest": machine.digest,
@@ -213,16 +214,16 @@ def document_of(found: Findings) -> dict[str, Any]:
         "axes": {axis: _axis_document(found, axis) for axis in machine.axis},
         "circle": {
             "plane": "".join(found.plane or ()),
-            "radius_mm": asked.radius_mm,
-            "feed_mm_min": asked.feed_mm_min,
-            "limit_um": asked.circle_um,
+            "radius_mm": options.radius_mm,
+            "feed_mm_min": options.feed_mm_min,
+            "limit_um": options.circle_um,
             "found": {label: _circle_document(circle) for label, circle in found.circles.items()},
         },
         "program": _program_document(found),
         "passes": list(found.passes),
         "notices": list(found.notices),
         "latency": found.latency,
-        "limits_set": bool(asked.limits),
+        "limits_set": bool(options.limits),
         "open": list(found.open_points),
         "accepted": not found.open_points,
     }

@@ -1,11 +1,10 @@
-"""Lays the acceptance report out: the verdict, what was proven, parameters, circular test, path, signatures."""
+"""Page of the acceptance report: verdict, commissioning, parameters, circular test, path, signatures."""
 
 from collections.abc import Mapping
 from typing import Any
 
 from fdhil.cli.acceptance_findings import NO_LIMIT, AxisProof, Findings
 from fdhil.cli.doctor.latency import latency_text
-from fdhil.prediction.circular import Circular
 from fdhil.report import Page, Section, Table
 from fdhil.report.circular import polar
 from fdhil.report.history_verdict import LATEST_HEAD, latest_rows
@@ -17,15 +16,15 @@ CIRCLE_ROWS = (
     "F, farthest outside (um)", "F, farthest inside (um)",
 )  # fmt: skip
 PROOF_ROWS = (
-    "vendor, product, revision", "serial number", "offset read back", "offset of 10 um moved it by",
-    "following-error window", "stops when fdhil is silent", "commissioned (UTC)", "record, digest", "open",
+    "vendor, product, revision", "serial number", "offset read back", "motion by an offset of 10 um",
+    "following-error window", "stops without heartbeat", "commissioned (UTC)", "record, digest", "open",
 )  # fmt: skip
-SIGNATURES = ("proved by", "received by")
+SIGNATURES = ("tested by", "received by")
 LINE = "_" * 28
 
 
 def page_of(found: Findings, document: Mapping[str, Any]) -> Page:
-    """Return the page; ``document`` is what JSON says of it, for its hash."""
+    """Return the page; ``document`` is the JSON content with its hash."""
     state = "accepted" if not found.open_points else f"{len(found.open_points)} points open"
     sections = [_verdict(found), _proven(found), _parameters(found)]
     if found.plane is not None:
@@ -40,7 +39,7 @@ def page_of(found: Findings, document: Mapping[str, Any]) -> Page:
     tiles += [(f"circle, {label}, G(b)", f"{circle.both_um:.1f} um") for label, circle in found.circles.items()]
     return Page(
         f"Acceptance of {found.machine.machine.name}",
-        "What was proven of its drives, what they are, and how well they run. Nothing was sent for this report.",
+        "Commissioning, parameters and accuracy of its drives. Nothing was sent for this report.",
         tiles,
         [*sections, _signatures(found, document)],
     )
@@ -66,8 +65,8 @@ def _verdict(found: Findings) -> Section:
         rows.append([f"axis {axis}", f"{reach}, at most {section.max_acceleration_mm_s2 / 1e3:g} m/s²"])
     points = [[str(number), point] for number, point in enumerate(found.open_points, 1)]
     tables = [Table(("", "open point"), points)] if points else []
-    text = "No point is open: every drive is commissioned and identified"
-    text = "" if points else f"{text}, and every limit that was set is kept." if found.asked.limits else f"{text}."
+    text = "No open points: every drive is commissioned and identified"
+    text = "" if points else f"{text}, and all limits are kept." if found.asked.limits else f"{text}."
     if not found.asked.limits:
         text = f"{text} {NO_LIMIT.capitalize()}.".lstrip()
     return Section("The machine", text, [*tables, Table(("", "value"), rows)])
@@ -79,10 +78,10 @@ def _proven(found: Findings) -> Section:
     steps = [[axis, name, time.replace("T", " ")[:16]] for axis, proof in found.proofs.items()
              for name, time in proof.steps.items()]  # fmt: skip
     head = ("", *(f"axis {axis}" for axis in found.proofs))
-    tables = [Table(head, rows, "Each on the drive itself, by fdhil commission")]
+    tables = [Table(head, rows, "Verified on the drive by fdhil commission")]
     if steps:
-        tables.append(Table(("axis", "step", "done (UTC)"), steps, "Steps that were done"))
-    return Section("What was proven", "", tables)
+        tables.append(Table(("axis", "step", "done (UTC)"), steps, "Completed steps"))
+    return Section("Commissioning", "", tables)
 
 
 def _proof_column(proof: AxisProof) -> list[str]:
@@ -102,54 +101,51 @@ def _parameters(found: Findings) -> Section:
     tables = [Table(LATEST_HEAD, latest_rows(history, shares), f"Axis {history.axis}")
               for history in found.histories if history.rows]  # fmt: skip
     text = (
-        f"The newest published ones, identified from rapid moves; {MEANING}." if tables else "None was published yet."
+        f"The newest published parameters, identified from rapid moves; {MEANING}." if tables else "None published yet."
     )
     return Section("Parameters", text, tables)
 
 
 def _circular(found: Findings) -> Section:
-    asked = found.asked
-    columns = [_circle_cells(circle) for circle in found.circles.values()]
+    options = found.asked
+    columns = [
+        [f"{um:.2f}" for um in (*circle.deviations_um, circle.both_um, circle.hysteresis_um, *circle.radial_um)]
+        for circle in found.circles.values()
+    ]
     rows = [[what, *cells] for what, *cells in zip(CIRCLE_ROWS, *columns, strict=True)]
     whose = "identified" if found.identified else "nominal"
     pictures = [
-        (f"Circular test, {label}: radius {asked.radius_mm:g} mm", polar(circle, found.plane or ("X", "Y")))
+        (f"Circular test, {label}: radius {options.radius_mm:g} mm", polar(circle, found.plane or ("X", "Y")))
         for label, circle in found.circles.items()
     ]
     return Section(
         f"Circular test after ISO 230-4, plane {''.join(found.plane or ())}",
-        f"Radius {asked.radius_mm:g} mm, feed {asked.feed_mm_min:g} mm/min, both directions, the middle 360 degrees of "
-        f"each run; predictions with the {whose} parameters. G is what lies between two concentric circles around a "
-        "run, H how far the runs are apart at one angle, F how far they are outside (+) or inside (-) of the "
-        "programmed circle; deviations are about the least-squares centre. F holds what the NC's smoothing takes away.",
+        f"Radius {options.radius_mm:g} mm, feed {options.feed_mm_min:g} mm/min, both directions, middle 360 degrees of "
+        f"each run; predictions use the {whose} parameters. G is the distance of two concentric circles that enclose a "
+        "run, H the distance of both runs at one angle, F the deviation outside (+) or inside (-) the programmed "
+        "circle, relative to the least-squares centre. F includes the contraction by the NC's smoothing.",
         [Table(("", *found.circles), rows)],
         pictures,
     )
 
 
 def _running(found: Findings) -> Section:
-    """What was measured while it ran: the passes with the correction, what waits for an answer, how late the PC is."""
     head = ("time", "severity", "what")
     passes, notices = (
-        [[minute(n["time"]), n["severity"], n["text"]] for n in told] for told in (found.passes, found.notices)
+        [[minute(n["time"]), n["severity"], n["text"]] for n in entries] for entries in (found.passes, found.notices)
     )
     tables = [Table(head, rows, title) for rows, title in
               ((passes, "Passes with the correction"), (notices, "Open notices")) if rows]  # fmt: skip
-    late = "How late this PC is was not measured: run fdhil doctor --latency 600."
+    late = "The latency of this PC was not measured: run fdhil doctor --latency 600."
     if found.latency is not None:
         late = f"This PC, measured {minute(found.latency['time'])}: {latency_text(found.latency)}."
-    none = [what for what, rows in (("No pass was cut with the correction.", passes), ("No notice is open.", notices))
+    none = [what for what, rows in (("No pass with the correction.", passes), ("No open notices.", notices))
             if not rows]  # fmt: skip
     return Section("In operation", " ".join([*none, late]), tables)
-
-
-def _circle_cells(circle: Circular) -> list[str]:
-    values = (*circle.deviations_um, circle.both_um, circle.hysteresis_um, *circle.radial_um)
-    return [f"{value:.2f}" for value in values]
 
 
 def _signatures(found: Findings, document: Mapping[str, Any]) -> Section:
     names = (found.asked.by or LINE, LINE)
     rows = [[who, name, LINE, LINE] for who, name in zip(SIGNATURES, names, strict=True)]
-    text = f"SHA-256 of what this report says, as fdhil acceptance --json prints it: {document['sha256']}"
+    text = f"SHA-256 of the content, as printed by fdhil acceptance --json: {document['sha256']}"
     return Section("Signatures", text, [Table(("", "name", "date, place", "signature"), rows)])

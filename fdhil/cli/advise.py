@@ -1,4 +1,4 @@
-"""``fdhil advise``: where a program leaves a tolerance, why, and how fast it may run there."""
+"""``fdhil advise``: the highest feed of each line at which a program keeps a tolerance."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import click
 
 from fdhil.api.compiling import forewarn
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, CONFIG_OPTION, FILE, OutputFile, Positive, Writing
+from fdhil.cli.options import AS_JSON, CONFIG_OPTION, FROM_HISTORY, MODEL, PROGRAM, OutputFile, Positive, Writing
 from fdhil.cli.prediction import inputs
 
 if TYPE_CHECKING:
@@ -23,21 +23,18 @@ if TYPE_CHECKING:
     from fdhil.prediction.feeds import Source
     from fdhil.records import Parameters, Trajectory
 
-UNHELD = "{} lines leave the tolerance at every feed that was tried, without the correction"
+UNHELD = "{} lines leave the tolerance at every feed tried, without the correction"
 
 
 @click.command(cls=Writing)
-@click.argument("program", type=FILE, metavar="PROGRAM|DEMAND.csv")
+@PROGRAM
 @CONFIG_OPTION
-@click.option("--model", "model_path", type=FILE, help="Parameters of each axis (JSON).")
-@click.option("--from-history", is_flag=True, help="Use the newest validated parameters of the store.")
+@MODEL
+@FROM_HISTORY
+@click.option("--tolerance-um", type=Positive(), required=True, help="Largest contour error allowed, um.")
 @click.option(
-    "--tolerance-um",
-    type=Positive(),
-    required=True,
-    help="Largest contour error allowed.",
+    "--out", type=OutputFile(), help="Write PROGRAM with the feeds that keep the tolerance without the correction."
 )
-@click.option("--out", type=OutputFile(), help="Write PROGRAM with these feeds, those without the correction.")
 @AS_JSON
 @verdict
 def advise(
@@ -49,18 +46,15 @@ def advise(
     out: Path | None,
     as_json: bool,
 ) -> int:
-    """Compute the highest feed that keeps a tolerance, for each line of PROGRAM or each zone of a demand CSV.
+    """Compute the highest feed that keeps a tolerance, per line of PROGRAM or per zone of a demand CSV.
 
-    Only what leaves the tolerance as programmed is listed, lines that follow each other in one range: F as programmed
-    and as it may be (mm/min), the worst place and why, and the highest feed there with the inverse correction. All
-    these feeds together were predicted to keep the tolerance. --json lists every line; --out writes the program with
-    its F words replaced and everything else kept.
-
-    Exit codes: 0 every line can be held by some feed (with --out: also without the correction), 1 some line cannot, 2
-    wrong option, model or configuration, 3 a file cannot be read or written.
+    Lists only lines that leave the tolerance as programmed; consecutive lines form one range. Each range shows the
+    programmed and the highest feed (mm/min), the largest error with its cause, and the highest feed with the inverse
+    correction. The path is predicted with all listed feeds together. --json lists every line; --out replaces only the
+    F words of the program.
     """
     if out is not None and program.suffix.lower() == ".csv":
-        raise click.UsageError("--out writes an NC program, and a demand has no F words; give the program")
+        raise click.UsageError("--out writes F words, which a demand does not have; give the NC program")
     reference, models, config = inputs(program, config_path, model_path, from_history)
     from fdhil.correction.advised import advised, entry
 
@@ -88,7 +82,7 @@ def advise(
 
 
 def _held(advice: Advice, corrected: bool) -> bool:
-    """Whether some feed holds a stretch, without the correction or, where that counts too, with it."""
+    """Return whether some feed keeps the tolerance, without the correction or, if ``corrected``, with it."""
     ways = (advice.plain, advice.corrected) if corrected else (advice.plain,)
     return any(way is not None and way.share is not None for way in ways)
 
@@ -118,7 +112,6 @@ def _sources(
 
 
 def _telling(source: Source) -> Source:
-    """Return the source that shows on a terminal how often the path was run, and how long it is by now."""
     if not sys.stderr.isatty():
         return source
     at, trials = source.at, itertools.count(1)

@@ -1,4 +1,4 @@
-"""Prints the advice of ``fdhil advise``: lines that follow each other in one range, the worst of each by name."""
+"""Prints the result of ``fdhil advise``: consecutive lines as one range, with the worst line of each."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from fdhil.prediction.advise import Advice, Held
 
 BRACKETED = (
-    "the averages of [nc] smoothing_s did not make this demand: the lower feed holds where the NC keeps its smoothing,"
-    " the higher one if its accelerations fell with the square of the feed"
+    "this demand does not match the averages of [nc] smoothing_s: the lower feed applies if the NC keeps its smoothing,"
+    " the higher one if accelerations fall with the square of the feed"
 )
-MANY = 20  # ranges that are shown
+MANY = 20  # ranges shown
 SPREADS = (1.1, 1.5, 2.0, 4.0)  # highest to lowest feed within one range
 Range = list["Advice"]
 
@@ -29,7 +29,7 @@ def show(
     corrects: bool,
     feeds: Callable[[int], bool],
 ) -> None:
-    """Print a line per range; ``feeds`` tells whether a line of the program orders a feed at all."""
+    """Print one line per range; ``feeds`` returns whether a program line moves at a feed."""
     if not advice:
         click.echo(f"the whole path stays within {tolerance_um:g} um as programmed")
         return
@@ -45,11 +45,11 @@ def show(
     if most:
         click.echo(BRACKETED)
     if not corrects:
-        click.echo("the correction was not tried: an axis has no section [axis.X.correction]")
+        click.echo("the correction was not evaluated: an axis lacks the section [axis.X.correction]")
 
 
 def ranges(advice: Sequence[Advice], feeds: Callable[[int], bool]) -> list[Range]:
-    """Return lines that follow each other together: at feeds as near each other as leaves not too many ranges."""
+    """Group consecutive lines of similar feeds, widening the feed spread until at most ``MANY`` ranges remain."""
     found: list[Range] = []
     for spread in SPREADS:
         found = list(_runs(advice, feeds, spread))
@@ -73,12 +73,12 @@ def _runs(advice: Sequence[Advice], feeds: Callable[[int], bool], spread: float)
 
 
 def _follows(before: Advice, after: Advice, feeds: Callable[[int], bool]) -> bool:
-    """Whether no line that feeds stands between two; zones of a demand are never taken together."""
+    """Return whether no feed line lies between two lines; zones of a demand are never grouped."""
     return 0 < before.line < after.line and not any(map(feeds, range(before.line + 1, after.line)))
 
 
 def _alike(one: Advice, other: Advice) -> bool:
-    """Whether two lines have the same feed as programmed, and are both held by another one or both not."""
+    """Return whether two lines have the same programmed feed, and both or neither keep the tolerance at a lower one."""
     return one.feed_mm_min == other.feed_mm_min and (one.plain.share is None) == (other.plain.share is None)
 
 
@@ -100,7 +100,7 @@ def _show_range(one: Range, most: Mapping[float, Advice] | None) -> None:
     )
     axis, what, share = max((a.load for a in one), key=lambda load: load[2])
     if share > 1.0:
-        click.echo(f"  the drive of axis {axis} is asked for {share * 100:.0f} % of its {what} limit")
+        click.echo(f"  the drive of axis {axis} needs {share * 100:.0f} % of its {what} limit")
     other = (most or {}).get(worst.start_s, worst)
     for kind, held, hopeful in (
         ("without correction", worst.plain, other.plain),
@@ -117,14 +117,17 @@ def _span(feeds: Sequence[float]) -> str:
 
 def _told(held: Held, most: Held | None, feed_mm_min: float) -> str:
     if held.share is None:
-        left = f": {held.left_um:.1f} um are left there" if math.isfinite(held.left_um) else ""
-        with_it = f"; the others hold with it at {cut(held.run * feed_mm_min):g}" if held.run > held.tried else ""
-        return f"no feed down to {cut(held.tried * feed_mm_min):g} mm/min holds it{left}{with_it}"
+        left = f": an error of {held.left_um:.1f} um remains" if math.isfinite(held.left_um) else ""
+        with_it = (
+            f"; the other lines keep the tolerance with this one at {cut(held.run * feed_mm_min):g}"
+            if held.run > held.tried
+            else ""
+        )
+        return f"no feed down to {cut(held.tried * feed_mm_min):g} mm/min keeps the tolerance{left}{with_it}"
     hopeful = most.share * feed_mm_min if most and most.share and _hopes(held, most) else None
     more = "" if hopeful is None else f", perhaps {cut(hopeful):g}"
     return f"at most {cut(held.share * feed_mm_min):g} mm/min{more}"
 
 
 def _hopes(held: Held, most: Held | None) -> bool:
-    """Whether the higher of two feeds is worth telling."""
     return bool(most and most.share and held.share and most.share > 1.02 * held.share)

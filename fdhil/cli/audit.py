@@ -1,4 +1,4 @@
-"""``fdhil audit``: who asked the machine for what, and whether that list is as it was written."""
+"""``fdhil audit``: show the audit log and verify its integrity."""
 
 import json
 from collections.abc import Mapping
@@ -14,13 +14,15 @@ from fdhil.cli.options import AS_JSON, CONFIG
 
 @click.command()
 @CONFIG
-@click.option("--last", type=click.IntRange(min=1), default=20, show_default=True, help="How many entries to show.")
+@click.option(
+    "--last", type=click.IntRange(min=1), default=20, show_default=True, help="Number of newest entries to show."
+)
 @AS_JSON
 @verdict
 def audit(config: Path, last: int, as_json: bool) -> int:
-    """Show the audit log of CONFIG's machine, and check that no line of it was changed.
+    """Show the audit log of CONFIG's machine and verify that it was not modified.
 
-    Exit 1 when a line was changed, left out or moved, or was cut off by a power failure.
+    The log lists each request to the machine with its time, client and result.
     """
     machine = machine_config.load(config)
     from fdhil.daemon.journal import printable
@@ -42,20 +44,20 @@ def audit(config: Path, last: int, as_json: bool) -> int:
 
 def _line(number: int, entry: Mapping[str, Any], wrong: str | None) -> str:
     if wrong is not None or not isinstance(entry.get("who"), dict):
-        return f"{number:6d}  NOT AS WRITTEN  {json.dumps(entry)}"
+        return f"{number:6d}  NOT INTACT  {json.dumps(entry)}"
     who = entry["who"]
     by = f" for {entry['by']}" if entry.get("by") else ""
     what = entry.get("asked") or entry.get("answered")
-    told = ", ".join(map(str, filter(None, (entry.get("result"), entry.get("text")))))
-    result = f": {told}" if told else " (asked)"
+    outcome = ", ".join(map(str, filter(None, (entry.get("result"), entry.get("text")))))
+    result = f": {outcome}" if outcome else " (requested)"
     program = "".join(f" {entry[key]}" for key in ("axis", "program", "offer") if entry.get(key))
     return f"{number:6d}  {entry.get('time')}  {who.get('user')}{by}  {what}{program}{result}"
 
 
 def _verdict(path: Path, count: int, broken: list[int]) -> str:
     if not count:
-        return f"{path}: nothing has been asked for yet"
+        return f"{path}: no requests yet"
     if not broken:
-        return f"{path}: {count} entries, each as it was written"
-    causes = "changed, left out or moved, or cut off by a power failure; compare with the daemon's journal"
-    return f"{path}: {len(broken)} of {count} entries are not as written, the first is number {broken[0]}: {causes}"
+        return f"{path}: {count} entries, all intact"
+    causes = "changed, removed, moved, or cut off by a power failure; compare with the daemon's journal"
+    return f"{path}: {len(broken)} of {count} entries are not intact, the first is number {broken[0]}: {causes}"

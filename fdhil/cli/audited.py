@@ -1,7 +1,7 @@
-"""Has what a command does to the machine in the audit of the store, beside what the daemon is asked for.
+"""Records the actions of commands in the audit log of the store, in addition to the requests to the daemon.
 
-What moves an axis or writes to a drive is written down before it is done, and refused where that cannot be. What takes
-an offset away is done whatever the disk does, and told to the terminal where it could not be written.
+An action that moves an axis or writes to a drive is recorded first, and refused if the entry cannot be written. An
+action that removes an offset is done in any case; a failed entry is reported on the terminal.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ if TYPE_CHECKING:
     from fdhil.config import MachineConfig
 
 MOST_CHARACTERS = 500
-DISK_S = 5.0  # how long an offset stands at most because a disk hangs
+DISK_S = 5.0  # a hanging disk delays the removal of an offset by no more than this
 
 
 @contextmanager
-def audited(machine: MachineConfig, what: str, **told: str) -> Iterator[dict[str, str]]:
-    """Write who does ``what``, do it, write how it ended. StoreError where the first cannot be written: it is not done.
+def audited(machine: MachineConfig, what: str, **details: str) -> Iterator[dict[str, str]]:
+    """Record the request ``what``, run the block, then record its result.
 
-    What the block puts into the dictionary is in the last line too. Of a command that was killed the first line stays
-    alone.
+    Entries of the yielded dictionary are added to the result. A killed command leaves the request without a result.
+    Raises StoreError, before the block runs, if the request cannot be recorded.
     """
-    _append(machine, {"asked": what, **told})
-    ended = {"result": "Stopped", "text": "it did not come to its end"}
+    _append(machine, {"asked": what, **details})
+    ended = {"result": "Stopped", "text": "interrupted before its end"}
     more: dict[str, str] = {}
     try:
         yield more
@@ -41,11 +41,11 @@ def audited(machine: MachineConfig, what: str, **told: str) -> Iterator[dict[str
         ended = {"result": type(error).__name__, "text": str(error)}
         raise
     finally:
-        _try(machine, {"answered": what, **told, **ended}, what)
+        _try(machine, {"answered": what, **details, **ended}, what)
 
 
 def write_before(machine: MachineConfig, what: str) -> None:
-    """Write that ``what`` takes an offset away: where the disk refuses, or hangs, it is told and done all the same."""
+    """Record the request ``what``, which removes an offset; only warn if the disk refuses or hangs."""
     writing = Thread(target=_try, args=(machine, {"asked": what}, what), daemon=True)
     writing.start()
     writing.join(DISK_S)
@@ -54,7 +54,7 @@ def write_before(machine: MachineConfig, what: str) -> None:
 
 
 def write_after(machine: MachineConfig, what: str, answer: Mapping[str, Any]) -> None:
-    """Write how ``what`` was answered; where that cannot be written it is told."""
+    """Record the answer to ``what``; only warn if the entry cannot be written."""
     result = "done" if answer["ok"] else str(answer["code"])
     _try(machine, {"answered": what, "result": result, "text": str(answer.get("text", ""))}, what)
 

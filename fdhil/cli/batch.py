@@ -1,4 +1,4 @@
-"""Many recordings at once: analysed in this process when few, on every core when many."""
+"""Analysis of recordings: few in this process, many on every core."""
 
 import multiprocessing
 import os
@@ -21,7 +21,7 @@ from fdhil.store.accelerometer_csv import with_accelerometer
 from fdhil.store.column_map import ColumnMap
 from fdhil.store.recordings import read_recording, read_stored
 
-MANY_FILES = 16  # from here on further processes pay for their start
+MANY_FILES = 16  # above this, further processes pay for their start
 MANY_WINDOWS = 48
 CHUNK = 8
 _Numbered = tuple[int, Path]
@@ -36,11 +36,10 @@ def analyse_files(
     columns: ColumnMap | None = None,
     any_move: bool = False,
 ) -> Iterator[FileResult]:
-    """Yield the result of each recording in order, also of those that cannot be read.
+    """Yield the result of each recording in order, including those that cannot be read.
 
-    The ``machine``, where it is known, tells the rapid speed of recordings that do not say theirs, the regulators, and
-    what a recording without voltage cannot. ``progress`` is told the share of a file that each step was: a window of
-    it, or the whole.
+    ``machine`` provides the regulators, the rapid speed of recordings without one, and the parameters that a recording
+    without voltage cannot determine. ``progress`` is called with the share of a file that each step completed.
     """
     if len(paths) < MANY_FILES or _cores() < 2:
         for path in paths:
@@ -61,8 +60,8 @@ def analyse_files(
                     yield ready.pop(first)
                     first += 1
     except BrokenProcessPool:
-        text = "a process that analysed recordings was ended from outside, as when the memory is used up"
-        raise FdhilError(f"{text}; nothing is told of any: give fewer at once, or free memory") from None
+        text = "a process that analyses recordings was killed, probably for lack of memory"
+        raise FdhilError(f"{text}; no result is shown: give fewer recordings, or free memory") from None
 
 
 def _analyse_some(numbered: Sequence[_Numbered], analyse: Callable[[Path], FileResult]) -> list[FileResult]:
@@ -78,7 +77,7 @@ def analyse_file(
     columns: ColumnMap | None = None,
     any_move: bool = False,
 ) -> FileResult:
-    """Return the windows of one recording analysed, and their pool, or why it cannot be read."""
+    """Return the analysed windows of one recording and their pool, or the reason why it cannot be read."""
     try:
         recorded = read_recorded(path, accelerometer, columns)
     except FdhilError as error:
@@ -93,7 +92,7 @@ def analyse_file(
 
 
 def read_recorded(path: Path, accelerometer: Path | None, columns: ColumnMap | None) -> Recording | Window:
-    if next(os.walk(path), None) is not None:  # a folder: what is in it would be given in its place
+    if next(os.walk(path), None) is not None:  # a folder without recordings; others are expanded before
         known = ", ".join(suffixes.RECORDINGS)
         raise RecordingError(f"{path} has no recordings ({known}); give the folder that has them")
     if accelerometer is None and columns is None and (stored := read_stored(path)) is not None:
@@ -115,6 +114,6 @@ def _cores() -> int:
 
 
 def _processes() -> ProcessPoolExecutor:
-    """Return processes that are spawned, not forked: a progress display has threads. They end with this one."""
+    # spawned, not forked: a progress display has threads; the processes end with this one
     spawning = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(_cores(), spawning, initializer=end_with, initargs=(os.getpid(),))

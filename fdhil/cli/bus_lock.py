@@ -1,8 +1,8 @@
-"""Locks a bus for one owner: the place that it leads to, whatever its name, in a file that others cannot reach.
+"""Locks a bus for one owner by its physical endpoint, whatever its name, in a file that other users cannot reach.
 
-It covers every process of the same user, and root with the guard's own user. It does not cover what looks like another
-place: two addresses of one distant hub, a tunnel, two interfaces on one cable, another computer. There the guards see
-each other's heartbeat on the bus (``BusLocked``).
+The lock covers all processes of one user, and root together with the guard's user. It cannot recognise one bus behind
+two endpoints: two addresses of a remote hub, a tunnel, two interfaces on one cable, another computer. There the guards
+detect each other's heartbeat on the bus (``BusLocked``).
 """
 
 import fcntl
@@ -25,13 +25,13 @@ LOCK_NAME = "bus.lock"
 
 
 def lock_bus(bus: CanBus, transmit: socket.socket | None = None, run_directory: Path | None = None) -> IO[bytes]:
-    """Own a bus, and a run directory, until the returned file is closed or the process ends.
+    """Lock a bus and a run directory until the returned file is closed or the process ends.
 
-    ``transmit`` is the open socket; without it the config's host is looked up. DeviceError (``BusLocked``) when another
-    process has it, ConnectError when the bus cannot be found.
+    ``transmit`` is the open socket; without it the host of the configuration is resolved. Raises DeviceError
+    (``BusLocked``) if another process owns the bus, ConnectError if the bus is not found.
     """
     places = [endpoint(bus, transmit)]
-    if bus.interface == "socketcan":  # an adapter that is plugged in again has another number and the same name
+    if bus.interface == "socketcan":  # a replugged adapter has a new index and the same name
         places.append(f"interface {bus.channel} of {_here()}")
     if run_directory is not None:
         places.append(f"directory {run_directory.resolve()}")
@@ -42,7 +42,7 @@ def _locked(places: Sequence[str]) -> IO[bytes]:
     try:
         file = os.fdopen(_open(_directory()), "rb")
     except (OSError, KeyError) as error:
-        text = f"the lock of the bus cannot be made ({error}), and nothing was sent; give this user a home directory"
+        text = f"the lock of the bus cannot be created ({error}), and nothing was sent; give this user a home directory"
         raise DeviceError(str(SHARED_DIRECTORY), text) from None
     try:
         for place in places:
@@ -54,14 +54,14 @@ def _locked(places: Sequence[str]) -> IO[bytes]:
 
 
 def lock_place(bus: CanBus, what: str) -> IO[bytes]:
-    """Own a part of a bus beside the guard that owns its offsets; DeviceError (``BusLocked``), ConnectError."""
+    """Lock one function of a bus, in addition to the guard's lock. Raises DeviceError (``BusLocked``), ConnectError."""
     return _locked([f"{what} of {endpoint(bus)}"])
 
 
 def endpoint(bus: CanBus, transmit: socket.socket | None = None) -> str:
-    """Return where a bus leads to: an interface of this network namespace, or a channel behind a hub's port.
+    """Return the endpoint of a bus: an interface of this network namespace, or a channel behind a hub's port.
 
-    All addresses of this computer are one.
+    All addresses of this computer count as one.
     """
     here = _here()
     try:
@@ -87,7 +87,7 @@ def _here() -> str:
 
 
 def _is_here(address: str) -> bool:
-    """Whether an address is one of this computer: then it is also what a packet to it would come from."""
+    # the source address of a packet to a local address is that address
     found = ipaddress.ip_address(address.partition("%")[0])
     if isinstance(found, ipaddress.IPv6Address) and found.ipv4_mapped is not None:
         found = found.ipv4_mapped
@@ -95,16 +95,16 @@ def _is_here(address: str) -> bool:
         return True
     with socket.socket(socket.AF_INET if found.version == 4 else socket.AF_INET6, socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect((str(found), 9))  # sends nothing: it only asks for the route
+            probe.connect((str(found), 9))  # sends nothing, only looks up the route
         except OSError:
             return False
         return ipaddress.ip_address(probe.getsockname()[0].partition("%")[0]) == found
 
 
 def _directory() -> Path:
-    """The directory of the guard's unit where this user owns it (root: whoever does), else one in the user's home.
+    """Return the directory of the guard's unit if this user owns it (root: in any case), else one in the user's home.
 
-    Not $HOME, nor one below /tmp: the place must be the same for every process of a user, and no one else's to make.
+    Neither $HOME nor /tmp are used: all processes of a user must agree, and no other user may create it.
     """
     user = os.getuid()
     if user == 0:
@@ -114,7 +114,7 @@ def _directory() -> Path:
     home = Path(pwd.getpwuid(user).pw_dir) / ".cache" / "fdhil"
     home.mkdir(mode=0o700, parents=True, exist_ok=True)
     if not _is_ours(home, user):
-        raise PermissionError(1, "others may write there", str(home))
+        raise PermissionError(1, "others can write there", str(home))
     return home
 
 
@@ -129,13 +129,13 @@ def _is_ours(directory: Path, user: int) -> bool:
 def _open(directory: Path) -> int:
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     descriptor = os.open(directory / LOCK_NAME, flags, 0o600)
-    if os.getuid() == 0:  # what root makes must not lock the guard's own user out
+    if os.getuid() == 0:  # a file created by root must not lock out the guard's user
         os.fchown(descriptor, directory.stat().st_uid, -1)
     return descriptor
 
 
 def _lock(file: IO[bytes], place: str) -> None:
-    """Lock the one byte of the file that stands for a place, on the open file: it stays locked over an exec."""
+    """Lock the byte of the file that represents an endpoint, as an open-file lock, which survives exec."""
     byte = int.from_bytes(hashlib.sha256(place.encode()).digest()[:8], "big") >> 2
     try:
         fcntl.fcntl(file, fcntl.F_OFD_SETLK, struct.pack("hhqqi", fcntl.F_WRLCK, os.SEEK_SET, byte, 1, 0))

@@ -1,4 +1,4 @@
-"""``fdhil --cite``: how to cite fdhil and the paper whose method it follows, as CITATION.cff has it."""
+"""``fdhil --cite``: the BibTeX entries of fdhil and of its reference paper, as in CITATION.cff."""
 
 from importlib.metadata import version
 
@@ -9,7 +9,7 @@ TITLE = "fdhil: identify feed drives during rapid moves, predict the path error 
 
 
 def cite(context: click.Context, _: click.Parameter, is_wanted: bool) -> None:
-    """Print both as BibTeX, and end the program."""
+    """Print both BibTeX entries and exit."""
     if not is_wanted or context.resilient_parsing:
         return
     click.echo(f"@software{{fdhil,\n  title = {{{TITLE}}},\n  author = {{{{fdhil developers}}}},")

@@ -1,4 +1,4 @@
-"""``fdhil commission``: set the drives up step by step, and try them by moving them where the operator allows it."""
+"""``fdhil commission``: commission the drives step by step, and run a trial if the operator allows motion."""
 
 from __future__ import annotations
 
@@ -37,26 +37,24 @@ if TYPE_CHECKING:
 
 SCHEMA = "fdhil-commission-1"
 NEXT = "next: fdhil run and, in another terminal, fdhil-guard; then switch the NC on and let it make rapids"
-NEXT_UNTRIED = (
-    f"{NEXT}, which identify the drives (or fdhil commission --room BACK FORWARD, which moves the axes itself)"
-)
+NEXT_UNTRIED = f"{NEXT}, which identify the drives (or run fdhil commission --room BACK FORWARD, which moves the axes)"
 NEXT_PDOS = "next: fdhil commission"
-NEXT_STOPPED = "next: run the same command again; it continues with the step that was not finished"
-NEXT_REFUSED = "next: correct that, then run the same command again; completed steps are kept"
+NEXT_STOPPED = "next: run the same command again; it continues with the unfinished step"
+NEXT_REFUSED = "next: correct the cause, then run the same command again; completed steps are kept"
 
 
 @click.command()
 @CONFIG
-@click.option("--axis", "only", help="Commission this axis; left out: all, one after the other.")
+@click.option("--axis", "only", help="Axis to commission (default: all, one after the other).")
 @click.option("--room", nargs=2, type=float, metavar="BACK FORWARD",
-              help="How far, mm, each axis may go from where it stands: -20 200. It is then tried by a jog and rapids, "
-              "and identified; left out, you are asked, and with --yes it is not tried.")  # fmt: skip
-@click.option("--dry-run", is_flag=True, help="Say what each step does and moves, and send nothing.")
-@click.option("--again", is_flag=True, help="Do all steps anew, also those that were done with this very drive.")
+              help="Travel allowed from the present position for the trial, mm: -20 200 (default: ask; with --yes: "
+              "no trial).")  # fmt: skip
+@click.option("--dry-run", is_flag=True, help="Print the effect and the motion of each step; send nothing.")
+@click.option("--again", is_flag=True, help="Repeat all steps, including completed ones.")
 @click.option(
-    "--set-pdos", is_flag=True, help="Write the PDOs of the drives' profiles, save them in the drives; no more."
+    "--set-pdos", is_flag=True, help="Only write and save the PDO mapping of the drives' profile; nothing moves."
 )
-@click.option("--yes", is_flag=True, help="Do not ask before an axis moves, or PDOs are written.")
+@click.option("--yes", is_flag=True, help="Do not ask before an axis moves or PDOs are written.")
 @AS_JSON
 @verdict
 def commission(
@@ -69,56 +67,57 @@ def commission(
     yes: bool,
     as_json: bool,
 ) -> int:
-    """Commission the drives of CONFIG, step by step: what arming a correction asks for.
+    """Commission the drives of CONFIG, step by step, as arming requires.
 
-    The NC must be off, the axis free to move a tenth of a millimetre, and the machine's own safety functions effective.
-    Reads and compares the drive's set-up, asks, switches the drive on, moves the axis by 10 um, finds out where the
-    offset acts, proves the drive's watchdog, and writes the signed record into the store. Where --room allows it, the
-    axis is then jogged, moved as by G0, identified, and compared with what the identified model predicts; each step
-    says before what it moves. Completed steps are skipped unless the drive or the configuration changed, so a run
-    that was stopped continues where it ended. Whatever fails, also Ctrl-C, the axis is braked, the offset goes back
-    to zero and the drive is switched off. With --set-pdos nothing moves: what differs from the profile in the
-    drive's PDOs is written and saved, and that is all. Exit codes: 0 commissioned, 1 refused, by you or because the
-    drive is not set up as it must be, 2 wrong option or configuration, 3 the drive or the bus cannot be reached.
+    Before: switch the NC off, leave the axis free to move by 0.1 mm, and make sure that the machine's safety functions
+    are effective.
+
+    Compares the drive's set-up with CONFIG, asks, switches the drive on, moves the axis by 10 um, determines where the
+    offset acts, verifies the drive's watchdog, and writes a signed record to the store. With --room the axis is then
+    jogged, moved as by G0, identified, and compared with the prediction of the identified model. Each step announces
+    its motion first.
+
+    Completed steps are skipped unless the drive or the configuration changed; an interrupted run continues where it
+    ended. On any failure and on Ctrl-C the axis is braked, the offset returns to zero and the drive is switched off.
     """
     machine = machine_config.load(config)
-    # an axis of HAL pins without offsets has nothing to prove
+    # an axis of HAL pins without offsets needs no commissioning
     proven = [name for name, axis in machine.axis.items() if axis.correction is not None or axis.drive.source != "hal"]
     axes = [only] if only else proven or list(machine.axis)
     if axes[0] not in machine.axis:
         fault = ConfigFault("--axis", f"there is no axis {only}", f"one of {', '.join(machine.axis)}")
         raise ConfigError(str(config), [fault])
-    asked = Asked(room_of(room), yes, again, as_json)
+    options = Asked(room_of(room), yes, again, as_json)
     if dry_run:
-        return _tell_plan(machine, axes, asked)
+        return _tell_plan(machine, axes, options)
     done: dict[str, Any] = {}
     refused = None
     with _stopped_like_ctrl_c():
         for axis in axes:
             try:
-                done[axis] = _set_pdos(machine, axis, asked) if set_pdos else _commission_axis(machine, axis, asked)
+                done[axis] = _set_pdos(machine, axis, options) if set_pdos else _commission_axis(machine, axis, options)
             except DriveFault as fault_found:
                 refused = str(fault_found)
                 break
             except (KeyboardInterrupt, click.Abort):
-                asked.say(NEXT_STOPPED)
+                options.say(NEXT_STOPPED)
                 raise
     if as_json:
         click.echo(json.dumps({"schema": SCHEMA, "axes": done, "refused": refused}))
     if refused is not None:
         click.echo(f"refused: {refused}", err=True)
-        asked.say(NEXT_REFUSED)
+        options.say(NEXT_REFUSED)
     else:
         tried = set_pdos or all(found["trial"] is not None for found in done.values())
-        asked.say(NEXT_PDOS if set_pdos else NEXT if tried else NEXT_UNTRIED)
+        options.say(NEXT_PDOS if set_pdos else NEXT if tried else NEXT_UNTRIED)
     return int(refused is not None)
 
 
 @contextmanager
 def _stopped_like_ctrl_c() -> Iterator[None]:
-    """A terminal that closes, or a kill, must leave the drive as Ctrl-C does: braked, offset zero, switched off.
+    """Turn SIGTERM and a closed terminal into Ctrl-C: the axis is braked, the offset zeroed, the drive switched off.
 
-    Only the first of them counts: a second one must not end what brings the axis to a stand.
+    Only the first signal counts: a second one must not interrupt the braking.
     """
     from fdhil.commissioning.moving import handling
 
@@ -140,31 +139,30 @@ def _progress_of(machine: MachineConfig, axis: str) -> Progress:
     return Progress(machine.store.directory, axis, machine.store.commissioning_key)
 
 
-def _tell_plan(machine: MachineConfig, axes: list[str], asked: Asked) -> int:
-    """Say what would be done; 1 where the room is too small for it."""
+def _tell_plan(machine: MachineConfig, axes: list[str], options: Asked) -> int:
     from fdhil.report.parameter_view import minute
 
     plans: dict[str, list[dict[str, Any]]] = {}
     refused = None
     for axis in axes:
         try:
-            plans[axis] = planned(machine, axis, asked.room, not asked.yes, _progress_of(machine, axis))
+            plans[axis] = planned(machine, axis, options.room, not options.yes, _progress_of(machine, axis))
         except DriveFault as fault:
             refused = str(fault)
             break
-    if asked.quiet:
+    if options.quiet:
         click.echo(json.dumps({"schema": SCHEMA, "dry_run": True, "axes": plans, "refused": refused}))
     for axis, steps in plans.items():
-        asked.say(f"axis {axis}, nothing is sent now:")
+        options.say(f"axis {axis}, planned steps (nothing is sent now):")
         for number, step in enumerate(steps, 1):
-            done = f" Done {minute(step['done_utc'])}, kept if the drive is the same." if step["done_utc"] else ""
-            asked.say(f"  {number} of {len(steps)}, {step['step']}: {told(step['does'], step['moves'])}{done}")
+            done = f" Done {minute(step['done_utc'])}, skipped if the drive is unchanged." if step["done_utc"] else ""
+            options.say(f"  {number} of {len(steps)}, {step['step']}: {told(step['does'], step['moves'])}{done}")
     if refused is not None:
         click.echo(f"refused: {refused}", err=True)
     return int(refused is not None)
 
 
-def _commission_axis(machine: MachineConfig, axis: str, asked: Asked) -> dict[str, Any]:
+def _commission_axis(machine: MachineConfig, axis: str, options: Asked) -> dict[str, Any]:
     from fdhil.cli.bus_lock import lock_bus
     from fdhil.commissioning import steps
     from fdhil.commissioning.hal_proof import commission_hal
@@ -174,82 +172,75 @@ def _commission_axis(machine: MachineConfig, axis: str, asked: Asked) -> dict[st
     progress = _progress_of(machine, axis)
     if progress.doubt:
         click.echo(progress.doubt, err=True)
-    if asked.again:
+    if options.again:
         progress.forget()
-    if asked.room is None and not asked.yes and tried_by_moving(machine, axis):
-        asked = replace(asked, room=ask_room(axis, machine.axis[axis].unit))
-    if asked.room is not None and not hal:
-        trial_moves(machine, axis, asked.room)  # a room that is too small is refused before anything is sent
+    if options.room is None and not options.yes and tried_by_moving(machine, axis):
+        options = replace(options, room=ask_room(axis, machine.axis[axis].unit))
+    if options.room is not None and not hal:
+        trial_moves(machine, axis, options.room)  # too little room is refused before anything is sent
     bus = machine.bus[machine.axis[axis].drive.bus]
     with lock_bus(bus), audited(machine, "commission", axis=axis) as ended:  # the guard reads the record when it starts
         own = HAL_STEPS if hal else STEPS
-        total = len(own) + (len(TRIAL) if asked.room is not None and not hal else 0)
-        guide = Guide(axis, asked, own, progress, 0, total)
-        report = _asking(machine, axis, asked, guide)
+        total = len(own) + (len(TRIAL) if options.room is not None and not hal else 0)
+        guide = Guide(axis, options, own, progress, 0, total)
+        report = _asking(machine, axis, options, guide)
         if hal:
             record = commission_hal(machine, axis, report)
         else:
             record = steps.commission(machine, axis, report, progress, guide.result)
         path = save_record(record, machine.store.directory, machine.store.commissioning_key)
         ended["text"] = f"record {record.digest[:16]}"
-        asked.say(
+        options.say(
             f"axis {axis} is commissioned: moved {record.sign_test_um:+.1f} um, "
             f"{FEEDFORWARD[record.offset_in_feedforward]}, watchdog {record.watchdog}; record {path}"
         )
-        further = Guide(axis, asked, TRIAL, progress, len(own), total)
-        tried = None if hal else try_commissioned(machine, record, asked, progress, further)
+        further = Guide(axis, options, TRIAL, progress, len(own), total)
+        tried = None if hal else try_commissioned(machine, record, options, progress, further)
     return {**asdict(record), "record": str(path), "digest": record.digest, "trial": tried}
 
 
-def _asking(machine: MachineConfig, axis: str, asked: Asked, guide: Guide) -> Callable[[str], None]:
-    """Return the function that reports each step, and asks before the drive is switched on."""
+def _asking(machine: MachineConfig, axis: str, options: Asked, guide: Guide) -> Callable[[str], None]:
     guide.moves = moves_of(machine, axis)
 
     def report(step: str) -> None:
-        if step in ("enable", "move") and not asked.yes:
+        if step in ("enable", "move") and not options.yes:
             _ask(machine, axis)
         guide(step)
 
     return report
 
 
-def _set_pdos(machine: MachineConfig, axis: str, asked: Asked) -> dict[str, Any]:
+def _set_pdos(machine: MachineConfig, axis: str, options: Asked) -> dict[str, Any]:
     from fdhil.cli.bus_lock import lock_bus
     from fdhil.commissioning.master import Master
     from fdhil.commissioning.pdo_setup import set_up_pdos
     from fdhil.drivers.cia402.profile_file import load_profile
 
     profile = load_profile(machine.axis[axis].drive)
-    if not asked.yes:
-        question = (
-            f"The PDOs of drive {axis} are written as profile {profile.name} has them, and saved in it. May they?"
-        )
-        confirm(axis, question, "nothing was written; start again with --yes where nobody can be asked")
+    if not options.yes:
+        question = f"Write the PDO mapping of profile {profile.name} to drive {axis} and save it there?"
+        confirm(axis, question, "nothing was written; start again, with --yes without a terminal")
     bus = machine.bus[machine.axis[axis].drive.bus]
     with lock_bus(bus), audited(machine, "set the PDOs up", axis=axis), Master(machine, axis) as master:
         done = set_up_pdos(master)
-    written = ", ".join(done.written) or "none, all were right"
+    written = ", ".join(done.written) or "none, all match the profile"
     kept = {True: ", saved in the drive", False: ", NOT saved: lost when the drive is off", None: ""}[done.saved]
-    if not asked.quiet:
+    if not options.quiet:
         click.echo(f"axis {axis}: PDOs written: {written}{kept}")
     return {"pdos_written": list(done.written), "saved": done.saved}
 
 
 def _ask(machine: MachineConfig, axis: str) -> None:
-    """Ask before anything moves; DriveFault when the answer is no, or nobody is there to give one."""
     from fdhil.commissioning.steps import largest_move_um
 
     hal = machine.axis[axis].drive.source == "hal"
-    question = f"Now axis {axis} moves by 10 um, or by 50 um where friction holds it. Is it free to move, and may it?"
-    question = (
-        question
-        if hal
-        else (
-            f"The set-up of axis {axis} is as it must be. Now the drive is switched on and the axis moves by 10 um, "
-            f"then up to {largest_move_um(machine, axis):.0f} um to and fro. Is it free to move, and may it?"
+    question = f"Axis {axis} will move by 10 um, or by 50 um if friction holds it. Is it free to move? Start?"
+    if not hal:
+        question = (
+            f"The set-up of axis {axis} matches. The drive will be switched on and the axis will move by 10 um, then "
+            f"up to {largest_move_um(machine, axis):.0f} um back and forward. Is it free to move? Start?"
         )
-    )
     if axis[0] + "2" in machine.axis:
         question = f"{axis} is one of two drives of a gantry axis: its beam will be skewed by as much. {question}"
-    advice = "nothing was moved or written; start again when it may move, with --yes where nobody can be asked"
+    advice = "nothing was moved or written; start again when it may move, with --yes without a terminal"
     confirm(axis, question, advice)

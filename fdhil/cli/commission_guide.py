@@ -1,4 +1,4 @@
-"""Reports each step of a commissioning and its result to the operator, and asks before anything moves."""
+"""Reports the commissioning steps and their results to the operator, and asks before each motion."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from fdhil.commissioning.progress import Found, Progress, Step
     from fdhil.commissioning.strokes import Room
 
-POSITION_S = 0.2  # a position is shown so often while an axis moves
+POSITION_S = 0.2  # period of the position display while an axis moves
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What the operator asked for; ``quiet``: only the JSON document goes to stdout."""
+    """Options of ``fdhil commission``; ``quiet``: only the JSON document goes to stdout."""
 
     room: Room | None
     yes: bool
@@ -31,7 +31,7 @@ class Asked:
     quiet: bool
 
     def say(self, text: str) -> None:
-        """Show progress: on stdout, or on a terminal beside the JSON document."""
+        """Show progress on stdout, or on stderr if that is a terminal and stdout has the JSON document."""
         if not self.quiet:
             click.echo(text)
         elif sys.stderr.isatty():
@@ -39,35 +39,35 @@ class Asked:
 
 
 class Guide:
-    """Reports each step before it is done, with what it moves, or that it is kept; then its result.
+    """Announces each step with its motion, or that it is skipped, then reports its result.
 
-    Steps are counted over the whole commissioning: ``first`` precede these, of ``total``.
+    Steps are numbered over the whole commissioning: ``first`` steps precede these, ``total`` is their number.
     """
 
     def __init__(
-        self, axis: str, asked: Asked, steps: Mapping[str, str], progress: Progress, first: int, total: int
+        self, axis: str, options: Asked, steps: Mapping[str, str], progress: Progress, first: int, total: int
     ) -> None:
-        self._axis, self._asked, self._steps, self._first, self._total = axis, asked, steps, first, total
+        self._axis, self._asked, self._steps, self._first, self._total = axis, options, steps, first, total
         self.moves: dict[str, str] = {}
         self._shown_s: float | None = None
         progress.on_kept = self.kept
 
     def __call__(self, step: str) -> None:
-        """Report what is done next."""
+        """Announce the next step."""
         self._say(f"{self._head(step)}: {told(self._steps[step], self.moves[step])}")
 
     def kept(self, name: str, step: Step) -> None:
-        """Report that a step need not be done, and what it found."""
+        """Report that a completed step is skipped, with its result."""
         from fdhil.report.parameter_view import minute
 
-        self._say(f"{self._head(name)}: kept, it was done {minute(step.done_utc)}; {result_text(name, step.found)}")
+        self._say(f"{self._head(name)}: skipped, done {minute(step.done_utc)}; {result_text(name, step.found)}")
 
     def result(self, step: str, found: Found) -> None:
-        """Report what a step found."""
+        """Report the result of a step."""
         self._say(f"axis {self._axis}: {step}: {result_text(step, found)}")
 
     def show_position(self, text: str) -> None:
-        """Show where the moving axis is, on a terminal, in a line that is written over."""
+        """Show the position of the moving axis in one line of a terminal that is overwritten."""
         now_s = time.monotonic()
         if sys.stderr.isatty() and (self._shown_s is None or now_s - self._shown_s >= POSITION_S):
             click.echo(f"\raxis {self._axis} at {text:<24}", err=True, nl=False)
@@ -85,26 +85,23 @@ class Guide:
 
 
 def told(does: str, moves: str) -> str:
-    """Return what a step does, and what it moves where it moves something."""
+    """Return the description of a step with its motion, if any."""
     return does if moves == NOTHING else f"{does} Moves {moves}."
 
 
 def room_of(given: tuple[float, float] | None) -> Room | None:
-    """Return the room that was given, mm or degrees back and forward; click.BadParameter where it is none."""
+    """Return the allowed travel, back and forward, mm or degrees. Raises click.BadParameter if it is invalid."""
     from fdhil.commissioning.strokes import Room
 
     if given is None:
         return None
     back, forward = given
     if not (-1e4 <= back <= 0.0 <= forward <= 1e4):
-        text = (
-            "--room wants two numbers of mm (or degrees), 0 or less and 0 or more: how far it may go back, and forward"
-        )
-        raise click.BadParameter(text)
+        raise click.BadParameter("--room needs the travel back (0 or less) and forward (0 or more) in mm or degrees")
     return Room(back, forward)
 
 
 def confirm(axis: str, question: str, advice: str) -> None:
-    """DriveFault unless the operator says yes; ``advice`` says how things stand then, and what to do."""
+    """Ask the operator. Raises DriveFault unless confirmed; ``advice`` states the state and the next action."""
     if not agreed(question):
         raise DriveFault(f"drive {axis}", f"not confirmed; {advice}")

@@ -1,4 +1,4 @@
-"""What each step of a commissioning does and moves, in words: said before it, and all together by ``--dry-run``."""
+"""Texts of the commissioning steps: effect, motion and result of each."""
 
 from __future__ import annotations
 
@@ -11,46 +11,44 @@ if TYPE_CHECKING:
     from fdhil.config import MachineConfig
 
 STEPS: Mapping[str, str] = {
-    "listen": "Listening: the NC must be off. A bus on which nothing is heard is asked whether the drive is there; "
-    "nothing else is sent.",
+    "listen": "Listening: the NC must be off. On a silent bus the drive is queried; nothing else is sent.",
     "compare": "Reading identity, PDO mapping, scale, option codes and following-error window, and comparing them with "
-    "the config. Nothing moves.",
-    "enable": "Starting SYNC and switching the drive on, held where it stands.",
-    "sign test": "Moving the axis by +10 um with the offset 0x60B0: it must be held, added to the demand, and the "
-    "position must follow, in this direction and by this much.",
-    "feed-forward test": "Ramping the offset to and fro: does its slope reach the speed feed-forward? The correction "
-    "depends on the answer.",
-    "watchdog test": "Sending our heartbeat, then keeping it back: the drive must stop by itself, as it must when "
-    "fdhil dies.",
-    "restore": "Taking the offset to zero, switching the drive off and giving back what was changed.",
+    "the configuration.",
+    "enable": "Starting SYNC and switching the drive on at its present position.",
+    "sign test": "Moving the axis by +10 um with the offset 0x60B0: the drive must accept it and add it to the demand, "
+    "and the position must follow in direction and size.",
+    "feed-forward test": "Ramping the offset back and forward to determine whether its slope reaches the speed "
+    "feed-forward; the correction depends on it.",
+    "watchdog test": "Sending our heartbeat, then withholding it: the drive must stop by itself, as if fdhil failed.",
+    "restore": "Ramping the offset to zero, switching the drive off and restoring what was changed.",
 }
 HAL_STEPS: Mapping[str, str] = {
-    "listen": "Listening to the bridge: LinuxCNC must be on, homed and at rest.",
+    "listen": "Listening to the bridge: LinuxCNC must be on, homed and at standstill.",
     "move": "Offsetting the axis: HAL must apply it within its limits, and command and table must follow.",
-    "watchdog test": "Sending nothing more: HAL must bring the offset to zero by itself.",
+    "watchdog test": "Withholding all commands: HAL must ramp the offset to zero by itself.",
 }
 FEEDFORWARD: Mapping[bool | None, str] = {
-    True: "the speed feed-forward sees the offset",
-    False: "the speed feed-forward does not see the offset",
-    None: "whether the speed feed-forward sees the offset could not be told, and arming will be refused",
+    True: "the speed feed-forward includes the offset",
+    False: "the speed feed-forward does not include the offset",
+    None: "whether the speed feed-forward includes the offset is undetermined, and arming will be refused",
 }
 NOTHING = "nothing"
 
 
 TRIAL: Mapping[str, str] = {
-    "timing": "Starting SYNC, the drive switched off: how evenly does it come, and how soon does the drive answer?",
-    "jog": "Switching the drive on and moving the axis slowly: its way, and the unit and sign of speed, current and "
+    "timing": "Starting SYNC with the drive off, to measure the jitter of SYNC and the answer time of the drive.",
+    "jog": "Switching the drive on and moving the axis slowly: distance, and unit and sign of speed, current and "
     "voltage must be right.",
-    "test rapids": "Moving the axis as fast as G0, and listening as the daemon does; while it accelerates the motor "
-    "must take power.",
-    "restore": "Switching the drive off and giving back what was changed.",
-    "identification": "Identifying the drive from them.",
-    "acceptance": "Comparing the last two with what the identified model predicts.",
+    "test rapids": "Moving the axis at rapid speed and recording as the daemon does; the motor must draw power during "
+    "acceleration.",
+    "restore": "Switching the drive off and restoring what was changed.",
+    "identification": "Identifying the drive from these rapids.",
+    "acceptance": "Comparing the last two rapids with the prediction of the identified model.",
 }
 
 
 def result_text(step: str, found: Mapping[str, Any]) -> str:
-    """Return what a step found, in words."""
+    """Return the result of a step as text."""
     match step:
         case "compare":
             return f"{found['points']} points agree with the configuration"
@@ -59,7 +57,7 @@ def result_text(step: str, found: Mapping[str, Any]) -> str:
         case "feed-forward test":
             return FEEDFORWARD[found["in_feedforward"]]
         case "room":
-            return f"it stands at {found['stands']} and may go from {found['from']} to {found['to']}"
+            return f"position {found['stands']}, allowed travel from {found['from']} to {found['to']}"
         case "identification":
             return ", ".join(f"{name} {_figure(name, value)}" for name, value in found.items())
         case "acceptance":
@@ -80,20 +78,20 @@ def _figure(name: str, value: Mapping[str, Any]) -> str:
 
 
 def tried_by_moving(machine: MachineConfig, axis: str) -> bool:
-    """Whether an axis can be tried by moving it: not one of HAL pins, nor one drive of a gantry alone."""
+    """Return whether a trial can move an axis: not an axis of HAL pins, and not a single drive of a gantry."""
     return machine.axis[axis].drive.source != "hal" and sum(name[0] == axis[0] for name in machine.axis) == 1
 
 
 def moves_of(machine: MachineConfig, axis: str) -> dict[str, str]:
-    """Return what each of the ``STEPS`` moves, of an axis of HAL pins each of the ``HAL_STEPS``."""
+    """Return the motion of each of the ``STEPS``, or of the ``HAL_STEPS`` for an axis of HAL pins."""
     if machine.axis[axis].drive.source == "hal":
-        moved = "10 um toward plus, and 50 um where friction holds it"
+        moved = "10 um toward plus, or 50 um if friction holds it"
         return {"listen": NOTHING, "move": moved, "watchdog test": "back to where it was"}
     from fdhil.commissioning.steps import RAMPS, SIGN_TEST_UM, largest_move_um
 
     largest = largest_move_um(machine, axis)
     return dict.fromkeys(STEPS, NOTHING) | {
-        "enable": "nothing but what holding it takes",
+        "enable": "nothing, except to hold the position",
         "sign test": f"{SIGN_TEST_UM:g} um toward plus and back, by the offset",
         "feed-forward test": f"{largest:.0f} um toward plus and back, by the offset, {RAMPS // 2} times",
         "watchdog test": "nothing; the drive stops by itself and is switched on again",
@@ -101,7 +99,7 @@ def moves_of(machine: MachineConfig, axis: str) -> dict[str, str]:
 
 
 def trial_moves(machine: MachineConfig, axis: str, room: Room | None) -> dict[str, str]:
-    """Return what each step of the ``TRIAL`` moves, without a room in general; DriveFault where it is too small."""
+    """Return the motion of each step of the ``TRIAL``. Raises DriveFault if the room is too small."""
     from fdhil.commissioning.strokes import plan_jog, plan_rapid, require_single_drive
     from fdhil.commissioning.trial import RAPIDS
 
@@ -110,8 +108,8 @@ def trial_moves(machine: MachineConfig, axis: str, room: Room | None) -> dict[st
     if room is None:
         top = settings.shown(settings.rapid_speed_mm_s, "/s", "g")
         return dict.fromkeys(TRIAL, NOTHING) | {
-            "jog": "a few millimetres within the room that you give, and back",
-            "test rapids": f"within the room that you give at up to {top}, and back, {RAPIDS // 2} times",
+            "jog": "a few millimetres within the room that you allow, and back",
+            "test rapids": f"within the room that you allow at up to {top}, and back, {RAPIDS // 2} times",
         }
     jog, rapid = plan_jog(axis, settings, room), plan_rapid(axis, settings, room)
     steep = settings.shown(rapid.acceleration_mm_s2, "/s2", "g")
@@ -124,9 +122,9 @@ def trial_moves(machine: MachineConfig, axis: str, room: Room | None) -> dict[st
 def planned(
     machine: MachineConfig, axis: str, room: Room | None, asks: bool, progress: Progress
 ) -> list[dict[str, Any]]:
-    """Return all steps of an axis, what each does and moves, and when it was done if it was; nothing is sent.
+    """Return all steps of an axis with effect, motion and, if completed, time. Sends nothing.
 
-    Without a ``room`` the axis is tried where the operator ``asks`` for it.
+    Without a ``room`` the trial is included if ``asks``, because the operator will be asked for it.
     """
     done = progress.done()
     hal = machine.axis[axis].drive.source == "hal"

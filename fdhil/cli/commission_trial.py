@@ -1,4 +1,4 @@
-"""The second half of ``fdhil commission``: an axis is moved where the operator allows it, and identified."""
+"""Trial of ``fdhil commission``: moves a commissioned axis within the allowed room and identifies it."""
 
 from __future__ import annotations
 
@@ -23,30 +23,30 @@ if TYPE_CHECKING:
 
 
 def try_commissioned(
-    machine: MachineConfig, record: CommissioningRecord, asked: Asked, progress: Progress, guide: Guide
+    machine: MachineConfig, record: CommissioningRecord, options: Asked, progress: Progress, guide: Guide
 ) -> dict[str, Any] | None:
-    """Try a commissioned axis by moving it; None where nobody allowed that. DriveFault when it is refused."""
+    """Run the trial of a commissioned axis; None without a room. Raises DriveFault if it is refused."""
     from fdhil.api.compiling import forewarn
     from fdhil.commissioning.trial import Operator, try_axis
 
-    axis, room = record.axis, asked.room
+    axis, room = record.axis, options.room
     if room is None:
-        asked.say(f"axis {axis} is not tried by moving it: no --room was given, so units, signs and model are unproven")
+        options.say(f"axis {axis}: no trial, because no --room was given; units, signs and model are unproven")
         return None
     guide.moves = trial_moves(machine, axis, room)
 
     def report(step: str) -> None:
         if step == "return":
-            ask_to_move(f"back by {guide.moves[step]} to where the trial began")
+            ask_to_move(f"back by {guide.moves[step]} to the start of the trial")
             return
         if guide.moves[step] != NOTHING:
             ask_to_move(guide.moves[step])
         guide(step)
 
     def ask_to_move(way: str) -> None:
-        if not asked.yes:
-            advice = "the axis was not moved, its record holds; start again when it may move"
-            confirm(axis, f"Now axis {axis} moves {way}. Is its way free, and may it?", advice)
+        if not options.yes:
+            advice = "the axis was not moved and its record stays valid; start again when it may move"
+            confirm(axis, f"Axis {axis} will move {way}. Is its path free? Start?", advice)
 
     def result(step: str, found: Found) -> None:
         guide.result(step, found)
@@ -54,7 +54,7 @@ def try_commissioned(
             guide.moves["return"] = found["return"]
 
     def saw(question: str) -> bool | None:
-        return None if asked.yes else agreed(question)
+        return None if options.yes else agreed(question)
 
     settings = machine.axis[axis]
     operator = Operator(report, saw, result, lambda mm: guide.show_position(settings.shown(mm, form=".3f")))
@@ -66,9 +66,9 @@ def try_commissioned(
 
 
 def ask_room(axis: str, unit: str) -> Room | None:
-    """Ask how far the axis may be moved; None where nobody allows it."""
+    """Ask for the allowed travel of the axis; None if no motion is allowed."""
     question = (
-        f"How far may axis {axis} go from here, for a jog and for rapids, in {unit}? Back and forward, as: -20 200; "
+        f"How far may axis {axis} move from here, for a jog and for rapids, in {unit}? Back and forward, as: -20 200; "
         "Enter: not at all"
     )
     said = answered(question)
@@ -78,15 +78,15 @@ def ask_room(axis: str, unit: str) -> Room | None:
     try:
         back, forward = map(float, words)
     except ValueError:
-        raise DriveFault(f"drive {axis}", f"{said!r} is not two numbers; it was not moved, start again") from None
+        raise DriveFault(f"drive {axis}", f"{said!r} is not two numbers; the axis was not moved, start again") from None
     return room_of((back, forward))
 
 
 @contextmanager
 def _history(machine: MachineConfig, axis: str) -> Iterator[tuple[Known | None, Callable[[Sequence[Outcome]], None]]]:
-    """What the history knows of the axis, and how outcomes get into it.
+    """Yield the history of the axis and a function that stores outcomes.
 
-    Beside a running daemon nothing is written: it hears the rapids itself.
+    While a daemon runs nothing is stored: it records the rapids itself.
     """
     from fdhil.daemon.lock import BusLocked, sole_owner
     from fdhil.daemon.outcome_store import OutcomeStore

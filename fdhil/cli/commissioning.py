@@ -1,4 +1,4 @@
-"""``fdhil scan`` and ``check``: list a bus, and compare it with the config. Nothing moves."""
+"""``fdhil scan`` and ``check``: list the nodes of a bus, and compare them with the configuration. Nothing moves."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from fdhil.commissioning.void import Mark
     from fdhil.config import MachineConfig
 
-TellGuard = Callable[[Mapping[str, str]], Sequence[Mapping[str, str]] | None]
+ReportToGuard = Callable[[Mapping[str, str]], Sequence[Mapping[str, str]] | None]
 SCAN_HEAD = ("node\naxis", "NMT state\nheartbeat", "device\nprofile", "vendor\nproduct", "revision\nserial", "EDS")
 STATES: Mapping[bool | None, tuple[str, str]] = {
     True: ("ok", "green"),
@@ -36,14 +36,13 @@ STATES: Mapping[bool | None, tuple[str, str]] = {
 @click.command()
 @CONFIG
 @click.option("--eds", "places", multiple=True, type=FILE,
-              help="EDS or DCF file, or a folder of them; left out: the folder of CONFIG.")  # fmt: skip
+              help="EDS or DCF file, or folder of such files (default: the folder of CONFIG).")  # fmt: skip
 @AS_JSON
 def scan(config: Path, places: tuple[Path, ...], as_json: bool) -> None:
-    """List the nodes on CONFIG's CAN buses: node-ID, identity, device name, NMT state, heartbeat, matching EDS.
+    """List the nodes on CONFIG's CAN buses: identity, name, NMT state, heartbeat, matching EDS.
 
-    Listens for some seconds and then only reads, by SDO. Where an NC runs the bus (SYNC, NMT commands, set-points or
-    SDO requests are heard) nothing at all is sent, and the list holds what was heard. Exit codes: 0 something was
-    found, 2 wrong option or configuration, 3 a bus cannot be reached or nothing is on it.
+    Listens for some seconds, then reads by SDO. If an NC runs the bus (SYNC, NMT commands, set-points or SDO requests
+    are received), nothing is sent, and the list contains only what was received.
     """
     machine = machine_config.load(config)
     from fdhil.commissioning.scan import scan_bus  # late: --help imports nothing heavy
@@ -51,7 +50,7 @@ def scan(config: Path, places: tuple[Path, ...], as_json: bool) -> None:
     descriptions = _descriptions(places, config.parent)
     scans = []
     for name in machine.bus:
-        print_progress(f"listening on bus {name}, then asking the nodes")
+        print_progress(f"listening on bus {name}, then querying the nodes")
         scans.append(scan_bus(name, machine, descriptions))
     if as_json:
         click.echo(json.dumps({"schema": "fdhil-scan-1", "buses": [asdict(found) for found in scans]}))
@@ -60,7 +59,7 @@ def scan(config: Path, places: tuple[Path, ...], as_json: bool) -> None:
 
 
 def _descriptions(places: Sequence[Path], folder: Path) -> list[Description]:
-    """Read the EDS files; one that was named must be readable, of those that only lie there it is told."""
+    # a named file must be readable; an unreadable one in the default folder is only reported
     from fdhil.commissioning.scan import read_descriptions
 
     found, faults = read_descriptions(places or [folder])
@@ -80,12 +79,12 @@ def _show_scans(scans: Sequence[BusScan]) -> None:
 
     out = open_console()
     for found in scans:
-        nc = f"an NC runs it ({found.master} heard), so no node was asked" if found.master else "no NC is heard"
+        nc = f"an NC runs it ({found.master} received), so no node was queried" if found.master else "no NC is active"
         period = f", SYNC every {found.sync_period_s * 1e3:.3f} ms" if found.sync_period_s else ""
         out.print(Text(f"bus {found.bus}: {nc}{period}; {len(found.nodes)} nodes"))
         table = Table(*SCAN_HEAD, box=box.SIMPLE_HEAD, pad_edge=False)
         for node in found.nodes:
-            table.add_row(*map(Text, _node_row(node, "not asked" if found.master else "no answer")))
+            table.add_row(*map(Text, _node_row(node, "not queried" if found.master else "no answer")))
         out.print(table)
         for node in found.nodes:
             for emergency in node.emergencies:
@@ -93,18 +92,18 @@ def _show_scans(scans: Sequence[BusScan]) -> None:
 
 
 def _node_row(node: Node, unanswered: str) -> list[str]:
-    """Return the cells of a node, two figures above each other in most, so that a row fits 80 columns."""
+    """Return the cells of a node, most with two lines, so that a row fits 80 columns."""
     period = node.heartbeat_s or (node.answers.heartbeat_s if node.answers else None)
     beat = f"{period * 1e3:.0f} ms" if period else "none"
-    heard = [f"{node.node_id}\n{node.axis or ''}", f"{node.nmt or 'unknown'}\n{beat}"]
+    seen = [f"{node.node_id}\n{node.axis or ''}", f"{node.nmt or 'unknown'}\n{beat}"]
     if node.answers is None:
-        return [*heard, unanswered, "", "", ""]
-    said, who = node.answers, node.answers.identity
-    number = said.device_type & 0xFFFF
+        return [*seen, unanswered, "", "", ""]
+    answers, who = node.answers, node.answers.identity
+    number = answers.device_type & 0xFFFF
     profile = f"CiA {number}" if number else "none"
-    eds = f"{said.eds.file}\n({said.eds.fit})" if said.eds else "none fits"
+    eds = f"{answers.eds.file}\n({answers.eds.fit})" if answers.eds else "no match"
     ids = (f"{who.vendor_id:08X}\n{who.product_code:08X}", f"{who.revision:08X}\n{who.serial}")
-    return [*heard, f"{said.name or 'unnamed'}\n{profile}", *ids, eds]
+    return [*seen, f"{answers.name or 'unnamed'}\n{profile}", *ids, eds]
 
 
 @click.command()
@@ -112,12 +111,10 @@ def _node_row(node: Node, unanswered: str) -> list[str]:
 @AS_JSON
 @verdict
 def check(config: Path, as_json: bool) -> int:
-    """Compare the drives on the bus with CONFIG: identity, mapping, scales, cycle, rapid signal, sensors.
+    """Compare the drives on the bus with CONFIG: identity, PDO mapping, scales, cycle, rapid signal, sensors.
 
-    Each point is ok, differs (with what was expected, what was found and what to do), or could not be compared. Only
-    listens and reads; where an NC runs the bus it only listens, and what belongs to the NC's SDO channel is not
-    compared. Exit codes: 0 nothing differs, 1 something does, 2 wrong option or configuration, 3 a bus cannot be
-    reached.
+    Each point is ok, differs (with expected value, found value and next action), or was not compared. Only listens and
+    reads. If an NC runs the bus, it only listens, and points that need an SDO request are not compared.
     """
     machine = machine_config.load(config)
     from fdhil.commissioning.config_check import check_machine
@@ -136,11 +133,11 @@ def check(config: Path, as_json: bool) -> int:
 
 
 def _tell_compared(
-    machine: MachineConfig, found: Sequence[Place], tell: TellGuard, marks: Mapping[str, Mark | None]
+    machine: MachineConfig, found: Sequence[Place], tell: ReportToGuard, marks: Mapping[str, Mark | None]
 ) -> None:
-    """Drives that are as they were commissioned have their records hold again, others void; a running guard is told.
+    """Confirm the records of drives that match their commissioning, void the others, and inform a running guard.
 
-    What was seen against a drive since it was compared stays: in the guard, and where a mark is not as in ``marks``.
+    A doubt that arose after the comparison remains: in the guard, and in a mark that differs from ``marks``.
     """
     from fdhil.commissioning.compare import POINT
     from fdhil.commissioning.void import confirm_record, is_void, void_record
@@ -159,21 +156,21 @@ def _tell_compared(
     for each in refused:
         advice = "run fdhil check again; where it is refused again, stop fdhil-guard and start it again"
         click.echo(f"{each['code']}: {each['text']}; {advice}", err=True)
-    if not all(each["axis"] for each in refused):  # the guard has taken nothing of it
+    if not all(each["axis"] for each in refused):  # the guard accepted none of it
         return
     for axis in {axis for axis, digest in seen.items() if digest} - {each["axis"] for each in refused}:
         confirm_record(directory, axis, marks[axis])
         if is_void(directory, axis):
-            text = "something was seen against it since it was compared, its record stays void"
+            text = "its drive changed again after the comparison, so its record stays void"
             click.echo(f"RecordVoid: axis {axis}: {text}; run fdhil check again", err=True)
 
 
 @contextmanager
-def _guard(machine: MachineConfig) -> Iterator[TellGuard]:
-    """Ask a running guard how often each drive was touched, and give what tells it which drives were compared since.
+def _guard(machine: MachineConfig) -> Iterator[ReportToGuard]:
+    """Read from a running guard how often each drive was touched, and yield a function that reports the comparison.
 
-    That returns what the guard refuses, None when it went before it could answer. The connection is held meanwhile: a
-    guard that is started anew has not heard what this one did.
+    That function returns the refusals of the guard, or None if the guard ended before it could answer. The connection
+    stays open meanwhile, because a restarted guard would not know the earlier counts.
     """
     from fdhil.arming.guard_client import GuardClient
     from fdhil.arming.token import operator_token
@@ -182,7 +179,7 @@ def _guard(machine: MachineConfig) -> Iterator[TellGuard]:
         try:
             return guard.compared(token, seen, touched).get("refused", []) if touched is not None else []
         except DeviceError as error:
-            click.echo(f"the guard was not told, and records that are void stay so: {error}", err=True)
+            click.echo(f"the guard could not be informed; void records stay void: {error}", err=True)
             return None
 
     directory, touched = machine.guard_directory, None
@@ -193,7 +190,7 @@ def _guard(machine: MachineConfig) -> Iterator[TellGuard]:
                 guard = held.enter_context(GuardClient(directory))
                 touched = guard.touched(token)
             except DeviceError as error:
-                click.echo(f"the guard is not told: {error}", err=True)
+                click.echo(f"the guard could not be informed: {error}", err=True)
         yield tell
 
 
@@ -243,7 +240,6 @@ def _show_check(found: Sequence[Place]) -> None:
 
 
 def _open_points(found: Sequence[Place]) -> dict[tuple[str, str, str], list[str]]:
-    """The points that could not be compared, by place and reason."""
     points: dict[tuple[str, str, str], list[str]] = {}
     for place, finding in found:
         if finding.ok is None:

@@ -1,4 +1,4 @@
-"""``fdhil compare``: two measured passes, models or recordings, before and after a change."""
+"""``fdhil compare``: compare two passes, models or recordings, before and after a change."""
 
 import json
 import math
@@ -18,7 +18,7 @@ SCHEMA = "fdhil-compare-1"
 REFERENCE = "_reference_mm"
 ACTUAL = ("_table_mm", "_predicted_mm")  # of a trace of fdhil sim, of fdhil predict --out
 Values = Mapping[str, Mapping[str, Mapping[str, Any]]]
-"""Axis, parameter, then value, low and high of its 95 % interval (None where it has none)."""
+"""Axis, parameter, then value, low and high of its 95 % interval (None if unknown)."""
 
 
 @click.command()
@@ -28,15 +28,20 @@ Values = Mapping[str, Mapping[str, Mapping[str, Any]]]
 def compare(before: Path, after: Path, as_json: bool) -> None:
     """Compare two passes, models or recordings, BEFORE and AFTER a change.
 
-    A pass is a CSV with X_reference_mm and X_table_mm or X_predicted_mm: a trace of fdhil sim, or what fdhil predict
-    --out wrote. Of passes the contour error is compared, the distance of the table from the programmed path, as fdhil
-    status, predict and correct measure it. Of models (.json) and recordings the parameters are compared.
+    A pass is a CSV with X_reference_mm and X_table_mm or X_predicted_mm, written by fdhil sim --trace or fdhil predict
+    --out. Passes are compared by contour error, the distance of the table from the programmed path. Models (.json) and
+    recordings are compared by their parameters.
     """
     kinds = [_kind(path) for path in (before, after)]
     if kinds[0] != kinds[1]:
-        raise click.UsageError(f"{before} is a {kinds[0]}, {after} a {kinds[1]}: give two of one kind")
-    document = {"schema": SCHEMA, "kind": kinds[0]}
-    document |= _passes(before, after) if kinds[0] == "pass" else _models(kinds[0], before, after)
+        raise click.UsageError(f"{before} is a {kinds[0]}, {after} a {kinds[1]}; give two files of one kind")
+    document: dict[str, Any] = {"schema": SCHEMA, "kind": kinds[0]}
+    if kinds[0] == "pass":
+        found = {"before": read_pass(before), "after": read_pass(after)}
+        old_um, new_um = (found[when]["contour"]["rms_um"] for when in ("before", "after"))
+        document |= {**found, "gain": old_um / new_um if new_um > 0.0 else None}
+    else:
+        document |= _models(kinds[0], before, after)
     if as_json:
         click.echo(json.dumps(document, allow_nan=False))
     else:
@@ -55,14 +60,8 @@ def _kind(path: Path) -> str:
     return "recording"
 
 
-def _passes(before: Path, after: Path) -> dict[str, Any]:
-    found = {"before": read_pass(before), "after": read_pass(after)}
-    left_um = found["after"]["contour"]["rms_um"]
-    return {**found, "gain": found["before"]["contour"]["rms_um"] / left_um if left_um > 0.0 else None}
-
-
 def read_pass(path: Path) -> dict[str, Any]:
-    """Return the errors of a pass, um: of the contour, and of each axis from its reference. RecordingError."""
+    """Return contour error and axis errors of a pass, um. Raises RecordingError."""
     import numpy as np
 
     from fdhil.csv_text import read_csv_text
@@ -103,7 +102,7 @@ def _models(kind: str, before: Path, after: Path) -> dict[str, Any]:
     first, second = read(before), read(after)
     if not first.keys() & second.keys():
         what = f"{before} is of axis {', '.join(first)}, {after} of {', '.join(second)}"
-        raise click.UsageError(f"{what}: nothing in them can be compared")
+        raise click.UsageError(f"{what}; they have no axis in common")
     parameters = {
         axis: {
             name: {
@@ -144,7 +143,7 @@ def _recording_values(path: Path) -> Values:
     result = analyse_file(path, Identification())
     if result.axis is None or result.pooled is None or not result.verdict.accepted:
         why = "; ".join(map(str, result.verdict.reasons)) or "no rapid move was found in it"
-        raise RecordingError(f"{path} gives no validated parameters: {why}; see fdhil identify {path}")
+        raise RecordingError(f"no validated parameters from {path}: {why}; see fdhil identify {path}")
     pooled = result.pooled
     values = {}
     for name in PARAMETERS:

@@ -1,7 +1,7 @@
-"""Asks the operator before anything is sent.
+"""Prompts the operator before anything is sent.
 
-While a question waits for its answer an NC may be switched on. So an answer is passed on only when the buses have been
-listened to for a while after it; whoever sends then is refused by the bus (:mod:`fdhil.commissioning.bus_watch`).
+An NC may be switched on while a prompt waits. So an answer takes effect only after the buses were monitored for a
+while; sending is then refused by :mod:`fdhil.commissioning.bus_watch` if another master is active.
 """
 
 import sys
@@ -9,11 +9,11 @@ import time
 
 import click
 
-LOOK_S = 0.25  # SYNC of any NC comes meanwhile
+LOOK_S = 0.25  # longer than any NC's SYNC period
 
 
 def agreed(question: str) -> bool:
-    """Whether the operator says yes; where nobody is there to be asked, nobody does."""
+    """Return whether the operator confirms; False if standard input has ended."""
     try:
         yes = click.confirm(question, err=True)
     except click.Abort:
@@ -25,7 +25,7 @@ def agreed(question: str) -> bool:
 
 
 def answered(question: str) -> str:
-    """Return what the operator answers, in one line; empty where nobody is there to be asked."""
+    """Return the operator's answer, one line; empty if standard input has ended."""
     try:
         answer = str(click.prompt(question, default="", show_default=False, err=True))
     except click.Abort:
@@ -37,5 +37,5 @@ def answered(question: str) -> str:
 
 
 def listen_again() -> None:
-    """Give the threads that listen to open buses time to hear an NC."""
+    """Wait until the threads that monitor the open buses would have detected an NC."""
     time.sleep(LOOK_S)

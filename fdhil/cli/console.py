@@ -1,4 +1,4 @@
-"""The terminal, as rich writes to it: no text from outside can steer it."""
+"""A rich console on which foreign text cannot control the terminal."""
 
 from collections.abc import Iterable
 
@@ -9,10 +9,9 @@ from fdhil.cli.terminal_text import without_controls
 
 
 class PrintableConsole(Console):
-    """A console that shows control characters of a text as a mark, one column wide.
+    """A console that replaces control characters of texts, such as names of machines, programs, files and devices.
 
-    Names of machines, programs, files and devices come from outside. Colours and the cursor are rich's own business: it
-    writes their sequences later than this, or marks them as control segments.
+    Colours and cursor movement are unaffected: rich writes their sequences later or as control segments.
     """
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:

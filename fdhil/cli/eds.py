@@ -1,4 +1,4 @@
-"""``fdhil eds``: what fdhil can and cannot do with a drive, by its maker's EDS or DCF file."""
+"""``fdhil eds``: capabilities of a drive with fdhil, from its EDS or DCF file."""
 
 from __future__ import annotations
 
@@ -29,15 +29,16 @@ MOST_NAMED = 6
 
 @click.command()
 @click.argument("file", type=FILE)
-@click.option("--profile", "name", help="Judge by this profile, a packaged name or a TOML file; left out: its maker's.")
+@click.option(
+    "--profile", "name", help="Profile to assess with: a packaged name or a TOML file (default: the vendor's)."
+)
 @AS_JSON
 @verdict
 def eds(file: Path, name: str | None, as_json: bool) -> int:
-    """Show what fdhil can and cannot do with the drive that FILE, an EDS or DCF, describes, and why.
+    """Assess a drive from its EDS or DCF FILE: show what fdhil can do with it, and why.
 
-    Suggests a profile by the maker, and the PDOs to set up; names the objects that may be a motor voltage, a DC link or
-    a current. Nothing is sent. An EDS is what the maker says: the drive itself may differ. Exit codes: 0 it can be
-    listened to, 1 it cannot, 2 wrong option or profile, 3 the file cannot be read.
+    Suggests a profile for the vendor and the PDOs to set up. Lists the objects that may be a motor voltage, a DC link
+    or a current. Nothing is sent. The drive itself may differ from its EDS.
     """
     from fdhil.drivers.cia402.abilities import abilities, named_alike, suggest_profile  # late: --help imports nothing
     from fdhil.drivers.cia402.device import read_device
@@ -52,11 +53,11 @@ def eds(file: Path, name: str | None, as_json: bool) -> int:
     suggested = suggest_profile(device)
     profile = read_profile(name or suggested, file)
     found = abilities(device, profile)
-    alike = {what: named_alike(device, what) for what in ("voltage", "dc_link", "current")}
+    candidates = {what: named_alike(device, what) for what in ("voltage", "dc_link", "current")}
     if as_json:
-        click.echo(json.dumps(_document(device, profile, suggested, found, alike)))
+        click.echo(json.dumps(_document(device, profile, suggested, found, candidates)))
     else:
-        _show(device, profile, suggested, found, alike)
+        _show(device, profile, suggested, found, candidates)
     return int(any(ability.what == "listen" and ability.answer == "no" for ability in found))
 
 
@@ -65,7 +66,7 @@ def _document(
     profile: DriveProfile,
     suggested: str,
     found: Sequence[Ability],
-    alike: Mapping[str, Sequence[DeviceObject]],
+    candidates: Mapping[str, Sequence[DeviceObject]],
 ) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
@@ -85,15 +86,15 @@ def _document(
         "suggested_profile": suggested,
         "notes": [*profile.notes, *device.doubts],
         "abilities": [asdict(ability) for ability in found],
-        "named_alike": {what: [_object(at) for at in objects] for what, objects in alike.items()},
+        "named_alike": {what: [_object(at) for at in objects] for what, objects in candidates.items()},
         "pdos": [_pdo(spec) for spec in (*profile.rpdos, *profile.tpdos)],
     }
 
 
 def _object(at: DeviceObject) -> dict[str, Any]:
     in_tpdo = "yes" if at.in_tpdo else "perhaps" if at.perhaps_in_tpdo else "no"
-    said = {"index": at.key[0], "sub": at.key[1], "name": at.name, "bits": at.bits, "signed": at.signed}
-    return said | {"access": at.access, "in_tpdo": in_tpdo}
+    entry = {"index": at.key[0], "sub": at.key[1], "name": at.name, "bits": at.bits, "signed": at.signed}
+    return entry | {"access": at.access, "in_tpdo": in_tpdo}
 
 
 def _pdo(spec: PdoSpec) -> dict[str, Any]:
@@ -112,7 +113,7 @@ def _show(
     profile: DriveProfile,
     suggested: str,
     found: Sequence[Ability],
-    alike: Mapping[str, Sequence[DeviceObject]],
+    candidates: Mapping[str, Sequence[DeviceObject]],
 ) -> None:
     from rich import box
     from rich.table import Table
@@ -125,18 +126,18 @@ def _show(
     out.print(Text(f"{device.file}: {who}, vendor {device.vendor_id:08X}, product {device.product_code:08X}"))
     if len(device.axes) > 1:
         others = ", ".join(map(str, device.axes[1:]))
-        out.print(Text(f"it has axes {others} besides: set drive.logical_axis for these"), soft_wrap=True)
+        out.print(Text(f"it also has axes {others}: set drive.logical_axis for these"), soft_wrap=True)
     by = "suggested" if profile.name == suggested else f"{suggested} is suggested"
     title = f" ({profile.title})" if profile.title else ""
-    out.print(Text(f"judged by profile {profile.name}{title}; {by}"), soft_wrap=True)
+    out.print(Text(f"assessed with profile {profile.name}{title}; {by}"), soft_wrap=True)
     table = Table("", "", "why", box=box.SIMPLE_HEAD, pad_edge=False)
     for ability in found:
         why = f"{ability.why}; {ability.advice}" if ability.advice else ability.why
         table.add_row(Text(ability.what), Text(ability.answer, COLOURS[ability.answer]), Text(why))
     out.print(table)
-    for what, objects in alike.items():
+    for what, objects in candidates.items():
         if objects:
-            out.print(Text(f"by its name may be {CANDIDATES[what]}: {_named(objects)}"), soft_wrap=True)
+            out.print(Text(f"by name, may be {CANDIDATES[what]}: {_named(objects)}"), soft_wrap=True)
     for note in (*profile.notes, *device.doubts) if device.is_drive else device.doubts:
         out.print(Text(f"note: {note}"), soft_wrap=True)
     _show_pdos(out, profile if device.is_drive else None)

@@ -1,4 +1,4 @@
-"""Which way a file goes from one format to another: a recording, or a log of the bus."""
+"""Conversion of recordings and bus logs between file formats."""
 
 from pathlib import Path
 from typing import Any
@@ -14,15 +14,15 @@ from fdhil.store.recordings import read_table
 
 
 def export_file(recording: Path, out: Path, format_name: str | None, columns: Path | None) -> dict[str, Any]:
-    """Write ``recording`` to ``out`` and return what ``--json`` tells of it; click.BadParameter for what cannot be."""
+    """Write ``recording`` to ``out``; return the JSON document. Raises click.BadParameter for an invalid format."""
     suffix = out.suffix.lower()
     name = format_name or suffixes.RECORDINGS.get(suffix) or suffixes.BUS_LOGS.get(suffix) or "csv"
     is_log = recording.suffix.lower() in suffixes.BUS_LOGS
     if is_log != (name in suffixes.BUS_LOGS.values()):
         what, others = "a recording", [*tables.RECORDING_FORMATS]
         if is_log:
-            what, others = "a log of the bus", [*suffixes.BUS_LOGS.values()]
-        raise click.BadParameter(f"{recording} is {what}, which becomes {', '.join(others)}", param_hint="--format")
+            what, others = "a bus log", [*suffixes.BUS_LOGS.values()]
+        raise click.BadParameter(f"{recording} is {what}, which converts to {', '.join(others)}", param_hint="--format")
     if is_log:
         from fdhil.drivers.can.bus_log import converted_log
 

@@ -1,10 +1,11 @@
-"""Turns an error into one sentence, or one JSON document, and an exit code."""
+"""Converts errors of commands to one sentence or one JSON document, and an exit code."""
 
 import contextlib
 import functools
 import io
 import json
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -13,6 +14,7 @@ from typing import Any, ParamSpec, TextIO, TypeVar
 
 import click
 
+from fdhil.cli.epilogs import read_epilog
 from fdhil.cli.terminal_text import without_controls
 from fdhil.errors import ConfigError, ConfigFault, FdhilError
 
@@ -20,23 +22,35 @@ SCHEMA = "fdhil-error-1"
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
 STOPPED = 130
+SURROGATES = re.compile("[\ud800-\udfff]")  # stand for bytes that are not text
 STANDARD_ERROR = 2
 WRONG_CALL = 2
 TROUBLE = 3
-COMPLETION = "_FDHIL_COMPLETE"  # what a shell asks click by for its completion; fdhil runs no command then
+COMPLETION = "_FDHIL_COMPLETE"  # set by a shell that requests completions; no command runs then
 NO_CACHE = (
-    "compiled code can be kept neither beside fdhil nor in the home of this user; nothing was started; "
-    "set NUMBA_CACHE_DIR to a folder that this user may write"
+    "compiled code can be cached neither next to fdhil nor in this user's home; nothing was started; "
+    "set NUMBA_CACHE_DIR to a folder that this user can write"
 )
 
 
 class SuggestingGroup(click.Group):
-    """A group that names the commands whose spelling is close to an unknown one."""
+    """A group that adds the epilog to each command, and suggests the command closest in spelling to an unknown one."""
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Return one command with its epilog, or None if the name is unknown."""
+        command = self.find_command(ctx, cmd_name)
+        if command is not None and command.epilog is None:
+            command.epilog = read_epilog(cmd_name if self.name == "cli" else f"{self.name} {cmd_name}")
+        return command
+
+    def find_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Return one command, or None if the name is unknown."""
+        return super().get_command(ctx, cmd_name)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Return the command that the arguments begin with; NoSuchCommand."""
+        """Return the command named by the first argument. Raises NoSuchCommand with suggestions."""
         try:
             return super().resolve_command(ctx, args)
         except click.NoSuchCommand as error:
@@ -44,10 +58,10 @@ class SuggestingGroup(click.Group):
 
 
 def run_safely(command: click.Command) -> int:
-    """Run a click command and return the exit code; errors are told on stderr, with ``--json`` on stdout."""
-    if broken := next((each for each in sys.argv[1:] if not _is_text(each)), None):
-        text = f"{broken!a} is no text in this computer's encoding, {sys.getfilesystemencoding()}"
-        return tell("BadParameter", f"{text}; rename the file, or write the word anew", WRONG_CALL)
+    """Run a click command and return its exit code; report errors on stderr, or with ``--json`` on stdout."""
+    if broken := next((each for each in sys.argv[1:] if SURROGATES.search(each)), None):
+        text = f"{broken!a} is not valid text in this computer's encoding, {sys.getfilesystemencoding()}"
+        return tell("BadParameter", f"{text}; rename the file, or retype the argument", WRONG_CALL)
     try:
         result = command.main(standalone_mode=False)
         sys.stdout.flush()
@@ -66,33 +80,24 @@ def run_safely(command: click.Command) -> int:
         _drop(sys.stdout)
         if isinstance(error, SystemExit) and COMPLETION in os.environ:
             return int(error.code or 0)
-        return 0  # whoever read the answer has seen enough of it; click and rich raise SystemExit then
+        return 0  # the reader closed the pipe; click and rich raise SystemExit then
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
         text = f"{place}{error.strerror or error}; nothing more was done, check the disk, the path and its rights"
         tell(type(error).__name__, text, TROUBLE)
-        _drop(sys.stdout)  # it may be what takes nothing
+        _drop(sys.stdout)  # stdout may be the stream that fails
         return TROUBLE
     except RuntimeError as error:
         if "no locator available" not in str(error):  # numba's words
             raise
         return tell("NoCache", NO_CACHE, TROUBLE)
     except MemoryError:
-        return tell("MemoryError", "the memory is used up; give a smaller file, or free memory", TROUBLE)
+        return tell("MemoryError", "out of memory; give a smaller file, or free memory", TROUBLE)
     return int(result or 0)
 
 
-def _is_text(argument: str) -> bool:
-    """Whether an argument can be told, kept and shown: bytes that are no letters cannot."""
-    try:
-        argument.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
-
-
 def verdict(command: Callable[Given, Result]) -> Callable[Given, Result]:
-    """Mark a command whose exit code 0 is a yes: where nobody took its answer, it is 3."""
+    """Decorate a command whose exit code 0 is an affirmative answer: exit 3 if the output could not be delivered."""
 
     @functools.wraps(command)
     def run(*given: Given.args, **options: Given.kwargs) -> Result:
@@ -108,10 +113,10 @@ def verdict(command: Callable[Given, Result]) -> Callable[Given, Result]:
 
 
 def prepare_streams() -> None:
-    """Make standard output and error take whatever is said: a terminal without ± shows ?, a closed one nothing.
+    """Make the standard streams safe: a terminal without ± shows ?, a closed stream becomes /dev/null.
 
-    What was closed is /dev/null from here on, also in programs started from here: a bus that was opened in its place
-    would be sent what is said. A closed standard input is one that is at its end.
+    Otherwise a bus opened later would get the descriptor of a closed stream, and messages would be sent on the bus.
+    Child processes inherit the replacement. A closed standard input reads as ended.
     """
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= STANDARD_ERROR:
         os.set_inheritable(descriptor, True)
@@ -119,13 +124,13 @@ def prepare_streams() -> None:
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         stream = getattr(sys, name)
         if stream is None:
-            setattr(sys, name, Path(os.devnull).open(mode))  # noqa: SIM115 (for as long as the process lives)
+            setattr(sys, name, Path(os.devnull).open(mode))  # noqa: SIM115 (open until the process ends)
         elif mode == "w" and isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
 
 
 def tell(kind: str, text: str, code: int, details: dict[str, Any] | None = None) -> int:
-    """Tell an error of class ``kind`` to whoever called, a person or a program; return its exit code."""
+    """Report an error of class ``kind`` as text or JSON; return its exit code."""
     if wants_json():
         document = {"schema": SCHEMA, "error": {"class": kind, "text": text} | (details or {})}
         with contextlib.suppress(OSError):
@@ -136,23 +141,22 @@ def tell(kind: str, text: str, code: int, details: dict[str, Any] | None = None)
 
 
 def wants_json(arguments: Sequence[str] | None = None) -> bool:
-    """Whether the command was asked for JSON; known also where its options could not be read."""
+    """Return whether JSON output is requested, even if the options could not be parsed."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     return "--json" in (given[: given.index("--")] if "--" in given else given)
 
 
 def error_document(error: FdhilError) -> dict[str, Any]:
-    """Return what the ``error`` of a JSON document says."""
+    """Return the ``error`` entry of a JSON document."""
     return {"class": type(error).__name__, "text": str(error)} | _details(error)
 
 
 def _details(error: FdhilError) -> dict[str, Any]:
-    """Return what an error knows beside its sentence: the device, the line and word, the faults of a config."""
-    known = vars(error)
-    told: dict[str, Any] = {name: value for name, value in known.items() if isinstance(value, str | int)}
-    if faults := known.get("faults"):
-        told["faults"] = [asdict(fault) for fault in faults if isinstance(fault, ConfigFault)]
-    return told
+    # device, line and word, faults of a configuration
+    details: dict[str, Any] = {name: value for name, value in vars(error).items() if isinstance(value, str | int)}
+    if faults := getattr(error, "faults", None):
+        details["faults"] = [asdict(fault) for fault in faults if isinstance(fault, ConfigFault)]
+    return details
 
 
 def _tell_config(error: ConfigError) -> int:
@@ -172,7 +176,6 @@ def _usage(error: click.ClickException) -> str:
 
 
 def _say(text: str) -> None:
-    """Say it on standard error; where that takes nothing, the exit code still tells."""
     try:
         click.echo(without_controls(text), err=True)
     except OSError:
@@ -180,7 +183,7 @@ def _say(text: str) -> None:
 
 
 def _drop(stream: TextIO) -> None:
-    """Let nothing more be written to a stream that takes nothing: the interpreter would complain at its end."""
+    # the interpreter would report a failing flush of the stream at exit
     with contextlib.suppress(OSError, ValueError):
         descriptor = os.open(os.devnull, os.O_WRONLY)
         os.dup2(descriptor, stream.fileno())

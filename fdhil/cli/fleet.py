@@ -1,10 +1,10 @@
-"""``fdhil uplink``: sends a machine's records to the works; ``fdhil fleet``: gathers them, and asks all machines."""
+"""``fdhil uplink`` sends the records of a machine; ``fdhil fleet`` collects and compares those of all machines."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -12,7 +12,10 @@ from fdhil.cli.failing import SuggestingGroup, verdict
 from fdhil.cli.options import AS_JSON, CONFIG, FLEET, LINES
 from fdhil.errors import FdhilError
 
-BY = click.option("--by", default="type", show_default=True, help="The label by which machines are of one kind.")
+if TYPE_CHECKING:
+    from fdhil.config.fleet import Fleet
+
+BY = click.option("--by", default="type", show_default=True, help="Label of [uplink] that groups comparable machines.")
 ELSEWHERE: Mapping[str, str] = {
     **dict.fromkeys(("service", "services", "retain", "export", "web", "web-user"), "fdhil.cli.fleet_works"),
     **dict.fromkeys(("key", "sign", "stage"), "fdhil.cli.fleet_rollout"),
@@ -23,7 +26,7 @@ PARAMETER = click.Choice(("R", "L", "K", "Jt", "ft", "Cd"))
 
 @contextmanager
 def with_extra() -> Iterator[None]:
-    """Turn a library that is missing into a sentence."""
+    """Report a missing library of the extra ``fleet`` as FdhilError."""
     try:
         yield
     except ImportError as error:
@@ -37,9 +40,9 @@ def with_extra() -> Iterator[None]:
 def uplink(config: Path, as_json: bool) -> None:
     """Send the records of CONFIG's daemon to the fleet server, over NATS JetStream.
 
-    A process of its own that reads the store: the daemon never waits for it, and what is recorded while the server is
-    away is sent later, each record once and in its order. [uplink] of CONFIG says where to; without it nothing is sent,
-    and nothing is kept for it. Stops on SIGTERM or Ctrl-C.
+    Runs as a separate process that reads the store, so the daemon never waits for it. Records made while the server is
+    unreachable are sent later, each once and in order. [uplink] of CONFIG names the server; without it nothing is sent
+    or queued. Stops on SIGTERM or Ctrl-C.
     """
     from fdhil import config as machine_config
 
@@ -54,16 +57,16 @@ def uplink(config: Path, as_json: bool) -> None:
 
 
 class Questions(SuggestingGroup):
-    """A group whose larger commands are in files of their own, imported when they are called."""
+    """The group ``fleet``; imports the modules of its larger commands on call."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Return all commands."""
+        """Return the names of all commands."""
         return [*super().list_commands(ctx), *ELSEWHERE]
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Return a command; None for an unknown name."""
+    def find_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Return one command, or None if the name is unknown."""
         if cmd_name not in ELSEWHERE:
-            return super().get_command(ctx, cmd_name)
+            return super().find_command(ctx, cmd_name)
         command: click.Command = getattr(import_module(ELSEWHERE[cmd_name]), cmd_name.replace("-", "_"))
         return command
 
@@ -72,8 +75,8 @@ class Questions(SuggestingGroup):
 def fleet() -> None:
     """Collect and compare the histories of many machines.
 
-    FLEET is a file of the works, not of a machine: which NATS server, which PostgreSQL database, where windows are
-    kept. Needs the extra 'fleet'.
+    FLEET is the configuration of the fleet server (TOML): NATS server, PostgreSQL database, folder of the windows.
+    Needs the extra 'fleet'.
     """
 
 
@@ -83,8 +86,8 @@ def fleet() -> None:
 def collect(fleet: Path, as_json: bool) -> None:
     """Collect the machines' records in the database of FLEET.
 
-    It comes from JetStream. Any number of these may run, on one computer or several. Makes the stream and the tables
-    where there are none yet. Stops on SIGTERM or Ctrl-C.
+    Reads them from JetStream. Several collectors may run, on one or more computers. Creates stream and tables if they
+    are missing. Stops on SIGTERM or Ctrl-C.
     """
     from fdhil.config.fleet import load
 
@@ -98,14 +101,28 @@ def collect(fleet: Path, as_json: bool) -> None:
         run(lambda settings: gather(settings, say_ready), settings)
 
 
-def _answer(fleet: Path, question: str, **given: str | None) -> dict[str, Any]:
-    from fdhil.config.fleet import load
-
-    settings = load(fleet)
+def query_database(settings: "Fleet", question: str, **given: str | None) -> dict[str, Any]:
+    """Return the answer of the database to a question, which is the name of a command."""
     with with_extra():
         from fdhil.fleet import questions, sets
+    functions: Mapping[str, Callable[..., dict[str, Any]]] = {
+        "status": questions.status,
+        "trend": questions.trend,
+        "compare": questions.compare,
+        "outliers": questions.outliers,
+        "services": questions.services,
+    }
     with sets.asking(settings) as db:
-        answer: dict[str, Any] = getattr(questions, question)(db, **given)
+        return functions[question](db, **given)
+
+
+def query_and_print(fleet: Path, question: str, as_json: bool, **given: str | None) -> dict[str, Any]:
+    """Answer a question from the database of ``fleet``, and print the answer."""
+    from fdhil.cli import fleet_view
+    from fdhil.config.fleet import load
+
+    answer = query_database(load(fleet), question, **given)
+    fleet_view.tell(answer, question, as_json)
     return answer
 
 
@@ -113,67 +130,55 @@ def _answer(fleet: Path, question: str, **given: str | None) -> dict[str, Any]:
 @FLEET
 @AS_JSON
 def status(fleet: Path, as_json: bool) -> None:
-    """Show all machines and their due maintenance.
+    """Show the status and the due maintenance of all machines.
 
-    When each was heard, which records are missing, how many notices wait, its parameters.
+    Lists the time of the last record, missing records, pending notices and parameter revisions of each.
     """
-    from fdhil.cli import fleet_view
-
-    told = _answer(fleet, "status")
-    fleet_view.tell(told, "status", as_json, fleet_view.status)
+    query_and_print(fleet, "status", as_json)
 
 
 @fleet.command()
 @FLEET
-@click.option("--machine", required=True, help="The machine, by its name in the works.")
-@click.option("--axis", required=True, help="Its axis.")
-@click.option("--parameter", required=True, type=PARAMETER)
+@click.option("--machine", required=True, help="Fleet name of the machine.")
+@click.option("--axis", required=True, help="Axis letter.")
+@click.option("--parameter", required=True, type=PARAMETER, help="Parameter to show.")
 @AS_JSON
 @verdict
 def trend(fleet: Path, machine: str, axis: str, parameter: str, as_json: bool) -> int:
     """Show the history of one parameter of one axis.
 
-    With its slope per 30 days. Exit 1 when nothing is known of it.
+    Includes temperature, 95 % interval and slope per 30 days.
     """
-    from fdhil.cli import fleet_view
-
-    told = _answer(fleet, "trend", machine=machine, axis=axis, parameter=parameter)
-    fleet_view.tell(told, "trend", as_json, fleet_view.trend)
-    return 0 if told["sets"] else 1
+    answer = query_and_print(fleet, "trend", as_json, machine=machine, axis=axis, parameter=parameter)
+    return 0 if answer["sets"] else 1
 
 
 @fleet.command()
 @FLEET
-@click.option("--parameter", required=True, type=PARAMETER)
+@click.option("--parameter", required=True, type=PARAMETER, help="Parameter to compare.")
 @BY
-@click.option("--axis", help="One axis letter only.")
+@click.option("--axis", help="Restrict to one axis letter.")
 @AS_JSON
 def compare(fleet: Path, parameter: str, by: str, axis: str | None, as_json: bool) -> None:
-    """Show one parameter of the same axis of all machines.
+    """Compare one parameter of the same axis across machines.
 
-    Side by side, by a label of [uplink].
+    Groups the machines by a label of [uplink].
     """
-    from fdhil.cli import fleet_view
-
-    told = _answer(fleet, "compare", parameter=parameter, by=by, axis=axis)
-    fleet_view.tell(told, "compare", as_json, fleet_view.compare)
+    query_and_print(fleet, "compare", as_json, parameter=parameter, by=by, axis=axis)
 
 
 @fleet.command()
 @FLEET
 @BY
-@click.option("--axis", help="One axis letter only.")
+@click.option("--axis", help="Restrict to one axis letter.")
 @AS_JSON
 @verdict
 def outliers(fleet: Path, by: str, axis: str | None, as_json: bool) -> int:
     """List the axes that differ from comparable axes.
 
-    Exit 1 when there are some. Sisters are the same axis of machines with the same label; at least five are needed.
-    Temperature and age, since the first set or the newest service, are taken into account. Of a hundred groups without
-    an outlier one has an alarm, for each parameter.
+    Comparable axes (peers) are the same axis of machines with the same label; at least five are needed. Temperature
+    and age since the first set or the newest service are taken into account. The false-alarm rate is one in a hundred
+    groups per parameter.
     """
-    from fdhil.cli import fleet_view
-
-    told = _answer(fleet, "outliers", by=by, axis=axis)
-    fleet_view.tell(told, "outliers", as_json, fleet_view.outliers)
-    return 1 if told["outliers"] else 0
+    answer = query_and_print(fleet, "outliers", as_json, by=by, axis=axis)
+    return 1 if answer["outliers"] else 0

@@ -1,4 +1,4 @@
-"""``fdhil fleet reanalyse``: the stored windows of all machines again, and what that changed."""
+"""``fdhil fleet reanalyse``: repeat the analysis of all stored windows and report the changes."""
 
 from __future__ import annotations
 
@@ -26,15 +26,17 @@ DAY = click.DateTime(["%Y-%m-%d", "%Y-%m-%dT%H:%M:%S"])
 
 @click.command()
 @FLEET
-@click.option("--since", type=DAY, help="Windows from this day on (UTC) only.")
-@click.option("--until", type=DAY, help="Windows before this day (UTC) only.")
-@click.option("--machine", help="One machine only, by its name in the works.")
-@click.option("--axis", help="One axis letter only.")
-@click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Estimator; left out: the best there is.")
-@click.option("--config", "configs", type=FILE, multiple=True, help="A machine's configuration; may be given often.")
-@click.option("--scheduler", help="A Dask scheduler (tcp://... or tls://...); left out: processes of this computer.")
+@click.option("--since", type=DAY, help="Restrict to windows from this day on (UTC).")
+@click.option("--until", type=DAY, help="Restrict to windows before this day (UTC).")
+@click.option("--machine", help="Restrict to one machine, by its fleet name.")
+@click.option("--axis", help="Restrict to one axis letter.")
+@click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Estimator (default: the best).")
+@click.option("--config", "configs", type=FILE, multiple=True, help="Configuration of a machine; repeatable.")
+@click.option("--scheduler", help="Dask scheduler, tcp://... or tls://... (default: processes of this computer).")
 @click.option(
-    "--workers", type=click.IntRange(0, 1024), help="Processes of this computer, 0 for none; left out: one per core."
+    "--workers",
+    type=click.IntRange(0, 1024),
+    help="Number of processes of this computer, 0 for none (default: one per core).",
 )
 @BY
 @AS_JSON
@@ -52,19 +54,20 @@ def reanalyse(
     by: str,
     as_json: bool,
 ) -> int:
-    """Analyse the stored windows of all machines again.
+    """Repeat the analysis of the stored windows of all machines.
 
-    And tell what that changes. What was found before stays: the results are a revision of their own in the database,
-    which belongs to the method, the configurations and the code. What is done of it is not done again, so a run that
-    was stopped is gone on with by the same call. Windows of machines whose --config is given are weighed through their
-    regulators, the others by what the recordings say. The bits are the same with any number of workers. Exit codes: 0
-    done, 3 some window could not be read (the others are done all the same).
+    Reports the changes. Earlier results are kept: the new ones form a separate revision in the database, identified by
+    method, configurations and code. The same call continues an interrupted run. Windows of machines whose --config is
+    given are assessed with their regulators, the others with what the recordings contain. The results do not depend
+    on the number of workers.
     """
     from fdhil.config import Identification
     from fdhil.config.fleet import load
 
     if scheduler is not None and workers is not None:
-        raise click.UsageError("--workers are processes of this computer, --scheduler is a cluster: give one of them")
+        raise click.UsageError(
+            "--workers are processes of this computer, --scheduler is a cluster; give only one of them"
+        )
     settings, machines = load(fleet), _by_name(configs)
     with with_extra():
         from fdhil.fleet import reanalysis, sets
@@ -75,16 +78,16 @@ def reanalyse(
     from fdhil.cli import fleet_reanalysis_view as view
     from fdhil.cli import fleet_view
 
-    asked = Method(Identification(method=method), machines, settings.objects.directory.resolve(), code_digest())
+    chosen = Method(Identification(method=method), machines, settings.objects.directory.resolve(), code_digest())
     scope = reanalysis.Scope(_utc(since), _utc(until), machine, axis)
     forewarn("identify")
     count = (os.cpu_count() or 1) if workers is None else workers
-    with with_extra(), entered(scheduler, count) as crew, _bar() as progress:
-        revision = reanalysis.reanalyse(settings, asked, scope, crew, progress)
+    with with_extra(), entered(scheduler, count) as pool, _bar() as progress:
+        revision = reanalysis.reanalyse(settings, chosen, scope, pool, progress)
     with sets.asking(settings) as db:
-        told = changes(db, revision, by)
-    fleet_view.tell(told, "reanalyse", as_json, view.changes)
-    return UNREADABLE if told["unreadable"] else 0
+        answer = changes(db, revision, by)
+    fleet_view.tell(answer, "reanalyse", as_json, view.changes)
+    return UNREADABLE if answer["unreadable"] else 0
 
 
 def _by_name(configs: tuple[Path, ...]) -> dict[str, MachineConfig]:
@@ -95,7 +98,7 @@ def _by_name(configs: tuple[Path, ...]) -> dict[str, MachineConfig]:
         read = config.load(path)
         name = read.machine.name if read.uplink is None else read.uplink.name_of(read.machine.name)
         if name in machines:
-            raise click.BadParameter(f"{path} is of {name}, which another --config is of, too", param_hint="--config")
+            raise click.BadParameter(f"{path} describes {name}, as another --config does", param_hint="--config")
         machines[name] = read
     return machines
 

@@ -1,4 +1,4 @@
-"""``fdhil fleet key | sign | stage``: the works' side of the roll-out of configurations."""
+"""``fdhil fleet key | sign | stage``: sign configuration changes and roll them out in stages."""
 
 from __future__ import annotations
 
@@ -19,51 +19,49 @@ if TYPE_CHECKING:
     from fdhil.fleet.rollout import Standing, Told
 
 CHANGE = click.argument("change", type=FILE)
-MACHINES = click.option("--machine", "machines", multiple=True, help="A machine, by its name in the works; repeatable.")
+MACHINES = click.option("--machine", "machines", multiple=True, help="Fleet name of a machine; repeatable.")
 
 
 @click.command()
 @click.argument("file", type=FILE)
 @AS_JSON
 def key(file: Path, as_json: bool) -> None:
-    """Make the key FILE to sign offers with.
+    """Create the key FILE for signing configuration changes.
 
-    It has mode 0600; of one that is there the public key is told. That goes into [offers] trust of each machine, by its
-    operator. Who has FILE can sign in your name.
+    FILE gets mode 0600 and is never overwritten. Prints the public key, which the operator of each machine adds to
+    [offers] trust. Anybody with access to FILE can sign in your name.
     """
     with with_extra():
         from fdhil.fleet.offer import make_key, public_key
     made = not file.exists()
-    told = make_key(file) if made else public_key(file)
+    public = make_key(file) if made else public_key(file)
     if as_json:
-        click.echo(json.dumps({"schema": "fdhil-fleet-key-1", "file": str(file), "made": made, "public_key": told}))
+        click.echo(json.dumps({"schema": "fdhil-fleet-key-1", "file": str(file), "made": made, "public_key": public}))
         return
-    click.echo(
-        f"{file} {'is made' if made else 'is there already'}; its public key, for [offers] trust of each machine:"
-    )
-    click.echo(told)
+    click.echo(f"{file} {'created' if made else 'exists already'}; its public key, for [offers] trust of each machine:")
+    click.echo(public)
 
 
 @click.command(cls=Writing)
 @CHANGE
-@click.option("--key", "key_file", type=FILE, required=True, help="The file of the key to sign with.")
-@click.option("--by", required=True, help="Who signs: your name, which the operators read.")
+@click.option("--key", "key_file", type=FILE, required=True, help="Key file to sign with.")
+@click.option("--by", required=True, help="Name of the signer, shown to the operators.")
 @MACHINES
-@click.option("--out", type=OutputFile(".offer"), required=True, help="The file to write, to be carried to machines.")
+@click.option("--out", type=OutputFile(".offer"), required=True, help="File to write, for transfer to the machines.")
 @AS_JSON
 def sign(change: Path, key_file: Path, by: str, machines: tuple[str, ...], out: Path, as_json: bool) -> None:
-    """Write the offer of CHANGE as a signed file.
+    """Write CHANGE as a signed change file.
 
-    It is carried by hand, and no server is needed. Without --machine it is for all machines that have the labels of
-    CHANGE.
+    The file is carried to the machines by hand; no server is needed. Without --machine it applies to all machines with
+    the labels of CHANGE.
     """
     with with_extra():
         from fdhil.fleet.offer import sign as signed
         from fdhil.fleet.rollout import offer_of, read_change
     from fdhil.store.output import open_output
 
-    told, days = read_change(change)
-    offer = offer_of(told, days, by, 1, machines)
+    proposal, days = read_change(change)
+    offer = offer_of(proposal, days, by, 1, machines)
     document = signed(offer, key_file)
     with open_output(out) as file:
         file.write(document)
@@ -77,12 +75,12 @@ def sign(change: Path, key_file: Path, by: str, machines: tuple[str, ...], out: 
 @click.command()
 @FLEET
 @CHANGE
-@click.option("--key", "key_file", type=FILE, help="The file of the key to sign with; without it nothing is opened.")
-@click.option("--by", default="", help="Who signs: your name, which the operators read.")
-@click.option("--count", type=click.IntRange(min=1), help="How many machines the stage has; left out: all the rest.")
+@click.option("--key", "key_file", type=FILE, help="Key file to sign with; without it no stage is opened.")
+@click.option("--by", default="", help="Name of the signer, shown to the operators.")
+@click.option("--count", type=click.IntRange(min=1), help="Number of machines in the stage (default: all remaining).")
 @MACHINES
-@click.option("--despite", default="", help="Why it goes on although not all machines before stand well.")
-@click.option("--withdraw", is_flag=True, help="Take CHANGE back from the machines that have not accepted it.")
+@click.option("--despite", default="", help="Reason for opening a stage although earlier machines are not ready.")
+@click.option("--withdraw", is_flag=True, help="Withdraw CHANGE from machines that have not accepted it.")
 @AS_JSON
 @verdict
 def stage(
@@ -96,35 +94,34 @@ def stage(
     withdraw: bool,
     as_json: bool,
 ) -> int:
-    """Show how far CHANGE is rolled out, or go on with it.
+    """Show the roll-out of CHANGE, or open its next stage.
 
-    What the machines told of it; with --key it is offered to the next of them. A further stage is opened when all
-    machines before have accepted CHANGE, have identified with it, and have told no notice since. Exit 1 when that is
-    not so.
+    Lists the answers of the machines. With --key CHANGE is proposed to the next machines, once all earlier ones have
+    accepted it, have identified with it, and have reported no notice since.
     """
     from fdhil.config.fleet import load
 
     settings = load(fleet)
     with with_extra():
         from fdhil.fleet import rollout
-    told, days = rollout.read_change(change)
+    proposal, days = rollout.read_change(change)
     if key_file is not None and not by:
-        raise click.UsageError("--key signs a stage, which needs --by: who signs")
+        raise click.UsageError("--key signs a stage; name the signer with --by")
     if key_file is not None and withdraw:
-        raise click.UsageError("--withdraw takes back what --key would offer: give one of them")
+        raise click.UsageError("--withdraw and --key exclude each other; give only one of them")
 
     async def work() -> tuple[Standing, Offer | None, list[str]]:
         async with rollout.entered(settings) as db:
-            found = await rollout.standing(db, told)
+            found = await rollout.standing(db, proposal)
             if key_file is None:
-                return found, None, await rollout.take_back(settings, found, told.name) if withdraw else []
+                return found, None, await rollout.take_back(settings, found, proposal.name) if withdraw else []
             names = rollout.chosen(found, count, machines, despite)
-            offer = rollout.offer_of(told, days, by, found.stage + 1, names)
-            await rollout.open_stage(settings, db, offer, told, key_file, despite)
+            offer = rollout.offer_of(proposal, days, by, found.stage + 1, names)
+            await rollout.open_stage(settings, db, offer, proposal, key_file, despite)
             return found, offer, []
 
     found, opened, withdrawn = asyncio.run(work())
-    _tell(told, found, opened, withdrawn, as_json)
+    _tell(proposal, found, opened, withdrawn, as_json)
     return 1 if any(each.against for each in found.offered) and opened is None and not withdraw else 0
 
 
@@ -137,22 +134,18 @@ def _tell(change: Change, found: Standing, opened: Offer | None, withdrawn: Sequ
     for line in _lines(change, found, opened):
         click.echo(printable(line))
     if withdrawn:
-        click.echo(printable(f"it is taken back from {_named(withdrawn)}; who has accepted it keeps it"))
+        click.echo(printable(f"withdrawn from {_named(withdrawn)}; machines that accepted it keep it"))
 
 
 def _lines(change: Change, found: Standing, opened: Offer | None) -> Iterator[str]:
     for each in found.offered:
-        told = each.against or "accepted, and stands well"
-        yield f"stage {each.stage}  {each.machine}: {told}"
+        yield f"stage {each.stage}  {each.machine}: {each.against or 'accepted and validated'}"
     if opened is not None:
         names = _named(opened.machines)
-        yield f"{opened}, stage {opened.stage}, is offered to {names}; their operators accept or reject it"
+        yield f"{opened}, stage {opened.stage}, is proposed to {names}; their operators accept or reject it"
     else:
-        yield f"{change.name} version {change.version}: {len(found.left)} machines are left{_behind(found.left)}"
-
-
-def _behind(left: Sequence[str]) -> str:
-    return f" ({_named(left)})" if left else ""
+        names = f" ({_named(found.left)})" if found.left else ""
+        yield f"{change.name} version {change.version}: {len(found.left)} machines remain{names}"
 
 
 def _named(machines: Sequence[str]) -> str:

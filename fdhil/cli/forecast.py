@@ -1,4 +1,4 @@
-"""Adds to ``fdhil predict --from-history`` what a step costs, each zone's change, and when it leaves a tolerance."""
+"""History part of ``fdhil predict --from-history``: step costs, zone changes, and forecast tolerance crossings."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ if TYPE_CHECKING:
 
 DAY_S = 86400.0
 FAR_DAYS = 36500.0
-RECENT = 64  # revisions of an axis, or comparisons of a program, that are looked at
+RECENT = 64  # revisions of an axis, or predictions of a program, that are read
 BEYOND_CHANCE = 2.0  # standard deviations
-TOLD_UM = 0.1  # a smaller change is listed by --json only
+TOLD_UM = 0.1  # smaller changes are listed only with --json
 MANY_CHANGES = 12
-MANY_CAUSES, WORTH_TELLING = 3, 0.3  # of a change, those that did so much of what the first did
+MANY_CAUSES, WORTH_TELLING = 3, 0.3  # causes shown per change, and their least share of the largest one
 KEPT = ("start_s", "end_s", "where", "line", "max_um", "cause", "std_um")
 
 
 @dataclass(frozen=True, slots=True)
 class Past:
-    """The recent revisions of each axis, oldest first, and what was predicted of a program, newest first."""
+    """Recent revisions of each axis, oldest first, and earlier predictions of a program, newest first."""
 
     revisions: Mapping[str, Sequence[Revision]]
     comparisons: Sequence[tuple[Stamp, Comparison]]
 
     @staticmethod
     def read(config: MachineConfig, program_digest: str) -> Past:
-        """Read the machine's history; StoreError when there is none."""
+        """Read the machine's history. Raises StoreError if there is none."""
         from fdhil.store.history import History
 
         with History.read(config.store.directory, partial(click.echo, err=True)) as history:
@@ -56,7 +56,7 @@ def comparison(
     config: MachineConfig,
     zones: Sequence[Mapping[str, Any]],
 ) -> Comparison:
-    """Return this prediction as the store keeps it; ``zones`` as JSON has them."""
+    """Return this prediction as a row of the store; ``zones`` are the JSON entries."""
     from fdhil.store.rows import Comparison, UsedParameters
 
     newest = {axis: found[-1].set.revision for axis, found in past.revisions.items() if found}
@@ -71,7 +71,7 @@ def comparison(
 
 
 def remember(past: Past, now: Comparison, config: MachineConfig) -> None:
-    """Store this prediction, unless it is the last one again; a store that takes nothing is told, and no more."""
+    """Store this prediction unless it equals the last one; only warn if the store fails."""
     if past.comparisons and _same(past.comparisons[0][1], now):
         return
     from fdhil.errors import StoreError
@@ -82,7 +82,7 @@ def remember(past: Past, now: Comparison, config: MachineConfig) -> None:
         with History.open(config.store.directory) as history:
             history.add_comparison(now, Stamp.now())
     except StoreError as error:
-        click.echo(f"this prediction is not kept for the next one to compare with: {error}", err=True)
+        click.echo(f"this prediction was not stored for later comparison: {error}", err=True)
 
 
 def _same(one: Comparison, other: Comparison) -> bool:
@@ -92,9 +92,9 @@ def _same(one: Comparison, other: Comparison) -> bool:
 def compared(
     past: Past, now: Comparison, predicted: Prediction, std_um: Float, config: MachineConfig
 ) -> dict[str, Any] | None:
-    """Return as JSON has it what became of each zone since the program was last predicted otherwise than now.
+    """Return as JSON the change of each zone since the last prediction with other parameters or configuration.
 
-    None when it was not predicted before, or always with these parameters and this configuration.
+    None if there is no such prediction.
     """
     from fdhil.prediction import forecast
     from fdhil.records import Zone
@@ -122,7 +122,8 @@ def _change_entry(
 ) -> dict[str, Any]:
     from fdhil.prediction.model_terms import values_of
 
-    old, new = ({axis: values_of(p) for axis, p in models.items()} for models in (earlier, models))
+    both = {"before": earlier, "now": models}
+    values = {when: {axis: values_of(p) for axis, p in of.items()} for when, of in both.items()}
     return {
         "line": change.line,
         "where": change.where,
@@ -135,8 +136,7 @@ def _change_entry(
             {
                 "axis": axis,
                 "parameter": name,
-                "before": old[axis].get(name, 0.0),
-                "now": new[axis].get(name, 0.0),
+                **{when: of[axis].get(name, 0.0) for when, of in values.items()},
                 "um": um,
             }
             for axis, name, um in change.by
@@ -146,7 +146,7 @@ def _change_entry(
 
 
 def show_compared(found: Mapping[str, Any] | None) -> None:
-    """Print the zones that have changed beyond chance, the most changed of them, and what caused it."""
+    """Print the zones with significant changes, largest change first, and their causes."""
     if found is None:
         return
     from fdhil.prediction.gain import plus_minus
@@ -155,7 +155,7 @@ def show_compared(found: Mapping[str, Any] | None) -> None:
     since = f"since this program was predicted on {found['at'][:10]} (revisions {revisions})"
     beyond = [z for z in found["zones"] if abs(z["change_um"]) > max(TOLD_UM, BEYOND_CHANCE * z["std_um"])]
     if not beyond:
-        click.echo(f"nothing has changed beyond chance {since}")
+        click.echo(f"no significant change {since}")
         return
     rms = found["rms_um"]
     click.echo(f"{since}: {rms['before']:.1f} -> {rms['now']:.1f} um RMS")
@@ -167,11 +167,10 @@ def show_compared(found: Mapping[str, Any] | None) -> None:
             f" {zone['before_um']:.1f} -> {zone['now_um']:.1f}){_because(zone)}"
         )
     if len(beyond) > MANY_CHANGES:
-        click.echo(f"  and {len(beyond) - MANY_CHANGES} zones that changed less (--json lists them all)")
+        click.echo(f"  and {len(beyond) - MANY_CHANGES} zones with smaller changes (--json lists all)")
 
 
 def _because(zone: Mapping[str, Any]) -> str:
-    """Name what did it, the most first; what did little beside that is left to --json."""
     causes = [
         (by["um"], f"by {by['parameter']} of axis {by['axis']}, {by['before']:.4g} -> {by['now']:.4g}")
         for by in zone["by"]
@@ -179,8 +178,8 @@ def _because(zone: Mapping[str, Any]) -> str:
     if zone["settings_um"]:
         causes.append((zone["settings_um"], "by the configuration"))
     causes.sort(key=lambda cause: -abs(cause[0]))
-    told = [f"{um:+.1f} {text}" for um, text in causes[:MANY_CAUSES] if abs(um) >= WORTH_TELLING * abs(causes[0][0])]
-    return f": {'; '.join(told)}" if told else ""
+    shown = [f"{um:+.1f} {text}" for um, text in causes[:MANY_CAUSES] if abs(um) >= WORTH_TELLING * abs(causes[0][0])]
+    return f": {'; '.join(shown)}" if shown else ""
 
 
 def steps(
@@ -190,9 +189,9 @@ def steps(
     config: MachineConfig,
     since: int | None,
 ) -> tuple[Step, ...]:
-    """Return what the steps since revision ``since`` (left out: since before each axis' last step) cost.
+    """Return the cost of the parameter steps since revision ``since`` (default: since before each axis' last step).
 
-    UsageError when no axis has that revision.
+    Raises click.UsageError if no axis has that revision.
     """
     from fdhil.prediction import forecast
 
@@ -203,7 +202,7 @@ def steps(
         if since is None:
             place = forecast.last_step(sets)
         else:
-            place = next((k for k, known in enumerate(sets) if known.revision == since), None)
+            place = next((k for k, one in enumerate(sets) if one.revision == since), None)
         if place is not None:
             earlier[axis] = sets[place]
     if since is not None and not earlier:
@@ -214,7 +213,7 @@ def steps(
 
 
 def step_entries(found: Sequence[Step]) -> list[dict[str, Any]]:
-    """Return the steps as JSON has them."""
+    """Return the steps as JSON entries."""
     return [
         {
             "axis": step.axis,
@@ -231,13 +230,13 @@ def step_entries(found: Sequence[Step]) -> list[dict[str, Any]]:
 
 
 def show_steps(found: Sequence[Step]) -> None:
-    """Print a line per step: what changed and what it costs where."""
+    """Print one line per step: the change, its cost and its location."""
     for step in found:
         changed = ", ".join(f"{name} {old:.4g} -> {new:.4g}" for name, (old, new) in step.changed.items())
         place = f"line {step.line}, {step.where}" if step.line else step.where
         verb = "costs" if step.cost_um > 0 else "saves"
         click.echo(
-            f"the {step.what} of axis {step.axis} has changed since revision {step.since_revision} ({changed}):"
+            f"the {step.what} of axis {step.axis} changed since revision {step.since_revision} ({changed}):"
             f" it {verb} {abs(step.cost_um):.1f} um at {place}"
         )
 
@@ -249,8 +248,9 @@ def crossings(
     models: Mapping[str, Parameters],
     tolerance_um: float,
 ) -> list[dict[str, Any]]:
-    """Return per zone when it leaves the tolerance as JSON has it: ``state`` is over, foreseen, not_foreseen within
-    ``within_days``, or not_enough_history, of which there are ``span_days``.
+    """Return as JSON when each zone will leave the tolerance.
+
+    ``state`` is over, foreseen, not_foreseen (within ``within_days``) or not_enough_history (of ``span_days``).
     """
     from fdhil.identification.trends import reach_days
     from fdhil.prediction import forecast
@@ -263,19 +263,19 @@ def crossings(
     }
     span_days = forecast.span_days(courses)
     within_days = min(reach_days(span_days), FAR_DAYS)
-    told: list[dict[str, Any]] = []
+    entries: list[dict[str, Any]] = []
     for zone, per_axis in zip(predicted.zones, um_per_percent, strict=True):
         if zone.max_um > tolerance_um:
-            told.append({"state": "over"})
+            entries.append({"state": "over"})
             continue
         if not within_days:
-            told.append({"state": "not_enough_history", "span_days": span_days})
+            entries.append({"state": "not_enough_history", "span_days": span_days})
             continue
         found = forecast.crossing(zone, per_axis, models, courses, tolerance_um)
         if found is None or found.days > within_days:
-            told.append({"state": "not_foreseen", "within_days": within_days})
+            entries.append({"state": "not_foreseen", "within_days": within_days})
             continue
-        told.append(
+        entries.append(
             {
                 "state": "foreseen",
                 "in_days": found.days,
@@ -286,7 +286,7 @@ def crossings(
                 "parameter": found.parameter,
             }
         )
-    return told
+    return entries
 
 
 def _days(revisions: Sequence[Revision], newest_s: float) -> Any:
@@ -296,7 +296,6 @@ def _days(revisions: Sequence[Revision], newest_s: float) -> Any:
 
 
 def _date(start_s: float, days: float) -> str | None:
-    """Return the day as ISO 8601; None beyond what can be foreseen."""
     if days > FAR_DAYS:
         return None
     at = datetime.datetime.fromtimestamp(start_s, datetime.UTC) + datetime.timedelta(days=days)
@@ -304,25 +303,25 @@ def _date(start_s: float, days: float) -> str | None:
 
 
 def crossing_text(entry: Mapping[str, Any], tolerance_um: float) -> str:
-    """Return the sentence for one zone."""
+    """Return the forecast of one zone as text."""
     if entry["state"] == "over":
-        return f"is over {tolerance_um:g} um"
+        return f"exceeds {tolerance_um:g} um now"
     if entry["state"] == "not_enough_history":
         return (
-            f"when it leaves {tolerance_um:g} um cannot be told, not enough history: {_span(entry['span_days'])},"
-            " a forecast wants a day or more"
+            f"no forecast for {tolerance_um:g} um: {_span(entry['span_days'])} of history are too short,"
+            " at least one day is needed"
         )
     if entry["state"] == "not_foreseen":
-        return f"is not foreseen to leave {tolerance_um:g} um within {_span(entry['within_days'])}"
+        return f"is not expected to exceed {tolerance_um:g} um within {_span(entry['within_days'])}"
     latest = entry["latest"] or "later"
     if entry["date"] < datetime.datetime.now(datetime.UTC).date().isoformat():
         return (
-            f"will have left {tolerance_um:g} um about {entry['date']} ({entry['earliest']} to {latest}), after the"
-            f" newest parameters, driven by {entry['parameter']} of axis {entry['axis']}: identify anew"
+            f"has probably exceeded {tolerance_um:g} um since {entry['date']} ({entry['earliest']} to {latest}),"
+            f" after the newest parameters, because of {entry['parameter']} of axis {entry['axis']}: identify again"
         )
     return (
-        f"leaves {tolerance_um:g} um about {entry['date']} ({entry['earliest']} to {latest}),"
-        f" driven by {entry['parameter']} of axis {entry['axis']}"
+        f"is expected to exceed {tolerance_um:g} um about {entry['date']} ({entry['earliest']} to {latest}),"
+        f" because of {entry['parameter']} of axis {entry['axis']}"
     )
 
 

@@ -1,4 +1,4 @@
-"""``fdhil-guard CONFIG``: owns the machine's bus and becomes the guard's process."""
+"""``fdhil-guard CONFIG``: locks the machine's bus, then becomes the guard process."""
 
 import hashlib
 import json
@@ -10,6 +10,7 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cli.bus_lock import lock_bus
+from fdhil.cli.epilogs import read_epilog
 from fdhil.cli.failing import prepare_streams, run_safely
 from fdhil.cli.options import CONFIG
 from fdhil.errors import DeviceError
@@ -18,17 +19,16 @@ from fdhil.guard.settings import from_json, to_json
 from fdhil.guard.transmit_socket import connect_bus, greet
 
 
-@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+@click.command(epilog=read_epilog("guard"), context_settings={"help_option_names": ["-h", "--help"]})
 @CONFIG
-@click.option("--check", is_flag=True, help="Write the settings and stop: opens no bus.")
+@click.option("--check", is_flag=True, help="Write the settings file and exit, without opening a bus.")
 def guard(config: Path, check: bool) -> None:
-    """Run the guard of the machine in CONFIG: the only process of fdhil that may send an offset to a drive.
+    """Run the guard of CONFIG's machine, the only process that sends offsets to the drives.
 
-    It sends no frame until the daemon arms a correction, checks every interlock at each SYNC, and ramps to zero when
-    anything is not as it must be: also when the daemon dies, and before it stops itself. Events are JSON lines on
-    stdout. Exit codes: 0 stopped with nothing applied, 2 wrong config, 3 bus trouble, or an offset may be left.
+    The guard sends no frame until the daemon arms a correction. It checks every interlock at each SYNC, and ramps the
+    offsets to zero on any violation, when the daemon fails, and before it stops. Events are JSON lines on stdout.
     """
-    from fdhil.arming import guard_settings  # late: the rooms behind it are heavy, --help is not
+    from fdhil.arming import guard_settings  # late: heavy imports, not needed for --help
     from fdhil.arming.token import make_directory, operator_token
     from fdhil.commissioning.compare import compare_again
 
@@ -38,14 +38,14 @@ def guard(config: Path, check: bool) -> None:
     run_directory = machine.guard_directory
     make_directory(run_directory)
     text = to_json(guard_settings.settings_of(machine, name, run_directory, token_sha256))
-    from_json(text, str(config))  # what the guard would refuse is refused before it is started
+    from_json(text, str(config))  # settings that the guard would refuse are refused before it starts
     file, bus = run_directory / SETTINGS_NAME, machine.bus[name]
     if check:
         _write(file, text)
-        click.echo(f"{file}: what the guard would be told of {name}")
+        click.echo(f"{file}: settings of the guard for {name}")
         return
     with connect_bus(name, bus) as transmit, lock_bus(bus, transmit, run_directory) as lock:
-        # where no NC runs the bus, the drives are asked whether they still are what was signed off
+        # if no NC runs the bus, the drives are compared with their commissioning records
         compare_again(machine, name, lambda text: click.echo(json.dumps({"event": "record_void", "text": text})))
         _write(file, to_json(guard_settings.settings_of(machine, name, run_directory, token_sha256)))
         greet(name, bus, transmit)
@@ -69,7 +69,7 @@ def _write(file: Path, text: str) -> None:
 
 
 def main() -> None:
-    """Run the command; an error is one sentence on stderr and its exit code."""
+    """Run the command. An error becomes one sentence on stderr and its exit code."""
     prepare_streams()
     sys.exit(run_safely(guard))
 

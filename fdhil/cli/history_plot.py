@@ -1,4 +1,4 @@
-"""The courses of the parameters as one picture (extra ``report``)."""
+"""Plot of the parameter trends (extra ``report``)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HEAD, FOOT = 0.8, 0.45
 
 
 def figure_of(histories: Sequence[AxisHistory]) -> Figure:
-    """Return a figure with a column for each axis and a row for each parameter."""
+    """Return a figure with one column per axis and one row per parameter."""
     from matplotlib import style
     from matplotlib.figure import Figure
 
@@ -46,10 +46,10 @@ def figure_of(histories: Sequence[AxisHistory]) -> Figure:
 
 
 def write_plot(histories: Sequence[AxisHistory], path: Path) -> None:
-    """Write the courses as PNG, SVG or PDF, by the name's suffix. FdhilError when there is nothing to plot."""
+    """Write the trends as PNG, SVG or PDF, by suffix. Raises FdhilError if there is nothing to plot."""
     shown = [history for history in histories if history.names()]
     if not shown:
-        raise FdhilError("there is nothing to plot: no parameters were published yet; let the daemon see some rapids")
+        raise FdhilError("nothing to plot: no parameters are published yet; run the daemon while the axes make rapids")
     figure = figure_of(shown)
     with open_output(path) as file:
         figure.savefig(file, format=path.suffix.lower().removeprefix("."), dpi=120)

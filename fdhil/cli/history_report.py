@@ -1,4 +1,4 @@
-"""The stored history as one page: how the drives are, then why."""
+"""HTML report of the stored history: the condition of the drives first, then the evidence."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ from fdhil.report.parameter_view import DISPLAY, MEANING, MEANINGS, cell, half_o
 
 MOST_REVISIONS = 50
 MOST_NOTICES = 30
-WIDTH, HEIGHT = 4.8, 2.6  # of a course, inches
+WIDTH, HEIGHT = 4.8, 2.6  # of a trend, inches
 
 
 def write_report(
@@ -25,12 +25,12 @@ def write_report(
     pdf: Path | None = None,
     notices: Sequence[Mapping[str, Any]] = (),
 ) -> None:
-    """Write the report of every axis that was ever seen, and its notices. FdhilError without the extra ``report``."""
+    """Write the report of all recorded axes and their notices. Raises FdhilError without the extra ``report``."""
     sections = [_verdict(machine, histories, refused)]
     sections += [_axis_section(history, refused.get(history.axis, Refusals())) for history in histories]
     sections += [_notices(notices)] if notices else []
     page = Page(
-        f"{machine.machine.name}: how its drives are",
+        f"{machine.machine.name}: condition of the drives",
         f"Identified from rapid moves; {_span(histories)}. {MEANING.capitalize()}.",
         [_tile(history, refused.get(history.axis, Refusals())) for history in histories],
         sections,
@@ -41,7 +41,7 @@ def write_report(
 def _span(histories: Sequence[AxisHistory]) -> str:
     times = [window["time"] for history in histories for window in (history.told or {}).get("windows", ())]
     times += [row["time"] for history in histories for row in history.rows]
-    return f"from {min(times)[:10]} to {max(times)[:10]}" if times else "nothing was identified yet"
+    return f"from {min(times)[:10]} to {max(times)[:10]}" if times else "nothing identified yet"
 
 
 def _tile(history: AxisHistory, refused: Refusals) -> tuple[str, str]:
@@ -51,15 +51,14 @@ def _tile(history: AxisHistory, refused: Refusals) -> tuple[str, str]:
     if not (history.told or {}).get("windows") and not history.rows:
         return f"axis {history.axis}", "not identified"
     first = min((limit["date"] for limit in limits.values()), default=None)
-    said = sentences(history, refused)[0]
+    verdict = sentences(history, refused)[0]
     return (
         f"axis {history.axis}",
-        f"limit {first[:10]}" if first else "in order" if said == IN_ORDER else "look below",
+        f"limit {first[:10]}" if first else "in order" if verdict == IN_ORDER else "see below",
     )
 
 
 def _verdict(machine: MachineConfig, histories: Sequence[AxisHistory], refused: Mapping[str, Refusals]) -> Section:
-    """Return what to know first: a sentence or more of each axis, and its newest values beside what they should be."""
     shares = machine.maintenance.model_dump()
     rows = [[history.axis, text] for history in histories
             for text in sentences(history, refused.get(history.axis, Refusals()))]  # fmt: skip
@@ -68,14 +67,14 @@ def _verdict(machine: MachineConfig, histories: Sequence[AxisHistory], refused: 
         for history in histories
         if history.rows
     ]
-    return Section("How they are", "", [Table(("axis", "what to know"), rows), *latest])
+    return Section("Condition", "", [Table(("axis", "condition"), rows), *latest])
 
 
 def _axis_section(history: AxisHistory, refused: Refusals) -> Section:
     many = max((len(history.estimates(name)) for name in history.names()), default=0) > MANY
     shown = "" if not many else (
-        f"Of more than {MANY} rapids the median of each day is drawn, and a band that holds its estimates from the "
-        f"{BAND[0]:.0f}th to the {BAND[1]:.0f}th percentile."
+        f"With more than {MANY} rapids the plots show the median of each day, and a band from the {BAND[0]:.0f}th to "
+        f"the {BAND[1]:.0f}th percentile."
     )  # fmt: skip
     tables = [*_health_tables(history.told), *_refused_tables(refused), *_revision_tables(history.rows)]
     return Section(f"Axis {history.axis}", shown, tables, _pictures(history))
@@ -89,22 +88,22 @@ def _pictures(history: AxisHistory) -> list[tuple[str, str]]:
     for name in history.names():
         if (course := over_temperature(history, name)) is not None:
             what = f"{name.partition('_')[0]}, {MEANINGS[name]}"
-            caption = f"{what}, over the temperature of the slide-way, which it follows"
+            caption = f"{what}, over the temperature of the slide-way, with which it varies"
             pictures.append((caption, svg(course, WIDTH, HEIGHT)))
     return pictures
 
 
-def _health_tables(told: Mapping[str, Any] | None) -> list[Table]:
-    if told is None:
+def _health_tables(health: Mapping[str, Any] | None) -> list[Table]:
+    if health is None:
         return []
     slopes = Table(
         head=["parameter", "per kelvin", "per day", "maintenance limit"],
-        rows=slope_rows(told),
+        rows=slope_rows(health),
         caption=f"Slopes since the last change; {MEANING}",
     )
     changes = Table(
-        head=["time", "window", "what moved", "likely cause"],
-        rows=[[_minute(c["time"]), str(c["window"]), moved(c), c["cause"]] for c in told["changes"]],
+        head=["time", "window", "parameters that changed", "likely cause"],
+        rows=[[_minute(c["time"]), str(c["window"]), moved(c), c["cause"]] for c in health["changes"]],
         caption="Changes",
     )
     return [table for table in (slopes, changes) if table.rows]
@@ -114,8 +113,8 @@ def _refused_tables(refused: Refusals) -> list[Table]:
     if not refused.refused:
         return []
     rows = [[code, str(count), text, time] for code, count, text, time in refused.reasons]
-    caption = f"Rapids that were not believed: {refused.refused} of {refused.seen}"
-    return [Table(("reason", "how often", "what the last one said", "when"), rows, caption)]
+    caption = f"Refused rapids: {refused.refused} of {refused.seen}"
+    return [Table(("reason", "count", "text of the latest", "time of the latest"), rows, caption)]
 
 
 def _revision_tables(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
@@ -135,28 +134,25 @@ def _revision_tables(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
         ]
         for row in newest
     ]
-    more = f"; {left_out} older ones are left out (fdhil history --json lists them)" if left_out else ""
+    more = f"; {left_out} older ones are omitted (fdhil history --json lists them)" if left_out else ""
     caption = f"Published parameter sets, newest first{more}; {MEANING}"
     return [Table(head, cells, caption, folded=f"{len(rows)} published parameter sets")]
 
 
 def _notices(notices: Sequence[Mapping[str, Any]]) -> Section:
-    """Return what an operator was told, what waits to be acknowledged in front, and who acknowledged the rest."""
     waiting = sum(notice["acknowledged"] is None for notice in notices)
     shown = sorted(notices, key=lambda notice: (notice["acknowledged"] is not None, -notice["number"]))[:MOST_NOTICES]
     rows = [
         [_minute(n["time"]), n["severity"], n["axis"] or "-", f"{n['code']}: {n['text']}", _answered(n["acknowledged"])]
         for n in shown
     ]
-    caption = f"{waiting} wait to be acknowledged; {len(shown)} of {len(notices)} are shown"
-    return Section(
-        "Notices", "", [Table(("time (UTC)", "severity", "axis", "what happened", "acknowledged"), rows, caption)]
-    )
+    caption = f"{waiting} pending; {len(shown)} of {len(notices)} are shown"
+    return Section("Notices", "", [Table(("time (UTC)", "severity", "axis", "notice", "acknowledged"), rows, caption)])
 
 
 def _answered(given: Mapping[str, Any] | None) -> str:
     if given is None:
-        return "waits"
+        return "pending"
     return f"{given['who']}, {_minute(given['time'])}" + (f": {given['note']}" if given["note"] else "")
 
 

@@ -1,4 +1,4 @@
-"""Shows on the terminal how the drives are, and which notices wait for somebody."""
+"""Shows trends, changes and notices of the history on the terminal."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,7 +14,7 @@ SHOWN_OPEN, SHOWN_DONE = 10, 5
 
 
 def show_health(told: Mapping[str, Mapping[str, Any]], console: Console | None = None) -> None:
-    """Print slopes, limits and changes of every axis, where there are any."""
+    """Print slopes, limits and changes of every axis that has some."""
     out = console or open_console()
     for axis, its in told.items():
         if rows := slope_rows(its):
@@ -31,12 +31,12 @@ def show_health(told: Mapping[str, Mapping[str, Any]], console: Console | None =
 
 
 def show_notices(notices: Sequence[Mapping[str, Any]], console: Console | None = None) -> None:
-    """Print which notices wait to be acknowledged, and who acknowledged the last ones."""
+    """Print the pending notices, and the latest acknowledged ones with their operators."""
     out = console or open_console()
     waiting = [notice for notice in notices if notice["acknowledged"] is None]
     done = [notice for notice in notices if notice["acknowledged"] is not None]
     if waiting:
-        out.print(f"notices that wait to be acknowledged (fdhil acknowledge): {len(waiting)}", highlight=False)
+        out.print(f"pending notices (see fdhil acknowledge): {len(waiting)}", highlight=False)
     for notice in waiting[-SHOWN_OPEN:]:
         out.print(escape(_line(notice)), highlight=False)
     for notice in done[-SHOWN_DONE:]:

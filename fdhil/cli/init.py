@@ -1,4 +1,4 @@
-"""``fdhil init``: from nothing to a machine's configuration, by asking the NC's files, the drives and the operator."""
+"""``fdhil init``: create a machine configuration from NC files, drives and answers of the operator."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ SCHEMA = "fdhil-init-1"
 INTERFACES = Path("/sys/class/net")
 CAN_TYPE = "280"  # ARPHRD_CAN of the kernel
 NEXT = (
-    ("doctor", "what is still wrong with this PC, bus and drives"),
-    ("check", "whether the drives are as the file says"),
-    ("commission", "prove what a correction needs; nothing is sent before"),
-    ("run", "listen, identify, predict"),
+    ("doctor", "diagnose this PC, bus and drives"),
+    ("check", "compare the drives with the file"),
+    ("commission", "prepare for a correction; nothing is sent before"),
+    ("run", "identify and predict"),
 )
 
 
 @click.command(cls=Writing)
 @click.argument("file", type=OutputFile(".toml"), default=DEFAULT_CONFIG)
 @click.option("--answers", type=FILE,
-              help="TOML with answers, its keys those of the configuration; then nothing is asked.")  # fmt: skip
+              help="Answers (TOML) with the keys of the configuration; disables all prompts.")  # fmt: skip
 @click.option("--from-linuxcnc", "ini", type=FILE, metavar="INI",
-              help="Take axes, speeds and scales from this LinuxCNC machine and its HAL files.")  # fmt: skip
+              help="Read axes, speeds and scales from this LinuxCNC machine and its HAL files.")  # fmt: skip
 @click.option("--hal", is_flag=True,
-              help="Drives are LinuxCNC's HAL pins: propose them, and write FILE's HAL file besides.")  # fmt: skip
+              help="Use LinuxCNC's HAL pins as drives, and write a HAL file next to FILE.")  # fmt: skip
 @click.option("--eds", "places", multiple=True, type=FILE,
-              help="EDS or DCF file, or a folder of them; left out: the folder of FILE.")  # fmt: skip
-@click.option("--offline", is_flag=True, help="Look at no bus and no running HAL: what they would tell is asked.")
-@click.option("--dry-run", is_flag=True, help="Write no file; print what it would be.")
+              help="EDS or DCF file, or folder of such files (default: the folder of FILE).")  # fmt: skip
+@click.option("--offline", is_flag=True, help="Do not access a bus or a running HAL; prompt for their values instead.")
+@click.option("--dry-run", is_flag=True, help="Print the file instead of writing it.")
 @AS_JSON
 def init(
     file: Path,
@@ -56,23 +56,22 @@ def init(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Create the configuration FILE of a machine from the NC's own files, the drives, and questions.
+    """Create the configuration FILE of a machine from NC files, drives and questions.
 
-    Reads LinuxCNC's files where they are named, listens to the CAN bus and, where no NC runs it, asks the drives for
-    their scales and ratings; what nobody tells is asked, with a proposal where one can be made. Nothing is written to a
-    drive, nothing moves, and a file that is there is never overwritten. Each value stands in FILE with who said so.
-    Exit codes: 0 made, 2 something is not known or cannot be, 3 a bus, drive or file cannot be reached.
+    Reads LinuxCNC's files, listens to the CAN bus and, if no NC runs it, reads scales and ratings from the drives.
+    Prompts for the remaining values, with proposals. Nothing is written to a drive, nothing moves, and an existing
+    FILE is never overwritten. FILE names the source of each value.
     """
     if offline and places:
-        raise click.UsageError("--eds fits files to drives on the bus, and --offline looks at none: give one of them")
+        raise click.UsageError("--eds needs drives on the bus, which --offline does not access; give only one of them")
     if hal and ini is None:
-        raise click.UsageError("--hal takes the pins from LinuxCNC's files: give --from-linuxcnc INI too")
+        raise click.UsageError("--hal reads the pins from LinuxCNC's files; give --from-linuxcnc INI as well")
     if hal and places:
-        raise click.UsageError("--hal looks at no CAN bus, so that --eds fits nothing: give one of them")
+        raise click.UsageError("--eds needs drives on a CAN bus, which --hal does not use; give only one of them")
     hal_file = file.with_suffix(".hal")
     for each in (file, hal_file) if hal else (file,):
         if each.exists() and not dry_run:
-            text = "is there already, and init never overwrites; name another file, or move it away"
+            text = "exists, and fdhil init never overwrites a file; name another file, or move it away"
             raise OutputError(f"{each} {text}")
     given = machine_config.read_toml(answers, "a file of answers") if answers is not None else {}
     from fdhil.commissioning.init.linuxcnc import read_linuxcnc  # late: --help imports nothing heavy
@@ -87,7 +86,7 @@ def init(
     text = conclude(draft, file)
     made = {file: text} | ({hal_file: _hal_text(text, file, nc, draft)} if nc is not None and hal else {})
     for place, content in made.items() if not dry_run else ():
-        with place.open("x", encoding="utf-8") as out:  # whatever came there meanwhile is kept
+        with place.open("x", encoding="utf-8") as out:  # never overwrites a file created meanwhile
             out.write(content)
     if as_json:
         click.echo(json.dumps(_document(draft, file, text, dry_run)))
@@ -97,30 +96,30 @@ def init(
 
 
 def running_pins() -> list[str]:
-    """Return the pins that HAL has now; empty where it does not run, or this user may not ask it."""
+    """Return the pins of the running HAL; empty if it does not run or is not accessible."""
     try:
-        asked = subprocess.run(["halcmd", "-s", "show", "pin"], capture_output=True, text=True, timeout=10, check=True)
+        listing = subprocess.run(
+            ["halcmd", "-s", "show", "pin"], capture_output=True, text=True, timeout=10, check=True
+        )
     except (OSError, subprocess.SubprocessError):
         return []
-    return [words[4] for line in asked.stdout.splitlines() if len(words := line.split()) > 4]
+    return [words[4] for line in listing.stdout.splitlines() if len(words := line.split()) > 4]
 
 
 def _hal_text(text: str, file: Path, nc: Machine, draft: Draft) -> str:
-    """Return the HAL file that loads the bridge, and lets offsets pass where an axis may be corrected."""
     from fdhil.commissioning.init.hal_file import correction_hal, splices_of
 
     machine = machine_config.parse(machine_config.toml_document(text.encode(), str(file)), str(file), file.parent)
     corrected = [axis for axis, settings in machine.axis.items() if settings.correction is not None]
     draft.notes.append(
-        f"{file.with_suffix('.hal').name} loads the bridge: name it as the last HALFILE in [HAL] of the INI; see that "
-        f"LinuxCNC's user can read {file.name}"
+        f"{file.with_suffix('.hal').name} loads the bridge: add it as the last HALFILE in [HAL] of the INI; "
+        f"LinuxCNC's user must be able to read {file.name}"
     )
     splices = splices_of(nc.hal, nc.joints, corrected)
     return correction_hal(machine, str(file.resolve()), nc.joint_count, splices, nc.hal)
 
 
 def _look(places: Sequence[Path], folder: Path) -> Look:
-    """Return what looks at a bus, with the EDS files that were named, or lie in the folder."""
     from fdhil.commissioning.init.drives import find_drives
     from fdhil.commissioning.scan import read_descriptions
 
@@ -129,17 +128,16 @@ def _look(places: Sequence[Path], folder: Path) -> Look:
         raise faults[0]
 
     def look(name: str, settings: machine_config.CanBus) -> FoundBus:
-        click.echo(f"listening on bus {name}, then asking the drives; nothing is written to them", err=True)
+        click.echo(f"listening on bus {name}, then reading from the drives; nothing is written to them", err=True)
         found = find_drives(name, settings, descriptions)
         for drive in found.drives:
-            click.echo(f"  {drive.name}: profile {drive.profile or 'not known'}", err=True)
+            click.echo(f"  {drive.name}: profile {drive.profile or 'unknown'}", err=True)
         return found
 
     return look
 
 
 def _can_interface() -> Told | None:
-    """Return the name of this PC's CAN interface, None where it has none; of several, the first."""
     from fdhil.commissioning.init.told import Told
 
     found = [place.parent.name for place in sorted(INTERFACES.glob("*/type")) if place.read_text().strip() == CAN_TYPE]
@@ -148,7 +146,7 @@ def _can_interface() -> Told | None:
 
 
 def _ask(asked: Asked) -> Any:
-    """Ask the operator until the answer is a possible value; None where the proposal is taken."""
+    """Prompt until the answer is a valid value; return None if the proposal is accepted."""
     click.echo(f"\n{asked.path}: {asked.meaning}" if asked.meaning else f"\n{asked.path}", err=True)
     click.echo(f"  where: {asked.where}", err=True)
     if asked.proposal is not None:
@@ -156,24 +154,24 @@ def _ask(asked: Asked) -> Any:
     while True:
         default = None if asked.proposal is None else str(asked.proposal.value)
         try:
-            said = str(click.prompt("  value", default=default, show_default=default is not None, err=True)).strip()
+            answer = str(click.prompt("  value", default=default, show_default=default is not None, err=True)).strip()
         except click.Abort as stopped:
             if sys.stdin.isatty() or not isinstance(stopped.__context__, EOFError):
                 raise
-            fault = ConfigFault(asked.path, "is asked for, and nobody is there to answer", "give --answers FILE")
+            fault = ConfigFault(asked.path, "needs an answer, and standard input has ended", "give --answers FILE")
             raise ConfigError("standard input", [fault]) from None
-        if said == default:
+        if answer == default:
             return None
         try:
-            return asked.check(said)
+            return asked.check(answer)
         except ConfigError as error:
-            click.echo(f"  {error.faults[0].what}; once more", err=True)
+            click.echo(f"  {error.faults[0].what}; try again", err=True)
 
 
 def _document(draft: Draft, file: Path, text: str, dry_run: bool) -> dict[str, Any]:
     values = [
-        {"path": path, "value": told.value, "source": told.source, "guessed": told.guessed}
-        for path, told in draft.values.items()
+        {"path": path, "value": setting.value, "source": setting.source, "guessed": setting.guessed}
+        for path, setting in draft.values.items()
     ]
     return {
         "schema": SCHEMA,
@@ -186,12 +184,12 @@ def _document(draft: Draft, file: Path, text: str, dry_run: bool) -> dict[str, A
 
 
 def _guesses(draft: Draft) -> list[str]:
-    """Return a line for each guess; one that is the same for several axes is one."""
+    # equal guesses of several axes become one line
     places: dict[tuple[str, str, str], list[str]] = {}
-    for path, told in draft.values.items():
-        if told.guessed:
+    for path, setting in draft.values.items():
+        if setting.guessed:
             where, axis, key = path.split(".", 2) if path.startswith("axis.") else ("", "", path)
-            places.setdefault((key, str(told.value), told.source), []).append(f"{where}.{axis}" if axis else "")
+            places.setdefault((key, str(setting.value), setting.source), []).append(f"{where}.{axis}" if axis else "")
     return [
         f"{key}{' of ' if axes[0] else ''}{', '.join(axes)} = {value}: {source}"
         for (key, value, source), axes in places.items()
@@ -199,14 +197,14 @@ def _guesses(draft: Draft) -> list[str]:
 
 
 def _tell(draft: Draft, file: Path, dry_run: bool, quiet: bool) -> None:
-    """Say what is guessed, what was noticed, and how it goes on; on stderr where stdout has the file or JSON."""
+    # with --dry-run stdout has the file
     if quiet:
         return
 
     def say(line: str) -> None:
         click.echo(line, err=dry_run)
 
-    done = "would be written" if dry_run else "is written"
+    done = "would be written" if dry_run else "written"
     say(f"{file} {done}: {len(draft.values)} values, {draft.guessed} of them guessed")
     for line in _guesses(draft):
         say(f"  check {line}")

@@ -1,6 +1,6 @@
-"""``python -m fdhil.cli.kernels``: compile all kernels once, so that no command is silent for half a minute later.
+"""``python -m fdhil.cli.kernels``: compile all kernels once, which takes half a minute.
 
-``make setup`` runs it. The kernels are kept where numba keeps them: beside the code, or in ``NUMBA_CACHE_DIR``.
+``make setup`` runs it. numba caches the kernels next to the code, or in ``NUMBA_CACHE_DIR``.
 """
 
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ SLOW_ROWS = 5
 
 
 def compile_all() -> None:
-    """Send made-up rapids through everything that computes: estimators, checks, corrections, the simulated drive."""
+    """Run synthetic rapids through all computations: estimators, checks, corrections, the simulated drive."""
     config = machine_config.parse(machine_document())
     for method in (None, *tables.ESTIMATORS):
         warm(config, method)
@@ -32,7 +32,7 @@ def compile_all() -> None:
 
 
 def _unusual(config: MachineConfig) -> Iterator[Window]:
-    """Yield windows that take the ways which a sound rapid does not: a stuck sensor, a slow one, an instant one."""
+    # a stuck sensor, an instantaneous voltage and a slow voltage take other code paths than an ordinary rapid
     axis = config.axis["X"]
     sound = nominal_rapid("X", axis, config.machine.sync_period_s)
     speed = np.round(sound.speed_rad_s, 2)

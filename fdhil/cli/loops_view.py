@@ -1,4 +1,4 @@
-"""``fdhil identify --loops``: the drive's own loops beside the configured ones."""
+"""Output of ``fdhil identify --loops``: the identified and the configured control loops."""
 
 from __future__ import annotations
 
@@ -11,24 +11,18 @@ from fdhil.records import INTERVAL_95
 if TYPE_CHECKING:
     from fdhil.api.analysis import FileResult
     from fdhil.config import Axis
-    from fdhil.records import LoopEstimate
 
 
-def loops_line(told: Mapping[str, Any]) -> str:
-    """Return what the status tells of an axis' loops, for people; nothing where they are as configured."""
-    if told["validated"] and not told["warnings"]:
+def loops_line(status: Mapping[str, Any]) -> str:
+    """Return the loops of an axis' status as text; empty if they match the configuration."""
+    if status["validated"] and not status["warnings"]:
         return ""
-    gains = ", ".join(f"{name} {figures['value']:.4g}" for name, figures in told["gains"].items())
-    return f"loops {told['structure']}, {gains}; {'; '.join((*told['reasons'], *told['warnings']))}"
-
-
-def _each(found: LoopEstimate) -> list[tuple[str, float, float]]:
-    stds = (math.sqrt(found.covariance[k, k]) for k in range(len(found.names)))
-    return list(zip(found.names, found.values.tolist(), stds, strict=True))
+    gains = ", ".join(f"{name} {figures['value']:.4g}" for name, figures in status["gains"].items())
+    return f"loops {status['structure']}, {gains}; {'; '.join((*status['reasons'], *status['warnings']))}"
 
 
 def show_loops(result: FileResult, axis: Axis | None, console: Any) -> None:
-    """Write a table of the loops of one recording, and what they explain."""
+    """Print the loops of one recording and the following error that they explain."""
     from rich import box
     from rich.table import Table
 
@@ -36,27 +30,27 @@ def show_loops(result: FileResult, axis: Axis | None, console: Any) -> None:
 
     found = result.loops
     if found is None:
-        text = "  the loops are not shown: no rapid whose demand, position and current were recorded"
-        console.print(text, highlight=False, markup=False)
+        console.print("  no loops identified: no rapid with recorded demand, position and current")
         return
     regulators = None if axis is None else axis.regulators
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
-    told = "" if regulators is None else f" (configured: {regulators.structure})"
-    console.print(f"loops: {found.structure}{told}", style="italic", highlight=False, markup=False)
+    status = "" if regulators is None else f" (configured: {regulators.structure})"
+    console.print(f"loops: {found.structure}{status}", style="italic")
     for head in ("regulators", "found", "configured", "unit"):
         table.add_column(head, justify="left" if head in ("regulators", "unit") else "right", no_wrap=True)
-    for name, value, std in _each(found):
+    for k, (name, value) in enumerate(zip(found.names, found.values.tolist(), strict=True)):
+        std = math.sqrt(found.covariance[k, k])
         configured = configured_value(regulators, name)
         shown = "-" if configured is None else f"{configured:.5g}"
         table.add_row(name, f"{value:.4g} ± {INTERVAL_95 * std:.2g}", shown, UNITS[name])
     console.print(table)
     for same in equivalent_loops(found):
         gains = ", ".join(f"{key} {value:.4g}" for key, value in same.items() if not isinstance(value, str))
-        console.print(f"  the same controller: {same['structure']}, {gains}", highlight=False, markup=False)
+        console.print(f"  equivalent structure: {same['structure']}, {gains}")
     left = found.verdict.unexplained_um
-    text = f"  these loops leave {left:.3g} um of the following error"
+    text = f"  following error not explained by these loops: {left:.3g} um"
     if found.configured_um is not None:
-        text += f", the configured ones {found.configured_um:.3g} um"
-    console.print(text, highlight=False, markup=False)
+        text += f", by the configured ones: {found.configured_um:.3g} um"
+    console.print(text)
     for reason in (*found.verdict.reasons, *found.verdict.warnings):
-        console.print(f"  {reason}; {reason.advice}", highlight=False, markup=False)
+        console.print(f"  {reason}; {reason.advice}")

@@ -1,4 +1,4 @@
-"""Writes what recordings tell as a model file, which ``--model`` of predict and correct reads."""
+"""Writes identified models to a file for ``--model`` of ``fdhil predict`` and ``correct``."""
 
 import json
 import math
@@ -18,17 +18,17 @@ from fdhil.validation.weight import LOOPS_DIFFER
 
 
 def write_model(results: Sequence[FileResult], axes: Mapping[str, Axis], path: Path) -> None:
-    """Write the validated pools by axis, of several files of one axis the last one's.
+    """Write the validated pooled parameters of each axis; of several files of one axis, the last.
 
-    What has to be given is the ``axes``' nominal value; click.UsageError where a value stays unknown. Without a
-    validated pool nothing is written, nor where rapids of any file refute the loops that would be used with the model;
-    stderr says so.
+    Undetermined parameters get the nominal values of ``axes``; raises click.UsageError if one stays unknown. Nothing is
+    written, with a message on stderr, without validated parameters, or if rapids of any file refute the loops that the
+    model would use.
     """
     valid = {r.axis: r.pooled for r in results if r.axis and r.pooled is not None and r.verdict.accepted}
     if not valid:
-        click.echo(f"fdhil: {path} is not written: no recording gives a validated model", err=True)
+        click.echo(f"fdhil: {path} is not written, because no recording gives a validated model", err=True)
         return
-    loops = {r.axis: told for r in results if r.axis and (told := _loops(r.loops, axes.get(r.axis))) is not None}
+    loops = {r.axis: found for r in results if r.axis and (found := _loops(r.loops, axes.get(r.axis))) is not None}
     refuting = {r.axis: reason for r in results if r.axis and (reason := _refuting(r, axes)) is not None}
     if wrong := sorted(refuting.keys() & valid.keys() - loops.keys()):
         text = f"axis {wrong[0]}: {refuting[wrong[0]]}; {refuting[wrong[0]].advice}"
@@ -50,8 +50,8 @@ def _model(name: str, estimate: Estimate, axis: Axis | None) -> dict[str, Any]:
     values = {key: estimate.value(key) for key in PARAMETERS}
     unknown = [key for key, value in values.items() if not math.isfinite(value)]
     if unknown and axis is None:
-        text = f"{' and '.join(unknown)} of axis {name} cannot be told without a voltage"
-        raise click.UsageError(f"{text}: give its nominal values with --config to have a whole model written")
+        text = f"{' and '.join(unknown)} of axis {name} cannot be determined without a voltage"
+        raise click.UsageError(f"{text}; give --config with nominal values to write a complete model")
     if axis is not None:
         values |= {key: float(getattr(axis.nominal, key)) for key in unknown}
     terms = {key: estimate.value(key) for key in estimate.terms}
@@ -59,7 +59,7 @@ def _model(name: str, estimate: Estimate, axis: Axis | None) -> dict[str, Any]:
 
 
 def _refuting(result: FileResult, axes: Mapping[str, Axis]) -> Reason | None:
-    """Return why the regulators that would be used with a model cannot be the drive's; None where nothing says so."""
+    """Return the reason why the loops used with a model cannot be the drive's, or None."""
     reasons = [reason for reason in result.verdict.reasons if reason.code == LOOPS_DIFFER]
     if result.loops is not None and result.axis not in axes:
         reasons += result.loops.verdict.reasons
@@ -67,7 +67,7 @@ def _refuting(result: FileResult, axes: Mapping[str, Axis]) -> Reason | None:
 
 
 def _loops(found: LoopEstimate | None, axis: Axis | None) -> dict[str, Any] | None:
-    """Return the table of loops that explain the rapids where the configured ones do not; None where there are none."""
+    """Return the loops that explain the rapids better than the configured ones, or None."""
     if found is None or not found.verdict.accepted:
         return None
     if axis is None or found.configured_um is None:

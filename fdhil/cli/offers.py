@@ -1,4 +1,4 @@
-"""``fdhil offers``: what the works offers to change at this machine, and the operator's answer."""
+"""``fdhil offers``: proposed configuration changes of this machine, and the operator's answers."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault
 
 if TYPE_CHECKING:
-    from fdhil.fleet.offered import Judged
+    pass
 
 OFFER = click.argument("offer", type=FILE)
-BY = click.option("--by", required=True, help="Who answers: your name, which the works is told.")
+BY = click.option("--by", required=True, help="Your name, reported to the fleet server.")
 MOST_BY, MOST_REASON = 64, 200
 
 
@@ -28,7 +28,8 @@ MOST_BY, MOST_REASON = 64, 200
 def offers() -> None:
     """List, accept or reject proposed configuration changes.
 
-    An offer is signed, comes by fdhil uplink or as a file, and does nothing by itself. Needs the extra 'fleet'.
+    A proposed change (OFFER) is signed, arrives through fdhil uplink or as a file, and has no effect until it is
+    accepted. Needs the extra 'fleet'.
     """
 
 
@@ -38,10 +39,9 @@ def offers() -> None:
 @AS_JSON
 @verdict
 def list_(config: Path, files: tuple[Path, ...], as_json: bool) -> int:
-    """List the changes that are proposed for CONFIG's machine.
+    """List the proposed changes of CONFIG's machine.
 
-    And those of FILES: what each would change, and what that costs. Nothing is changed. Exit 1 when one of FILES cannot
-    be accepted.
+    Includes those in FILES. Shows the new values and what they invalidate. Nothing is changed.
     """
     machine_config.load(config)
     with with_extra():
@@ -59,18 +59,18 @@ def list_(config: Path, files: tuple[Path, ...], as_json: bool) -> int:
 @CONFIG
 @OFFER
 @BY
-@click.option("--loosens", "may_loosen", is_flag=True, help="A limit may be loosened, where the offer does that.")
+@click.option("--loosens", "may_loosen", is_flag=True, help="Permit the change to loosen limits.")
 @AS_JSON
 @verdict
 def accept(config: Path, offer: Path, by: str, may_loosen: bool, as_json: bool) -> None:
-    """Write the changes of OFFER into CONFIG.
+    """Accept OFFER and write its changes to CONFIG.
 
-    The old file is kept beside it. OFFER is a name of the list, or a file. Signature, time, version and the new
-    configuration are looked at once more. A daemon that runs goes on as it is until it is started anew; nothing is
-    armed by it. Exit 1 when the offer is not accepted: nothing was changed.
+    OFFER is a name from fdhil offers list, or a file. Signature, validity, version and the new configuration are
+    verified again. The old CONFIG is kept next to it. A running daemon uses the new values after a restart; nothing is
+    armed.
     """
     machine = machine_config.load(config)
-    by, place = _signed(by), _place(machine, offer)
+    by, place = _text("--by", by, MOST_BY), _place(machine, offer)
     with with_extra():
         from fdhil.fleet.offered import accept as write
     from fdhil.cli import offers_view
@@ -85,36 +85,27 @@ def accept(config: Path, offer: Path, by: str, may_loosen: bool, as_json: bool) 
 @CONFIG
 @OFFER
 @BY
-@click.option("--reason", required=True, help="Why not, for the works.")
+@click.option("--reason", required=True, help="Reason, reported to the fleet server.")
 @AS_JSON
 def reject(config: Path, offer: Path, by: str, reason: str, as_json: bool) -> None:
     """Reject OFFER, with a reason.
 
-    The works is told; nothing else is changed at the machine of CONFIG.
+    The fleet server is informed. The configuration does not change.
     """
     machine = machine_config.load(config)
-    by, place, reason = _signed(by), _place(machine, offer), _text("--reason", reason, MOST_REASON)
+    by, place, reason = _text("--by", by, MOST_BY), _place(machine, offer), _text("--reason", reason, MOST_REASON)
     with with_extra():
         from fdhil.fleet.offered import reject as note
     with audited(machine, "reject an offer", offer=str(offer), by=by) as ended:
         done = note(place, config, by, reason)
         ended["text"] = reason
-    _tell_rejected(done, as_json)
-
-
-def _tell_rejected(done: Judged, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps({"schema": "fdhil-offer-rejected-1", "offer": str(done.offer)}))
-        return
-    click.echo(f"{done.offer} is rejected; nothing was changed")
-
-
-def _signed(by: str) -> str:
-    return _text("--by", by, MOST_BY)
+    else:
+        click.echo(f"{done.offer} rejected; nothing was changed")
 
 
 def _text(option: str, text: str, most: int) -> str:
-    """Return a text in one line; ConfigError where it is none, or too long."""
     from fdhil.daemon.journal import printable
 
     if not text.strip() or len(text) > most:
@@ -123,7 +114,6 @@ def _text(option: str, text: str, most: int) -> str:
 
 
 def _place(machine: MachineConfig, offer: Path) -> Path:
-    """Return the file of an offer: the newest of that name which lies here, or the file that was named."""
     from fdhil.store.offers import lying
 
     if offer.suffix == ".offer" or offer.name != str(offer):
@@ -132,6 +122,8 @@ def _place(machine: MachineConfig, offer: Path) -> Path:
     of_name = {version: path for path, (name, version) in lie.items() if name == str(offer)}
     if not of_name:
         names = ", ".join(sorted({name for name, _ in lie.values()})) or "none"
-        fault = ConfigFault(str(offer), "is no offer that lies here", f"these do: {names}; or name a file, *.offer")
+        fault = ConfigFault(
+            str(offer), "is not a proposed change of this machine", f"choose one of: {names}; or name a file, *.offer"
+        )
         raise ConfigError("OFFER", [fault])
     return of_name[max(of_name)]

@@ -1,4 +1,4 @@
-"""Shows offers to the operator: what would change, which limit is loosened, and what that makes void."""
+"""Shows proposed changes to the operator: values, loosened limits, and what becomes invalid."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from fdhil.daemon.journal import printable
 if TYPE_CHECKING:
     from fdhil.fleet.offered import Changed, Judged
 
-NOTHING_ARMED = "nothing is armed by it"
-RESTART = "the daemon goes on with the old configuration until it is started anew: systemctl restart fdhil"
+NOTHING_ARMED = "nothing is armed"
+RESTART = "restart the daemon, which still uses the old configuration: systemctl restart fdhil"
 
 
 def tell(found: Sequence[Judged], machine: MachineConfig, as_json: bool) -> None:
-    """Write all offers that were found."""
+    """Print all proposed changes."""
     if as_json:
         click.echo(json.dumps({"schema": "fdhil-offered-1", "offers": [_document(each, machine) for each in found]}))
         return
@@ -28,43 +28,42 @@ def tell(found: Sequence[Judged], machine: MachineConfig, as_json: bool) -> None
         for line in _lines(each, machine):
             click.echo(printable(line))
     if not found:
-        trusted = "" if machine.offers.trust else "; [offers] trust names no key, so that none is fetched"
-        click.echo(f"no offers lie in {machine.offers_directory}{trusted}")
+        trusted = "" if machine.offers.trust else "; none is fetched, because [offers] trust names no key"
+        click.echo(f"no proposed changes in {machine.offers_directory}{trusted}")
 
 
 def accepted(done: Judged, before: MachineConfig, file: Path, as_json: bool) -> None:
-    """Write what was accepted, and what is to be done next."""
+    """Print the accepted changes and the next action."""
     from fdhil.fleet.offered import kept_file
 
     assert done.offer is not None
     kept = str(kept_file(file, done.offer)) if done.changes else None
     if as_json:
-        told = {"schema": "fdhil-offer-accepted-1", **_document(done, before), "kept": kept}
-        click.echo(json.dumps(told))
+        click.echo(json.dumps({"schema": "fdhil-offer-accepted-1", **_document(done, before), "kept": kept}))
         return
     for line in _changes(done, before):
         click.echo(printable(line))
     if kept is None:
-        click.echo(f"{done.offer} is accepted; {file} said so already and is as it was")
+        click.echo(f"{done.offer} accepted; {file} has these values already and was not changed")
         return
-    click.echo(f"{done.offer} is accepted and in {file}; what was there before is in {kept}")
+    click.echo(f"{done.offer} accepted and written to {file}; the previous file is {kept}")
     click.echo(f"next: {RESTART}; {NOTHING_ARMED}")
 
 
 def in_short(done: Judged) -> str:
-    """Return the changes in one line, for the audit."""
-    return "; ".join(map(_change, done.changes)) or "no value is another one"
+    """Return the changes in one line, for the audit log."""
+    return "; ".join(map(_change, done.changes)) or "no value changes"
 
 
 def voids(old: MachineConfig, new: MachineConfig) -> Iterator[str]:
-    """Yield what a change of the configuration makes void, in plain words."""
+    """Yield what a change of the configuration invalidates, as text."""
     from fdhil.commissioning.record import axis_digest, record_path
 
     for axis in new.axis:
         if record_path(new.store.directory, axis).exists() and axis_digest(old, axis) != axis_digest(new, axis):
-            yield f"the commissioning record of axis {axis} holds no longer: commission it again before it is corrected"
+            yield f"the commissioning record of axis {axis} becomes invalid: commission it before the next correction"
     if old.digest != new.digest:
-        yield "a correction that is on ends with the restart; none is armed until the axes are identified anew"
+        yield "the restart ends an active correction; arming is refused until the axes are identified again"
 
 
 def _lines(each: Judged, machine: MachineConfig) -> Iterator[str]:
@@ -85,11 +84,11 @@ def _changes(each: Judged, machine: MachineConfig) -> Iterator[str]:
     for changed in each.changes:
         yield f"  {_change(changed)}"
     for changed in each.loosens:
-        yield f"  LOOSENS {_change(changed)}: more is let through than before; accepted with --loosens alone"
+        yield f"  LOOSENS {_change(changed)}: more is permitted than before; accepting needs --loosens"
     for doubt in each.doubts:
-        yield f"  unlikely: {doubt}"
+        yield f"  implausible: {doubt}"
     if not each.changes:
-        yield "  the configuration says so already"
+        yield "  the configuration has these values already"
     if each.config is not None:
         yield from (f"  {line}" for line in voids(machine, each.config))
 
@@ -101,7 +100,7 @@ def _change(changed: Changed) -> str:
 def _value(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
-    return "(left out)" if value is None else str(value)
+    return "(not set)" if value is None else str(value)
 
 
 def _document(each: Judged, machine: MachineConfig) -> dict[str, Any]:

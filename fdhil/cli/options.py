@@ -1,4 +1,4 @@
-"""Types of option values that several commands share."""
+"""Option types and help texts that several commands share."""
 
 import math
 import os
@@ -17,52 +17,54 @@ DEFAULT_CONFIG = Path("machine.toml")
 
 
 def _check_default(_ctx: click.Context, _param: click.Parameter, value: Path) -> Path:
-    """ConfigError where no configuration was named and this folder has none."""
     if value == DEFAULT_CONFIG and not value.exists():
         fault = ConfigFault("file", "is not in this folder", "name the configuration, or create one with fdhil init")
         raise ConfigError(str(value), [fault])
     return value
 
 
-# whether it can be read is seen where it is read: a file that cannot is trouble, not a wrong call
+# readability is checked when reading: an unreadable file is exit code 3, not a wrong call
 FILE = click.Path(path_type=Path, readable=False)
 FOLDER = click.Path(path_type=Path, readable=False, file_okay=False)
 CONFIG = click.argument("config", type=FILE, default=DEFAULT_CONFIG, callback=_check_default)
 CONFIG_OPTION = click.option("--config", "config_path", type=FILE, default=DEFAULT_CONFIG, show_default=True,
-                             callback=_check_default, help="The machine's configuration (TOML).")  # fmt: skip
+                             callback=_check_default, help="Machine configuration (TOML).")  # fmt: skip
 FLEET = click.argument("fleet", type=FILE)
+PROGRAM = click.argument("program", type=FILE, metavar="PROGRAM|DEMAND.csv")
+MODEL = click.option("--model", "model_path", type=FILE, help="Model file (JSON) with the parameters of each axis.")
+FROM_HISTORY = click.option("--from-history", is_flag=True, help="Use the newest validated parameters of the history.")
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout.")
 LINES = click.option("--json", "as_json", is_flag=True, help="Write each log line as a JSON object to stdout.")
 COLUMNS = click.option(
     "--columns",
     type=FILE,
-    help="Column map (TOML): which column of another program's file is which signal, in which unit.",
+    help="Column map (TOML) that assigns signals and units to the columns of a foreign file.",
 )
 
 
 class Positive(click.FloatRange):
-    """A finite number above 0, or of a range above it: nan, which no range refuses, and infinity are wrong too."""
+    """A finite number above 0, or within a positive range; rejects nan and infinity, which a FloatRange accepts."""
 
     def __init__(self, least: float | None = None, most: float | None = None) -> None:
         super().__init__(min=least or 0.0, max=most, min_open=least is None)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Return the number; click.BadParameter where it is none."""
+        """Return the number. Raises click.BadParameter for other values."""
         number = float(super().convert(value, param, ctx))
         if not math.isfinite(number):
-            self.fail(f"{value} is no finite number.", param, ctx)
+            self.fail(f"{value} is not a finite number.", param, ctx)
         return number
 
 
 class OutputFile(click.Path):
-    """A file to be written, looked at before the work is done; with ``suffixes`` its name must end in one of them."""
+    """An output file, checked before the work starts; its name must end in one of ``suffixes``, if any are given."""
 
     def __init__(self, *suffixes: str) -> None:
         super().__init__(path_type=Path, readable=False)
         self._suffixes = suffixes
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        """Return the path; OutputError where nothing can be written there, BadParameter for an unknown suffix."""
+        """Return the path. Raises OutputError if it is not writable, click.BadParameter for an unknown suffix."""
         path = Path(value)
         if self._suffixes and path.suffix.lower() not in self._suffixes:
             self.fail(f"{value}: the name must end in {', '.join(self._suffixes)}.", param, ctx)
@@ -71,21 +73,21 @@ class OutputFile(click.Path):
 
 
 class Picture(OutputFile):
-    """A picture to be written, ``-`` where its name follows from what is drawn."""
+    """An image file to write; ``-`` derives its name from the recording."""
 
     def __init__(self) -> None:
         super().__init__(".png", ".svg", ".pdf")
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        """Return the path. Errors as of an :class:`OutputFile`."""
+        """Return the path. Raises the errors of :class:`OutputFile`."""
         return Path(value) if str(value) == "-" else super().convert(value, param, ctx)
 
 
 class ConfigFirst(click.Command):
-    """A command whose CONFIG may be left out although other arguments follow it."""
+    """A command whose CONFIG is optional although other arguments follow it."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Put the default in front where the first argument is no TOML file and the last one would be missing."""
+        """Insert the default CONFIG if the first argument is not a TOML file and the last one would be missing."""
         given = self.make_parser(ctx).parse_args(list(args))[0]
         last = [param for param in self.params if isinstance(param, click.Argument)][-1]
         first, alone = given.get("config"), not isinstance(given.get(last.name or ""), str)
@@ -95,28 +97,28 @@ class ConfigFirst(click.Command):
 
 
 class Writing(click.Command):
-    """A command that writes files: never over one that it reads, each file once, and it reports each."""
+    """A command with output files: refuses to overwrite its inputs or to write a file twice, and reports each file."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Compare what is written with what is read, run, then report which files are new."""
+        """Compare outputs with inputs, run the command, then report the files that were written."""
         given = [(p, path) for p in self.params for path in _paths(ctx.params.get(str(p.name)))]
         for k, (option, path) in enumerate(given):
             for other, there in given[:k] + given[k + 1 :]:
                 if isinstance(option.type, OutputFile) and _same_file(path, there):
-                    text = f"{path} is also what {other.human_readable_name} names; choose another name"
+                    text = f"{path} is also named by {other.human_readable_name}; choose another name"
                     raise click.BadParameter(text, ctx, option)
         outputs = [path for option, path in given if isinstance(option.type, OutputFile)]
         before = [_identity(path) for path in outputs]
         try:
             return super().invoke(ctx)
-        finally:  # a command whose answer is no writes its file, too
+        finally:  # a command that answers no writes its file as well
             for path, old in zip(outputs, before, strict=True):
                 if _identity(path) != old and (not wants_json() or sys.stderr.isatty()):
                     click.echo(f"wrote {path}", err=True)
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """Return what changes when a regular file is written; None where there is none."""
+    """Return inode and modification time of a regular file, which change when it is written; None if there is none."""
     try:
         found = path.stat()
     except OSError:
@@ -125,10 +127,10 @@ def _identity(path: Path) -> tuple[int, int] | None:
 
 
 def _same_file(path: Path, there: Path) -> bool:
-    """Whether two names are of one regular file, one that is there or one that is to be."""
+    """Return whether two names denote one regular file, existing or not yet written."""
     try:
         return path.samefile(there) and path.is_file()
-    except OSError:  # one is not there, or nobody may look
+    except OSError:  # missing, or not accessible
         return os.path.realpath(path) == os.path.realpath(there)
 
 

@@ -1,4 +1,4 @@
-"""``fdhil play``: a program or a demand streamed to the drives of a test bench that has no NC."""
+"""``fdhil play``: stream a program or demand to the drives of a test bench without NC."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
     from fdhil.commissioning.set_points import SetPoints
     from fdhil.config import MachineConfig
 
-NOBODY = "nobody is there to press Enter, and nothing was played; leave --hold out"
-MARKED_S = 1.0  # a daemon beside the guard marks a record that late
+NOBODY = "standard input has ended, so Enter cannot be pressed; nothing was played; run it without --hold"
+MARKED_S = 1.0  # a running daemon marks a record within this time
 SIGNALS: Mapping[int, str] = {
     signal.SIGINT: "stopped by Ctrl-C",
     signal.SIGTERM: "stopped by SIGTERM",
-    signal.SIGHUP: "the terminal is gone",
+    signal.SIGHUP: "the terminal was closed",
     signal.SIGQUIT: "stopped by Ctrl-\\",
 }
 
@@ -42,23 +42,25 @@ SIGNALS: Mapping[int, str] = {
 @click.command()
 @click.argument("program", type=FILE)
 @CONFIG_OPTION
-@click.option("--go-to-start", is_flag=True, help="Go to the first set-point slowly, where the axes are not there.")
-@click.option("--hold", is_flag=True, help="Hold the axes at the start until Enter is pressed: arm a correction there.")
-@click.option("--dry-run", is_flag=True, help="Check the program and say what would move; opens no bus.")
+@click.option("--go-to-start", is_flag=True, help="Move slowly to the first set-point before the start.")
+@click.option(
+    "--hold", is_flag=True, help="Hold the axes at the start until Enter is pressed, so that a correction can be armed."
+)
+@click.option("--dry-run", is_flag=True, help="Check the program and print the motion, without opening a bus.")
 @click.option("--yes", is_flag=True, help="Do not ask before the axes move.")
 @AS_JSON
 @verdict
 def play(
     program: Path, config_path: Path, go_to_start: bool, hold: bool, dry_run: bool, yes: bool, as_json: bool
 ) -> int:
-    """Stream PROGRAM (an NC program, or a demand CSV) to the drives of a test bench that has no NC.
+    """Stream PROGRAM (NC program or demand CSV) to the drives of a test bench without NC.
 
-    The axes move: fdhil produces SYNC, switches the drives on and sends their set-points, so nothing else may run the
-    bus. Asked for are a commissioning of every axis, [axis.X.setpoints] with its travel, and your yes. What would leave
-    its limits is refused before anything is sent; Ctrl-C and SIGTERM brake the axes and switch the drives off; should
-    fdhil die, the drives miss its heartbeat and stop by themselves. A correction may be armed while it plays.
-    Exit codes: 0 played to its end, 1 refused, or stopped on its way, 2 wrong option or configuration, 3 a drive or
-    bus cannot be reached, or failed on the way.
+    The axes move: fdhil produces SYNC, switches the drives on and sends the set-points. No other master may run the
+    bus. Every axis must be commissioned and have [axis.X.setpoints] with its travel, and you must confirm the start.
+
+    A program beyond the limits is refused before anything is sent. Ctrl-C and SIGTERM brake the axes and switch the
+    drives off. If fdhil fails, the drives miss its heartbeat and stop by themselves. A correction can be armed
+    meanwhile.
     """
     machine = machine_config.load(config_path)
     from fdhil.commissioning.play import plan_play
@@ -81,7 +83,6 @@ def play(
 
 
 def _play(machine: MachineConfig, plan: Plan, program: Path, go_to_start: bool, hold: bool, yes: bool) -> Played:
-    """Ask, lead the drives and play; DriveFault when it is refused."""
     from fdhil.arming.guard_presence import GuardPresence
     from fdhil.cli.bus_lock import lock_place
     from fdhil.commissioning.play import on_bench, valid_records
@@ -102,9 +103,9 @@ def _play(machine: MachineConfig, plan: Plan, program: Path, go_to_start: bool, 
         with bench.led(lambda: _vouch(machine, records, bench.as_compared)):
             stopped = bench.go_to_start(_stopping, go_to_start)
             if stopped is not None:
-                raise DriveFault("the way to the start", f"{stopped}; nothing was played")
+                raise DriveFault("the move to the start", f"{stopped}; nothing was played")
             if hold:
-                click.echo("held at the start: press Enter to begin", err=True)
+                click.echo("holding at the start: press Enter to begin", err=True)
             played = bench.play(_stopping, _entered) if hold else bench.play(_stopping)
         ended["text"] = played.stopped or f"{played.rows} set-points, to the end"
         return played
@@ -124,9 +125,9 @@ def _entered() -> bool:
 def _vouch(
     machine: MachineConfig, records: Mapping[str, CommissioningRecord], as_compared: Callable[[], set[str]]
 ) -> None:
-    """Have the records of those drives hold that are ``as_compared``: what was written to 0x1016 since was ours.
+    """Confirm the commissioning records of the drives that are still ``as_compared``; the write to 0x1016 was ours.
 
-    That is asked each time after what is known against a drive: what comes later stays.
+    The doubts of the guard and of the store are read before each comparison, so later doubts remain.
     """
     from fdhil.commissioning.void import confirm_record, void_mark
 
@@ -135,14 +136,14 @@ def _vouch(
         marks = {axis: void_mark(machine.store.directory, axis) for axis in records}
         holding = as_compared()
     except DeviceError as error:
-        click.echo(f"the guard was not told that the drives were compared: {error}", err=True)
+        click.echo(f"the guard could not be informed of the comparison of the drives: {error}", err=True)
         return
     for axis in sorted({*records} - holding):
-        text = f"axis {axis}: its drive has booted since it was compared, and nothing can be armed there"
+        text = f"axis {axis}: its drive rebooted after the comparison, so nothing can be armed there"
         click.echo(f"RecordVoid: {text}; switch the NC off and run fdhil check", err=True)
     for each in refused:
         click.echo(f"{each['code']}: {each['text']}; {each['advice']}", err=True)
-    if all(each["axis"] for each in refused):  # else the guard has taken nothing of it
+    if all(each["axis"] for each in refused):  # otherwise the guard accepted none of it
         for axis in holding - {each["axis"] for each in refused}:
             confirm_record(machine.store.directory, axis, marks[axis])
 
@@ -150,7 +151,7 @@ def _vouch(
 def _guard_told(
     machine: MachineConfig, records: Mapping[str, CommissioningRecord], as_compared: Callable[[], set[str]]
 ) -> Sequence[Mapping[str, str]]:
-    """Tell a running guard which drives are as they were compared; return what it refuses of that. DeviceError."""
+    """Report the compared drives to a running guard; return its refusals. Raises DeviceError."""
     from fdhil.arming.guard_client import GuardClient
     from fdhil.arming.token import operator_token
 
@@ -167,7 +168,7 @@ def _guard_told(
 
 @contextmanager
 def _raised() -> Iterator[None]:
-    """SIGTERM and a terminal that closes are raised like Ctrl-C while the axes stand."""
+    # while the axes stand, SIGTERM and a closed terminal act like Ctrl-C
     from fdhil.commissioning.moving import handling
 
     with handling(signal.default_int_handler):
@@ -176,7 +177,7 @@ def _raised() -> Iterator[None]:
 
 @contextmanager
 def _stopping(path: SetPoints) -> Iterator[None]:
-    """While the axes move they are braked instead, whatever is pressed how often."""
+    # while the axes move, every signal brakes them
     from fdhil.commissioning.moving import handling
 
     with handling(lambda number, _frame: path.stop(SIGNALS[number])):
@@ -184,7 +185,6 @@ def _stopping(path: SetPoints) -> Iterator[None]:
 
 
 def _told(plan: Plan, program: Path) -> str:
-    """What would move: from where to where, how fast, how long."""
     trajectory = plan.trajectory
     lines = [
         f"{program.name}: {trajectory.time_s.size} set-points, {trajectory.time_s[-1] - trajectory.time_s[0]:.3f} s"
@@ -199,17 +199,16 @@ def _told(plan: Plan, program: Path) -> str:
 
 
 def _ask(bench: Bench, program: Path, here: list[int]) -> None:
-    """Ask before anything moves; DriveFault when the answer is no, or nobody is there to give one."""
     ways = zip(bench.plan.axes, bench.away_mm(here), strict=True)
     shown = {axis: bench.plan.config.axis[axis] for axis in bench.plan.axes}
     start = ", ".join(f"{axis} {shown[axis].shown(way, form='+.3f')}" for axis, way in ways if way)
-    first = f"First the axes go slowly to the start ({start}). " if start else ""
+    first = f"First the axes move slowly to the start ({start}). " if start else ""
     question = (
-        f"The drives are as they were commissioned. {first}Then {program.name} is played. "
-        "Is everybody out of reach, is the emergency stop within it, and may the axes move?"
+        f"The drives match their commissioning. {first}Then {program.name} is played. "
+        "Is everybody clear of the machine, and the emergency stop within reach? Start?"
     )
     if not agreed(question):
-        raise DriveFault("the bench", "not confirmed; nothing moved; start again, with --yes where nobody is")
+        raise DriveFault("the bench", "not confirmed; nothing moved; start again, with --yes without a terminal")
 
 
 def _document(as_json: bool, more: Mapping[str, Any]) -> None:

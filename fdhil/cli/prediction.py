@@ -1,4 +1,4 @@
-"""``fdhil predict`` and ``fdhil correct``: the path error of a program before it is cut, and its correction."""
+"""``fdhil predict`` and ``fdhil correct``: the path error of a program before the cut, and its correction."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import click
 from fdhil import tables
 from fdhil.api.compiling import forewarn
 from fdhil.cli.failing import verdict
-from fdhil.cli.options import AS_JSON, CONFIG_OPTION, FILE, OutputFile, Positive, Writing
+from fdhil.cli.options import AS_JSON, CONFIG_OPTION, FROM_HISTORY, MODEL, PROGRAM, OutputFile, Positive, Writing
 from fdhil.records import INTERVAL_95
 from fdhil.report.parameter_view import MEANING
 
@@ -30,7 +30,7 @@ MANY_ZONES = 12
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """The argument and options that both commands have."""
+    """Argument and options that both commands share."""
 
     program: Path
     config_path: Path
@@ -43,80 +43,78 @@ class Asked:
 
 
 def _shared(wanted: Callable[..., int | None]) -> Callable[..., int | None]:
-    """Add the argument and options that both commands have; ``wanted`` gets them as one ``Asked``."""
-
     @functools.wraps(wanted)
     def command(**options: Any) -> int | None:
         if options["report"] or options["pdf"]:
             from fdhil.report import require
 
-            require()  # before the work
+            require()  # before the computation
         own = {name: value for name, value in options.items() if name not in Asked.__dataclass_fields__}
         return wanted(Asked(**{name: options[name] for name in Asked.__dataclass_fields__}), **own)
 
-    for option in reversed(
-        (
-            click.argument("program", type=FILE, metavar="PROGRAM|DEMAND.csv"),
-            CONFIG_OPTION,
-            click.option("--model", "model_path", type=FILE, help="Parameters of each axis (JSON)."),
-            click.option("--from-history", is_flag=True, help="Use the newest validated parameters of the store."),
-            click.option("--out", type=OutputFile(), help="Write a CSV with a row per SYNC period."),
-            click.option(
-                "--report", type=OutputFile(), help="Write an HTML page: a map of the error, its worst places."
-            ),
-            click.option("--pdf", type=OutputFile(".pdf"), help="Print that page as PDF (needs chromium)."),
-            AS_JSON,
-        )
-    ):
+    for option in (
+        AS_JSON,
+        click.option("--pdf", type=OutputFile(".pdf"), help="Write that page as PDF (needs chromium)."),
+        click.option("--report", type=OutputFile(), help="Write an HTML page with error map and worst locations."),
+        click.option("--out", type=OutputFile(), help="Write a CSV with one row per SYNC period."),
+        FROM_HISTORY,
+        MODEL,
+        CONFIG_OPTION,
+        PROGRAM,
+    ):  # the last one is shown first
         option(command)
     return command
 
 
 @click.command(cls=Writing)
 @_shared
-@click.option("--sensitivity", is_flag=True, help="Tell per zone by how many um 1 % of each parameter raises it.")
+@click.option("--sensitivity", is_flag=True, help="Show per zone the error change, um, for 1 % of each parameter.")
 @click.option(
     "--tolerance-um",
     type=Positive(),
-    help="With --from-history: when each zone leaves this tolerance, if the parameters go on as they did.",
+    help="Forecast when each zone exceeds this tolerance, um, from the parameter trends (needs --from-history).",
 )
 @click.option(
-    "--since", type=int, metavar="REVISION", help="With --from-history: compare inertia and friction with REVISION."
+    "--since",
+    type=int,
+    metavar="REVISION",
+    help="Compare inertia and friction with this revision (needs --from-history; default: the last step).",
 )
-def predict(asked: Asked, sensitivity: bool, tolerance_um: float | None, since: int | None) -> None:
-    """Predict the path error that the drives will leave of a PROGRAM (NC program or demand CSV).
+def predict(options: Asked, sensitivity: bool, tolerance_um: float | None, since: int | None) -> None:
+    """Predict the path error of a PROGRAM (NC program or demand CSV) before it is cut.
 
-    The parameters are the configuration's nominal ones unless --model or --from-history says otherwise. A program is
-    read as LinuxCNC 2.9 reads it, or by [nc] dwell_unit and integers. Exit codes: 0 done, 2 wrong option, model or
-    configuration, 3 a file cannot be read or written.
+    Uses the nominal parameters of the configuration unless --model or --from-history is given. Programs are interpreted
+    as in LinuxCNC 2.9, modified by [nc] dwell_unit and integers.
 
-    With --from-history the contour error has its standard deviation, from the parameters' covariance, and a step of an
-    axis' inertia or friction is told with what it costs: since REVISION, or since before the last step. The prediction
-    is kept in the store, and the next one of the same program tells what became of each zone, and by which parameter.
+    With --from-history the contour error gets a standard deviation from the covariance of the parameters, and steps of
+    inertia or friction are shown with their cost. The prediction is stored; the next one of the same program shows the
+    change of each zone and the parameters that caused it.
     """
-    if not asked.from_history and (tolerance_um is not None or since is not None):
-        raise click.UsageError("--tolerance-um and --since look at the history: give --from-history too")
-    reference, models, config = inputs(asked.program, asked.config_path, asked.model_path, asked.from_history)
+    if not options.from_history and (tolerance_um is not None or since is not None):
+        raise click.UsageError("--tolerance-um and --since need --from-history")
+    reference, models, config = inputs(options.program, options.config_path, options.model_path, options.from_history)
     from fdhil import prediction
     from fdhil.correction.document import prediction_document
 
     forewarn("predict")
     predicted = prediction.predict(reference, models, config)
     columns = _prediction_columns(predicted)
-    document = {"schema": "fdhil-predict-1", "program": str(asked.program), **prediction_document(predicted, models)}
-    told = None
+    document = {"schema": "fdhil-predict-1", "program": str(options.program), **prediction_document(predicted, models)}
+    um_per_percent = None
     if sensitivity or tolerance_um is not None:
-        told = prediction.sensitivity_um(predicted, models, config)
-        for zone, per_axis in zip(document["zones"], told, strict=True):
+        um_per_percent = prediction.sensitivity_um(predicted, models, config)
+        for zone, per_axis in zip(document["zones"], um_per_percent, strict=True):
             zone["um_per_percent"] = per_axis
     steps: Sequence[Step] = ()
-    if asked.from_history:
-        std_um, steps = _with_history(document, asked.program, predicted, models, config, since, told, tolerance_um)
+    if options.from_history:
+        std_um, steps = _with_history(
+            document, options.program, predicted, models, config, since, um_per_percent, tolerance_um
+        )
         columns["contour_std_um"] = (std_um, 4)
-    if asked.out is not None:
-        _write(asked.out, columns)
-    _report(asked, config, predicted)
-    if asked.as_json:
+    if options.out is not None:
+        _write(options.out, columns)
+    _report(options, config, predicted)
+    if options.as_json:
         click.echo(json.dumps(document, allow_nan=False))
         return
     from fdhil.cli import forecast
@@ -133,12 +131,12 @@ def _with_history(
     models: Mapping[str, Parameters],
     config: MachineConfig,
     since: int | None,
-    told: Sequence[Mapping[str, Mapping[str, float]]] | None,
+    um_per_percent: Sequence[Mapping[str, Mapping[str, float]]] | None,
     tolerance_um: float | None,
 ) -> tuple[Float, Sequence[Step]]:
-    """Add to the document what the history says, and this prediction to the history.
+    """Add the history's results to the document and store this prediction.
 
-    Return the standard deviation of the contour error (n,) um, and the steps.
+    Returns the standard deviation of the contour error, (n,) um, and the parameter steps.
     """
     from fdhil import prediction
     from fdhil.cli import forecast
@@ -156,24 +154,25 @@ def _with_history(
     now = forecast.comparison(program, digest, past, predicted, models, config, zones)
     document["compared"] = forecast.compared(past, now, predicted, std_um, config)
     forecast.remember(past, now, config)
-    if tolerance_um is not None and told is not None:
+    if tolerance_um is not None and um_per_percent is not None:
         document["tolerance_um"] = tolerance_um
-        for zone, when in zip(zones, forecast.crossings(past, predicted, told, models, tolerance_um), strict=True):
+        for zone, when in zip(
+            zones, forecast.crossings(past, predicted, um_per_percent, models, tolerance_um), strict=True
+        ):
             zone["crosses"] = when
     return std_um, steps
 
 
 @click.command(cls=Writing)
 @_shared
-@click.option("--method", type=click.Choice(list(tables.CORRECTIONS)), help="Left out: the best there is.")
+@click.option("--method", type=click.Choice(list(tables.CORRECTIONS)), help="Correction method (default: the best).")
 @verdict
-def correct(asked: Asked, method: str | None) -> int:
-    """Plan the offsets that correct the predicted path error of a PROGRAM (NC program or demand CSV).
+def correct(options: Asked, method: str | None) -> int:
+    """Plan the offsets that correct the path error of a PROGRAM (NC program or demand CSV).
 
-    Nothing is sent. A correction that is not predicted to help is refused, with advice: its offsets are 0. Exit codes:
-    0 planned, 1 refused, 2 wrong option, model or configuration, 3 a file cannot be read or written.
+    Nothing is sent. A correction without a predicted improvement is refused with advice, and its offsets are 0.
     """
-    reference, models, config = inputs(asked.program, asked.config_path, asked.model_path, asked.from_history)
+    reference, models, config = inputs(options.program, options.config_path, options.model_path, options.from_history)
     from fdhil import correction
     from fdhil.api.machine import held_out_max_um
     from fdhil.correction.document import correction_document
@@ -181,54 +180,53 @@ def correct(asked: Asked, method: str | None) -> int:
     from fdhil.store.known_gain import known_gain
 
     forewarn("predict", "correct")
-    held_out_um = {} if asked.model_path is None else load_model_file(asked.model_path).held_out_um
-    largest_um = held_out_max_um(reference, config, "history" if asked.from_history else asked.model_path)
+    held_out_um = {} if options.model_path is None else load_model_file(options.model_path).held_out_um
+    largest_um = held_out_max_um(reference, config, "history" if options.from_history else options.model_path)
     planned = correction.plan(reference, models, config, method, largest_um)
-    predicted = known_gain(planned, models, config, asked.from_history, held_out_um)
-    if asked.out is not None:
-        _write(asked.out, _correction_columns(planned))
-    _report(asked, config, planned, predicted)
-    if asked.as_json:
-        click.echo(json.dumps(correction_document(str(asked.program), planned, predicted, models), allow_nan=False))
+    predicted = known_gain(planned, models, config, options.from_history, held_out_um)
+    if options.out is not None:
+        _write(options.out, _correction_columns(planned))
+    _report(options, config, planned, predicted)
+    if options.as_json:
+        click.echo(json.dumps(correction_document(str(options.program), planned, predicted, models), allow_nan=False))
     else:
         _show_correction(planned, predicted, models)
     return 1 if planned.refused else 0
 
 
-def _report(asked: Asked, config: MachineConfig, found: Prediction | Correction, predicted: Gain | None = None) -> None:
-    """Write the page of a prediction or correction where one was asked for; FdhilError without the extra ``report``."""
-    if asked.report is None and asked.pdf is None:
+def _report(
+    options: Asked, config: MachineConfig, found: Prediction | Correction, predicted: Gain | None = None
+) -> None:
+    if options.report is None and options.pdf is None:
         return
     from fdhil.records import Prediction
     from fdhil.report import deliver
     from fdhil.report.path import correction_page, prediction_page
 
-    name, machine = asked.program.name, config.machine.name
+    name, machine = options.program.name, config.machine.name
     parameters = "the nominal parameters of the configuration"
-    if asked.from_history:
+    if options.from_history:
         parameters = "the newest parameters of the history"
-    elif asked.model_path is not None:
-        parameters = f"the parameters of {asked.model_path.name}"
+    elif options.model_path is not None:
+        parameters = f"the parameters of {options.model_path.name}"
     if isinstance(found, Prediction):
         page = prediction_page(name, machine, found, parameters)
     else:
         page = correction_page(name, machine, found, parameters, predicted)
-    deliver(page, asked.report, asked.pdf)
+    deliver(page, options.report, options.pdf)
 
 
 def inputs(
     program: Path, config_path: Path, model_path: Path | None, from_history: bool
 ) -> tuple[Trajectory, dict[str, Parameters], MachineConfig]:
-    """Read configuration, model and reference, in this order; loops of the model are in the configuration."""
+    """Read configuration, model and reference, in this order; loops of the model replace those of the configuration."""
     if model_path is not None and from_history:
-        raise click.UsageError("--model and --from-history exclude each other: give one of them")
+        raise click.UsageError("--model and --from-history exclude each other; give only one of them")
     from fdhil.api.machine import Machine, read_inputs
 
-    return read_inputs(program, Machine.load(config_path), "history" if from_history else model_path, _warn)
+    print_note = functools.partial(click.echo, err=True)
 
-
-def _warn(text: str) -> None:
-    click.echo(text, err=True)
+    return read_inputs(program, Machine.load(config_path), "history" if from_history else model_path, print_note)
 
 
 def _covariances(reference: Trajectory, past: Past) -> dict[str, Float]:
@@ -239,7 +237,7 @@ def _covariances(reference: Trajectory, past: Past) -> dict[str, Float]:
 
 
 def _prediction_columns(predicted: Prediction) -> dict[str, tuple[Float, int]]:
-    """Return the columns of the CSV: header -> values (n,) and decimals."""
+    """Return the CSV columns: header -> values (n,) and number of decimals."""
     reference = predicted.reference
     columns: dict[str, tuple[Float, int]] = {"time_s": (reference.time_s, 6 if reference.dt_s >= 1e-5 else 9)}
     for axis in reference.axes:
@@ -265,7 +263,6 @@ def _correction_columns(planned: Correction) -> dict[str, tuple[Float, int]]:
 
 
 def _write(path: Path, columns: Mapping[str, tuple[Float, int]]) -> None:
-    """Write columns as CSV whose first line is the header; OutputError when the file cannot be written."""
     import numpy as np
 
     from fdhil.store.output import open_output
@@ -278,7 +275,7 @@ def _write(path: Path, columns: Mapping[str, tuple[Float, int]]) -> None:
 
 
 def _show_prediction(
-    predicted: Prediction, told: Sequence[Mapping[str, Any]] | None = None, tolerance_um: float | None = None
+    predicted: Prediction, zones: Sequence[Mapping[str, Any]] | None = None, tolerance_um: float | None = None
 ) -> None:
     from fdhil.cli.forecast import crossing_text
     from fdhil.correction import document
@@ -287,9 +284,9 @@ def _show_prediction(
     contour, time_s = document.contour(predicted), predicted.reference.time_s
     click.echo(
         f"{time_s[-1] - time_s[0]:.2f} s of path: contour error {contour['rms_um']:.1f} um RMS,"
-        f" {contour['max_um']:.1f} um at most" + (f"; {MEANING}" if told and "std_um" in told[0] else "")
+        f" {contour['max_um']:.1f} um at most" + (f"; {MEANING}" if zones and "std_um" in zones[0] else "")
     )
-    entries = document.zones(predicted) if told is None else told
+    entries = document.zones(predicted) if zones is None else zones
     shown = sorted(sorted(entries, key=lambda zone: -zone["max_um"])[:MANY_ZONES], key=lambda zone: zone["start_s"])
     for note in predicted.reference.notes:
         click.echo(f"note, {note}; {note.advice}", err=True)
@@ -305,7 +302,7 @@ def _show_prediction(
         if "crosses" in zone and tolerance_um is not None:
             click.echo(f"{'':26}{crossing_text(zone['crosses'], tolerance_um)}")
     if len(entries) > len(shown):
-        click.echo(f"  and {len(entries) - len(shown)} smaller zones (--json lists them all)")
+        click.echo(f"  and {len(entries) - len(shown)} smaller zones (--json lists all)")
 
 
 def _driver(per_axis: Mapping[str, Mapping[str, float]]) -> str:
@@ -313,7 +310,7 @@ def _driver(per_axis: Mapping[str, Mapping[str, float]]) -> str:
         ((rise, axis, name) for axis, values in per_axis.items() for name, rise in values.items()),
         key=lambda item: abs(item[0]),
     )
-    return f"1 % more {name} of axis {axis} changes it by {rise:+.2f} um"
+    return f"1 % more {name} of axis {axis} changes the error by {rise:+.2f} um"
 
 
 def _show_correction(planned: Correction, predicted: Gain, models: Mapping[str, Parameters]) -> None:
@@ -330,5 +327,5 @@ def _show_correction(planned: Correction, predicted: Gain, models: Mapping[str, 
         click.echo(f"predicted with the {planned.method} correction: {predicted}; {most}{sure}")
         blind = [axis for axis, where in document.seen_at(models).items() if where == "encoder"]
         if blind:
-            told = f"that is where the encoders of {', '.join(blind)} are: what a table swings behind its motor they"
-            click.echo(f"{told} do not see; where it does, tell resonance_hz of the axis")
+            text = f"this applies at the encoders of {', '.join(blind)}, which do not measure oscillation of the table"
+            click.echo(f"{text}; if the table oscillates behind its motor, set resonance_hz of the axis")

@@ -1,4 +1,4 @@
-"""``fdhil interpret``: the motions of an NC program."""
+"""``fdhil interpret``: list the motions of an NC program."""
 
 import json
 import shutil
@@ -16,18 +16,18 @@ _SPOOL_CHARACTERS = 8_000_000
 
 @click.command()
 @click.argument("program", type=FILE)
-@click.option("--config", "config_path", type=FILE, help="The machine (TOML): its dialect, axes and 32 bit positions.")
+@click.option("--config", "config_path", type=FILE, help="Machine configuration (TOML) with NC dialect and axes.")
 @click.option("--json", "as_document", is_flag=True, help="Print one JSON document instead of a table.")
 @click.option("--max-blocks", type=click.IntRange(min=1), default=10_000_000, show_default=True,
-              help="Blocks that may be executed before the program is refused.")  # fmt: skip
+              help="Largest number of executed blocks.")  # fmt: skip
 @click.option("--max-repeated-blocks", "max_repeated", type=click.IntRange(min=1), default=500_000, show_default=True,
-              help="Of these, blocks that loops and calls may execute again.")  # fmt: skip
+              help="Largest number of blocks repeated by loops and calls.")  # fmt: skip
 def interpret(program: Path, config_path: Path | None, as_document: bool, max_blocks: int, max_repeated: int) -> None:
-    """List the motions that PROGRAM (ISO 6983, G-code) orders, in machine millimetres.
+    """List the motions of PROGRAM (ISO 6983, G-code) in machine millimetres.
 
-    The program is read as LinuxCNC 2.9 reads it; with --config by [nc] dwell_unit and integers, and refused where the
-    machine lacks an axis or a set-point exceeds its drive's 32 bits. Nothing is printed unless the whole program can be
-    interpreted.
+    Interprets the program as LinuxCNC 2.9 does. With --config, [nc] dwell_unit and integers apply, and the program is
+    refused if the machine lacks an axis or a set-point exceeds 32 bits. Nothing is printed unless the whole program can
+    be interpreted.
     """
     from fdhil.config import Nc, load
     from fdhil.program.budget import Budget
@@ -54,14 +54,10 @@ def interpret(program: Path, config_path: Path | None, as_document: bool, max_bl
             found = [asdict(note) for note in notes.found]
             spool.write("\n]" + (f', "notes": {json.dumps(found)}' if found else "") + "}\n")
         else:
-            spool.writelines(_row(as_json(motion)) for motion in motions)
+            for row in map(as_json, motions):
+                values = "  ".join(f"{key} {value}" for key, value in row.items() if key not in ("line", "kind"))
+                spool.write(f"{row['line']:>7}  {row['kind']:<6}  {values}\n")
         spool.seek(0)
         shutil.copyfileobj(spool, sys.stdout)
     for note in () if as_document else notes.found:
         click.echo(f"note, {note}; {note.advice}", err=True)
-
-
-def _row(motion: dict[str, object]) -> str:
-    """One line of the table: line, kind, then what the motion has."""
-    values = "  ".join(f"{key} {value}" for key, value in motion.items() if key not in ("line", "kind"))
-    return f"{motion['line']:>7}  {motion['kind']:<6}  {values}\n"

@@ -1,4 +1,4 @@
-"""``fdhil publish``: tells a network of the shop floor what the daemon knows."""
+"""``fdhil publish``: publish the daemon's status on the shop-floor network."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,7 +11,7 @@ from fdhil.cli.options import CONFIG, LINES, OutputFile, Writing
 from fdhil.config import MachineConfig
 from fdhil.errors import FdhilError
 
-EXTRAS: Mapping[str, str] = {"prometheus": "web", "mtconnect": ""}  # the others are called as their protocol
+EXTRAS: Mapping[str, str] = {"prometheus": "web", "mtconnect": ""}  # other extras have the name of the protocol
 
 
 @click.command(cls=Writing)
@@ -20,18 +20,18 @@ EXTRAS: Mapping[str, str] = {"prometheus": "web", "mtconnect": ""}  # the others
 @click.option(
     "--devices",
     type=OutputFile(),
-    help="With mtconnect: write the Devices.xml that its agent needs to this file, and stop.",
+    help="Write the Devices.xml of the MTConnect agent to this file and exit (only mtconnect).",
 )
 @LINES
 def publish(protocol: str, config: Path, devices: Path | None, as_json: bool) -> None:
-    """Publish the values of CONFIG's daemon over PROTOCOL: parameters with intervals, verdicts, alarms, offsets.
+    """Publish parameters, verdicts, alarms and offsets of CONFIG's daemon over PROTOCOL.
 
-    A process of its own for each protocol, which only asks the daemon for its status: nothing that comes over the
-    network reaches the machine. [publish.PROTOCOL] of CONFIG says where; by default no other computer can reach it.
-    While the daemon does not respond, no values are published; polling continues. Stops on SIGTERM or Ctrl-C.
+    Runs as a separate process that polls the daemon's status; nothing from the network reaches the machine.
+    [publish.PROTOCOL] of CONFIG sets the address; by default only this computer can connect. While the daemon does not
+    respond, no values are published; polling continues. Stops on SIGTERM or Ctrl-C.
     """
     if devices is not None and protocol != "mtconnect":
-        raise click.UsageError("--devices is of use with mtconnect alone")
+        raise click.UsageError("--devices applies only to mtconnect")
     machine = machine_config.load(config)
     if devices is not None:
         _write_devices(machine, devices)
@@ -55,4 +55,4 @@ def _write_devices(machine: MachineConfig, file: Path) -> None:
 
     with open_output(file) as written:
         written.write(devices(machine).encode())
-    click.echo("restart the agent: it reads the file once", err=True)
+    click.echo("restart the agent, which reads the file at its start", err=True)

@@ -1,4 +1,4 @@
-"""``fdhil record``: the demand of an air cut, captured from the bus by listening alone."""
+"""``fdhil record``: record the demand of an air cut by listening to the bus."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ NOTHING_MOVED = "nothing moved; start the program on the NC while the recording 
 
 @click.command(cls=Writing)
 @CONFIG
-@click.option("--out", required=True, type=OutputFile(), help="The demand CSV to write; as *.csv it is read as one.")
-@click.option("--seconds", type=Positive(), help="Record no longer than this.")
+@click.option("--out", required=True, type=OutputFile(), help="Demand CSV to write; use the suffix .csv.")
+@click.option("--seconds", type=Positive(), help="Maximum duration of the recording, s.")
 @click.option(
     "--rest",
     type=Positive(),
     default=2.0,
     show_default=True,
-    help="Seconds of rest after a motion that end the recording; more than the program's longest dwell.",
+    help="Standstill that ends the recording, s; must exceed the longest dwell of the program.",
 )
-@click.option("--with-gaps", is_flag=True, help="Write a demand with lost rows too, each marked nan.")
+@click.option("--with-gaps", is_flag=True, help="Write the demand even if samples were lost, marked nan.")
 @AS_JSON
 @verdict
 def record(config: Path, out: Path, seconds: float | None, rest: float, with_gaps: bool, as_json: bool) -> None:
-    """Record the demand that the NC sends to CONFIG's machine during an air cut, as a demand CSV.
+    """Record the NC's demand for CONFIG's machine during an air cut, as a demand CSV.
 
-    It listens and sends nothing. The recording begins with the first motion and ends with --rest, --seconds or Ctrl-C;
-    row k is r[k], what the drives follow at that SYNC, without offsets. Exit 1 when rows were lost (nothing is written
-    then, but with --with-gaps) or nothing moved.
+    Only listens; sends nothing. The recording starts with the first motion and ends by --rest, --seconds or Ctrl-C.
+    Row k is r[k], the set-point of the drives at that SYNC, without offsets. If samples were lost, nothing is written
+    unless --with-gaps is given.
     """
     machine = machine_config.load(config)
     import asyncio
@@ -65,7 +65,6 @@ def record(config: Path, out: Path, seconds: float | None, rest: float, with_gap
 
 
 async def _listen(machine: machine_config.MachineConfig, recorder: DemandRecorder, seconds: float | None) -> None:
-    """Feed the recorder until it is done, the time is over, or the operator stops it."""
     import asyncio
     import signal
 
@@ -74,16 +73,16 @@ async def _listen(machine: machine_config.MachineConfig, recorder: DemandRecorde
     loop, stopped = asyncio.get_running_loop(), asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stopped.set)
-    told = None
+    shown = None
 
     def take(record: Record) -> None:
-        nonlocal told
+        nonlocal shown
         if not recorder.done:
             recorder.feed(record)
         state = "recording" if recorder.moving else "waiting for a motion" if recorder.heard else None
-        if state != told:
+        if state != shown:
             click.echo(f"{state} (Ctrl-C ends)", err=True)
-            told = state
+            shown = state
         if recorder.done:
             stopped.set()
 
@@ -120,15 +119,16 @@ def _tell(recorded: RecordedDemand | None, written: bool) -> None:
         click.echo(NOTHING_MOVED, err=True)
         return
     rows = recorded.reference.time_s.size
-    click.echo(f"{rows} rows, {recorded.reference.time_s[-1]:.3f} s")
+    click.echo(f"{rows} samples, {recorded.reference.time_s[-1]:.3f} s")
     for gap in recorded.gaps[:_SHOWN_GAPS]:
         lost, at_s = gap.stop - gap.first, recorded.reference.time_s[gap.first]
-        click.echo(f"lost: {lost} rows of axis {gap.axis} at {at_s:.3f} s", err=True)
+        click.echo(f"lost: {lost} samples of axis {gap.axis} at {at_s:.3f} s", err=True)
     if len(recorded.gaps) > _SHOWN_GAPS:
-        click.echo(f"lost: {len(recorded.gaps) - _SHOWN_GAPS} gaps more", err=True)
+        click.echo(f"lost: {len(recorded.gaps) - _SHOWN_GAPS} further gaps", err=True)
     for doubt in recorded.doubts:
         click.echo(doubt, err=True)
     if not written:
-        click.echo(
-            "not written: a demand with holes corrects nothing; free the computer and cut the air again", err=True
+        text = (
+            "not written, because a demand with gaps cannot be corrected; reduce the load of this PC and record again"
         )
+        click.echo(text, err=True)

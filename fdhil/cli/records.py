@@ -1,4 +1,4 @@
-"""``fdhil replay``, ``history``, ``report`` and ``export``: what was recorded, again."""
+"""``fdhil replay``, ``history``, ``report`` and ``export``: evaluate and convert what was recorded."""
 
 from __future__ import annotations
 
@@ -25,15 +25,18 @@ HEALTH = ("slopes", "trends", "limits", "changes", "windows")
 
 @click.command()
 @click.argument("recordings", type=FILE, nargs=-1, required=True, metavar="RECORDING...")
-@click.option("--config", "config", type=FILE, help="The machine's config; left out: what the recordings say.")
-@click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Left out: the config's, else the best.")
+@click.option("--config", "config", type=FILE, help="Machine configuration (default: from the recordings).")
+@click.option(
+    "--method",
+    type=click.Choice(list(tables.ESTIMATORS)),
+    help="Estimator (default: the configuration's, else the best).",
+)
 @AS_JSON
 @verdict
 def replay(recordings: tuple[Path, ...], config: Path | None, method: str | None, as_json: bool) -> None:
-    """Repeat the analysis of recorded windows (.parquet) or recordings (.csv), bit for bit as the daemon does.
+    """Repeat the daemon's analysis of recorded windows (.parquet) or recordings (.csv), bit for bit.
 
-    Windows of one axis are fed in the order given, so that a pool of them is repeated too. Exit 1 when a window is not
-    validated, or there is none.
+    Windows of one axis are analysed in the given order, so that their pooling is repeated as well.
     """
     machine = machine_config.load(config) if config else None
     from fdhil.daemon.journal import line_of
@@ -49,7 +52,7 @@ def replay(recordings: tuple[Path, ...], config: Path | None, method: str | None
         for outcome in () if as_json else outcomes:
             click.echo(line_of(outcome)[0])
         if not windows and not as_json:
-            click.echo(f"{path}: NoWindow: there is no rapid move in it")
+            click.echo(f"{path}: NoWindow: the file contains no rapid move")
     if as_json:
         click.echo(json.dumps({"schema": "fdhil-replay-1", "validated": validated, "files": files}))
     if not validated:
@@ -69,7 +72,9 @@ def _replayed(
             if window.axis not in pipelines:
                 settings = machine or _config_of(window)
                 if window.axis not in settings.axis:
-                    raise RecordingError(f"{path} is of axis {window.axis}, which --config does not have; use its own")
+                    raise RecordingError(
+                        f"{path} is of axis {window.axis}, which --config lacks; give the configuration of that machine"
+                    )
                 forewarn("identify")
                 pipelines[window.axis] = AxisPipeline(window.axis, settings, method, with_skill=machine is not None)
             outcomes += pipelines[window.axis].feed(window)
@@ -78,7 +83,7 @@ def _replayed(
 
 
 def read_windows(path: Path) -> list[Window]:
-    """Return the windows of a stored window (.parquet) or of a recording. RecordingError when it is neither."""
+    """Return the windows of a window file (.parquet) or of a recording. Raises RecordingError for other files."""
     if path.suffix == ".parquet":
         from fdhil.store.recording_parquet import is_recording
         from fdhil.store.windows import read_window
@@ -92,7 +97,7 @@ def read_windows(path: Path) -> list[Window]:
 
 
 def _config_of(window: Window) -> machine_config.MachineConfig:
-    """Return a config with what a window says of its axis; what it cannot say is not used in a replay."""
+    """Return a configuration from the metadata of a window; the other values are placeholders that a replay ignores."""
     unknown = dict.fromkeys(("R", "L", "K", "Jt", "ft", "Cd"), 1.0)
     gains = ("position_gain_per_s", "speed_kp", "speed_ki", "current_kp", "current_ki")
     regulators = dict.fromkeys((*gains, "current_limit_a", "voltage_limit_v"), 1.0)
@@ -109,82 +114,85 @@ def _config_of(window: Window) -> machine_config.MachineConfig:
 
 @click.command(cls=Writing)
 @CONFIG
-@click.option("--axis", help="One axis only.")
+@click.option("--axis", help="Restrict to one axis.")
 @click.option(
     "--plot",
     type=OutputFile(".png", ".svg", ".pdf"),
-    help="Also draw the parameters over time and temperature: .png, .svg or .pdf.",
+    help="Plot the parameters over time and temperature (.png, .svg, .pdf).",
 )
 @AS_JSON
 def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) -> None:
-    """Show the history of CONFIG's machine: revisions, slopes, changes, maintenance dates, notices."""
+    """Show the parameter history of CONFIG's machine.
+
+    Lists revisions, slopes, changes, maintenance dates and notices.
+    """
     machine = machine_config.load(config)
     from fdhil.report import require
     from fdhil.report.history_reading import by_axis, read_history, read_notices
 
     if plot is not None:
         require()
-    rows, told = read_history(machine, axis, partial(click.echo, err=True))
+    rows, health = read_history(machine, axis, partial(click.echo, err=True))
     notices = read_notices(machine, axis)
     if axis is not None and axis not in machine.axis and not rows:
         raise click.BadParameter(
-            f"{axis} is no axis of {config}; it has {', '.join(machine.axis)}", param_hint="--axis"
+            f"{config} has no axis {axis}; its axes are {', '.join(machine.axis)}", param_hint="--axis"
         )
     if plot is not None:
         from fdhil.cli.history_plot import write_plot
 
-        write_plot(by_axis(machine, rows, told), plot)
+        write_plot(by_axis(machine, rows, health), plot)
     if as_json:
-        parts = {key: {name: of_axis[key] for name, of_axis in told.items()} for key in HEALTH}
+        parts = {key: {name: of_axis[key] for name, of_axis in health.items()} for key in HEALTH}
         click.echo(json.dumps({"schema": "fdhil-history-1", "revisions": rows, "notices": notices} | parts))
         return
-    if not rows and not told and not notices:
-        click.echo("no parameters were published yet")
+    if not rows and not health and not notices:
+        click.echo("no parameters published yet")
         return
     from fdhil.cli.history_view import show_health, show_notices
     from fdhil.cli.status_view import show_history
 
     if rows:
         show_history(rows)
-    show_health(told)
+    show_health(health)
     show_notices(notices)
 
 
 @click.command(cls=Writing)
 @click.argument("recording", type=FILE)
-@click.option("--out", required=True, type=OutputFile(), help="The file to write.")
+@click.option("--out", required=True, type=OutputFile(), help="File to write.")
 @click.option(
     "--format",
     "format_name",
     type=click.Choice([*tables.RECORDING_FORMATS, *suffixes.BUS_LOGS.values()]),
-    help="Left out: by the name of --out, else csv.",
+    help="File format (default: by the suffix of --out, else csv).",
 )
 @COLUMNS
 @AS_JSON
 def export(recording: Path, out: Path, format_name: str | None, columns: Path | None, as_json: bool) -> None:
     """Convert RECORDING to another file format.
 
-    RECORDING is a stored window (.parquet), a recording in any format (csv, parquet, mat, mdf4, hdf5), or with
-    --columns another program's file. A log of the bus (.log of the black box or candump, .blf, .asc, .trc) becomes
-    another log of the bus. mdf4 needs the extra 'mdf', hdf5 the extra 'hdf5'.
+    RECORDING is a window file (.parquet), a recording (csv, parquet, mat, mdf4, hdf5), or a foreign file with
+    --columns. A bus log (.log of the black box or of candump, .blf, .asc, .trc) is converted to another bus log. mdf4
+    needs the extra 'mdf', hdf5 the extra 'hdf5'.
     """
     from fdhil.cli.export_file import export_file
 
-    told = export_file(recording, out, format_name, columns)
-    for what, happened in (("left_out", "not in"), ("reduced", "lost in")):
-        for kind, count in told.get(what, {}).items():
+    result = export_file(recording, out, format_name, columns)
+    for what, happened in (("left_out", "omitted from"), ("reduced", "reduced in")):
+        for kind, count in result.get(what, {}).items():
             click.echo(f"{count} {kind}: {happened} {out}", err=True)
     if as_json:
-        click.echo(json.dumps({"schema": "fdhil-export-1", "recording": str(recording), "file": str(out)} | told))
+        click.echo(json.dumps({"schema": "fdhil-export-1", "recording": str(recording), "file": str(out)} | result))
 
 
 @click.command(cls=Writing)
 @CONFIG
-@click.option("--out", required=True, type=OutputFile(), help="The HTML file to write.")
-@click.option("--pdf", type=OutputFile(".pdf"), help="Also print it as PDF (needs chromium).")
+@click.option("--out", required=True, type=OutputFile(), help="HTML file to write.")
+@click.option("--pdf", type=OutputFile(".pdf"), help="PDF file to write as well (needs chromium).")
 @AS_JSON
 def report(config: Path, out: Path, pdf: Path | None, as_json: bool) -> None:
-    """Write an HTML report of the stored history of CONFIG's machine."""
+    """Write an HTML report of the history of CONFIG's machine."""
     from fdhil.report import require
 
     require()
@@ -192,8 +200,8 @@ def report(config: Path, out: Path, pdf: Path | None, as_json: bool) -> None:
     from fdhil.cli.history_report import write_report
     from fdhil.report.history_reading import by_axis, read_history, read_notices, read_refusals
 
-    rows, told = read_history(machine, tell=partial(click.echo, err=True))
+    rows, health = read_history(machine, tell=partial(click.echo, err=True))
     refused = read_refusals(machine)
-    write_report(machine, by_axis(machine, rows, told, refused), refused, out, pdf, read_notices(machine))
+    write_report(machine, by_axis(machine, rows, health, refused), refused, out, pdf, read_notices(machine))
     if as_json:
         click.echo(json.dumps({"schema": "fdhil-report-1", "file": str(out), "revisions": len(rows)}))

@@ -1,4 +1,4 @@
-"""``fdhil run``, and what talks to it or the guard: ``status``, ``arm``, ``disarm``, ``adopt``, ``acknowledge``."""
+"""``fdhil run`` and the clients of daemon and guard: ``status``, ``arm``, ``disarm``, ``adopt``, ``acknowledge``."""
 
 from __future__ import annotations
 
@@ -24,21 +24,25 @@ from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, DriveFault
 if TYPE_CHECKING:
     from fdhil.arming.guard_client import GuardClient
 
-DISARM_S = 15.0  # the daemon waits for the guard's answer and for the ramp
+DISARM_S = 15.0  # covers the guard's answer and the ramp
 WATCH_S = 1.0
-UNASKED = "hold the feed and run it again, with --yes where nobody can be asked"
+UNASKED = "hold the feed and run it again, with --yes without a terminal"
 
 
 @click.command()
 @CONFIG
-@click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Left out: the config's, else the best.")
+@click.option(
+    "--method",
+    type=click.Choice(list(tables.ESTIMATORS)),
+    help="Estimator (default: the configuration's, else the best).",
+)
 @LINES
 @verdict
 def run(config: Path, method: str | None, as_json: bool) -> int:
-    """Run the daemon of the machine in CONFIG: listen, identify, predict; correct only when armed.
+    """Run the daemon of CONFIG's machine: identify, predict, and correct once armed.
 
-    Writes one line per outcome to stderr, with --json to stdout. Stops on SIGTERM or Ctrl-C, with the correction ramped
-    to zero first. Exit 3 when an offset may still be applied then: the last line says which, and what to do.
+    Writes one line per outcome to stderr, or with --json to stdout. On SIGTERM or Ctrl-C it ramps the correction to
+    zero and stops.
     """
     machine = machine_config.load(config)
     from fdhil.api.compiling import forewarn
@@ -47,8 +51,8 @@ def run(config: Path, method: str | None, as_json: bool) -> int:
 
     forewarn("identify", "predict", "correct")
     with journal.lines_as_json(as_json):
-        stands = service.run(machine, open_machine, method)
-    return 0 if stands.nothing else 3
+        residual = service.run(machine, open_machine, method)
+    return 0 if residual.nothing else 3
 
 
 def _ask(
@@ -65,17 +69,20 @@ def _ask(
 
 @click.command()
 @CONFIG
-@click.option("--watch", is_flag=True, help="Show it again each second until Ctrl-C; with --json, a line each.")
+@click.option("--watch", is_flag=True, help="Repeat every second until Ctrl-C (with --json: one line each).")
 @AS_JSON
 def status(config: Path, watch: bool, as_json: bool) -> None:
-    """Show the status of CONFIG's daemon: parameters, windows, frames, guard, notices."""
+    """Show the status of CONFIG's daemon.
+
+    Lists parameters, windows, frames, guard state and notices.
+    """
     if not watch:
         _show_status(config, as_json)
         return
     with suppress(KeyboardInterrupt):
         while True:
             if not as_json:
-                click.clear()  # of a terminal; elsewhere one status follows the other
+                click.clear()  # has no effect without a terminal
             try:
                 _show_status(config, as_json)
             except (ConnectError, DeviceTimeout) as error:  # the daemon may be restarted meanwhile
@@ -98,27 +105,29 @@ def _show_status(config: Path, as_json: bool) -> None:
 @click.command(cls=ConfigFirst)
 @CONFIG
 @click.argument("program", type=FILE, required=False)
-@click.option("--method", type=click.Choice(list(tables.CORRECTIONS)), help="Left out: the best there is.")
-@click.option("--whole", is_flag=True, help="Arm only when all of a long PROGRAM has passed, however long that takes.")
+@click.option("--method", type=click.Choice(list(tables.CORRECTIONS)), help="Correction method (default: the best).")
+@click.option("--whole", is_flag=True, help="Arm only after the whole PROGRAM has passed the check.")
 @AS_JSON
 @verdict
 def arm(config: Path, program: Path | None, method: str | None, whole: bool, as_json: bool) -> None:
-    """Arm the correction of one PROGRAM (or demand CSV) on the machine of CONFIG.
+    """Arm the correction of one PROGRAM (or demand CSV) on CONFIG's machine.
 
-    Without PROGRAM, --method flatness feeds speed and torque forward on line, whatever runs.
+    Without PROGRAM, --method flatness applies speed and torque feed-forward online to any program.
 
-    A program longer than 10 s is armed when all of it, or its first minute, has passed the check, which then goes on
-    ahead of the motion: what it refuses later is told at least a minute ahead, and the correction ramped to zero before
-    that place. How far the check is goes to stderr (with --json one JSON object per line); Ctrl-C abandons it. What was
-    checked is not checked again until program, parameters or config change.
+    A program longer than 10 s is armed once its first minute has passed the check, which then continues ahead of the
+    motion. A later refusal is reported at least one minute ahead, and the correction is ramped to zero before that
+    position. Progress goes to stderr (with --json one JSON object per line); Ctrl-C aborts the check. Results of the
+    check are reused until program, parameters or configuration change.
 
-    Exit 1 with class, cause and next action when it is refused. Nothing is armed again by itself, ever.
+    Each arming applies once; nothing is ever armed again automatically.
     """
     if program is None and method != "flatness":
-        raise click.UsageError("only --method flatness needs no PROGRAM; name the program to correct")
+        raise click.UsageError("PROGRAM is missing; only --method flatness works without it")
     machine = machine_config.load(config)
     if program is not None:
-        os.close(os.open(program, os.O_RDONLY | os.O_NONBLOCK))  # a missing file is trouble, not the daemon's no
+        os.close(
+            os.open(program, os.O_RDONLY | os.O_NONBLOCK)
+        )  # a missing file is exit code 3, not a refusal by the daemon
     from fdhil.arming.token import read_token
 
     request = {
@@ -136,25 +145,25 @@ def arm(config: Path, program: Path | None, method: str | None, whole: bool, as_
 
 
 class _Shown:
-    """The progress of a check on stderr: one line that is written over, or JSON lines."""
+    """Progress of a program check on stderr: one line that is overwritten, or JSON lines."""
 
     def __init__(self, as_json: bool) -> None:
         self._as_json, self._open = as_json, False
 
-    def __call__(self, told: Mapping[str, Any]) -> None:
+    def __call__(self, progress: Mapping[str, Any]) -> None:
         if self._as_json:
-            click.echo(json.dumps({"progress": told}), err=True)
+            click.echo(json.dumps({"progress": progress}), err=True)
             return
-        minutes, seconds = divmod(int(told["checked_s"]), 60)
-        text = f"checked {minutes}:{seconds:02d} of the program, line {told['line']}"
-        text += f", {told['times_real_time']:.0f} x real time"
-        if told["refused"]:
-            text += f", {told['refused']} places refused"
+        minutes, seconds = divmod(int(progress["checked_s"]), 60)
+        text = f"checked {minutes}:{seconds:02d} of the program, line {progress['line']}"
+        text += f", {progress['times_real_time']:.0f} x real time"
+        if progress["refused"]:
+            text += f", {progress['refused']} positions refused"
         click.echo(f"\r{text:<78}", err=True, nl=False)
         self._open = True
 
     def end(self) -> None:
-        """Begin a new line where one is open."""
+        """End an open line."""
         if self._open:
             click.echo(err=True)
 
@@ -166,8 +175,8 @@ class _Shown:
 def disarm(config: Path, as_json: bool) -> None:
     """Ramp the correction to zero, disarm, and wait until zero is read back.
 
-    Where the daemon does not answer, the guard itself is asked. Exit 1 when zero is not reached: what may still be
-    applied is told, and what to do.
+    If the daemon does not respond, the guard is contacted directly. If zero is not reached, the residual offset and the
+    next action are printed.
     """
     try:
         answer: Mapping[str, Any] = _ask(config, {"request": "disarm"}, DISARM_S)
@@ -180,29 +189,26 @@ def disarm(config: Path, as_json: bool) -> None:
 @click.command(cls=ConfigFirst)
 @CONFIG
 @click.argument("numbers", type=int, nargs=-1, metavar="NUMBER...")
-@click.option("--all", "everything", is_flag=True, help="All that wait now.")
-@click.option("--note", default="", help="A remark that is kept with it.")
+@click.option("--all", "everything", is_flag=True, help="Acknowledge all pending notices.")
+@click.option("--note", default="", help="Remark to store with the acknowledgement.")
 @AS_JSON
 def acknowledge(config: Path, numbers: tuple[int, ...], everything: bool, note: str, as_json: bool) -> None:
-    """Acknowledge notices of CONFIG's machine by their NUMBERs, which fdhil status and fdhil history show.
+    """Acknowledge notices of CONFIG's machine by their NUMBERs.
 
-    It is kept who did and when. It says that somebody has seen them: nothing is armed and nothing is sent.
+    fdhil status and fdhil history show the numbers. Operator and time are recorded. Nothing is armed or sent.
     """
     if everything == bool(numbers):
-        raise click.UsageError("name the notices by their numbers, or give --all")
+        raise click.UsageError("give the numbers of the notices, or --all")
     chosen: dict[str, Any] = {"notices": list(numbers)}
     if everything:
         waiting = _ask(config, {"request": "status"})["unacknowledged"]["newest"]
         chosen = {"up_to": max((notice["number"] for notice in waiting), default=0)}
-    _tell(_ask(config, {"request": "acknowledge", "by": _user(), "note": note, **chosen}), as_json)
-
-
-def _user() -> str:
-    return os.environ.get("SUDO_USER") or os.environ.get("USER") or f"user {os.getuid()}"
+    user = os.environ.get("SUDO_USER") or os.environ.get("USER") or f"user {os.getuid()}"
+    _tell(_ask(config, {"request": "acknowledge", "by": user, "note": note, **chosen}), as_json)
 
 
 def _disarm_at_the_guard(config: Path, silent: DeviceError) -> Mapping[str, Any]:
-    """Ask the guard without the daemon; ``silent`` is why. ConnectError when neither answers."""
+    """Disarm at the guard after the daemon failed with ``silent``. Raises ConnectError if the guard fails as well."""
     machine = machine_config.load_places(config)
     from fdhil.arming.guard_client import GuardClient
     from fdhil.arming.standing import landed, verdict
@@ -212,24 +218,23 @@ def _disarm_at_the_guard(config: Path, silent: DeviceError) -> Mapping[str, Any]
             answer = guard.disarm()
             return {**(verdict(landed(guard.status)) if answer["ok"] else answer), "asked": "guard"}
     except DeviceError as error:
-        text = f"{silent}; nor does the guard answer ({error}): it is unknown what is applied"
+        text = f"{silent}; the guard does not answer either ({error}); the applied offset is unknown"
         raise ConnectError("machine", text) from None
 
 
 @click.command()
 @CONFIG
-@click.option("--yes", is_flag=True, help="Do not ask.")
+@click.option("--yes", is_flag=True, help="Do not ask for confirmation.")
 @AS_JSON
 @verdict
 def adopt(config: Path, yes: bool, as_json: bool) -> None:
-    """Take over the offsets that CONFIG's drives still apply (the guard's state FROZEN), and ramp them to zero.
+    """Ramp offsets that CONFIG's drives still apply to zero (guard state FROZEN).
 
-    Says what may still be applied, asks, and has the guard take it over and ramp it to zero. The guard is asked itself:
-    no daemon is needed. Hold the feed first. Exit 0 only when zero was read back, 1 when the guard refuses or zero is
-    not reached, 3 without a guard or when nobody says yes.
+    Hold the feed first. Prints the residual offsets, asks for confirmation, then the guard adopts them and ramps them
+    to zero. Contacts the guard directly; no daemon is needed.
     """
     if as_json and not yes:
-        raise click.UsageError("--json cannot ask: give --yes too")
+        raise click.UsageError("--json cannot prompt; give --yes as well")
     machine = machine_config.load_places(config)
     from fdhil.arming.guard_client import GuardClient
     from fdhil.arming.token import read_token
@@ -247,7 +252,7 @@ def adopt(config: Path, yes: bool, as_json: bool) -> None:
 
 @contextmanager
 def _written_after(config: Path, what: str, answer: Mapping[str, Any]) -> Iterator[None]:
-    """Have an answer in the audit after it was told: no disk delays it."""
+    # recorded after it was shown, so that no disk delays it
     try:
         yield
     finally:
@@ -255,30 +260,29 @@ def _written_after(config: Path, what: str, answer: Mapping[str, Any]) -> Iterat
 
 
 def _adopted(guard: GuardClient, token: Callable[[], str], yes: bool, quiet: bool) -> Mapping[str, Any]:
-    """Have what stands ramped to zero, where anything does and the operator wants it; return the answer."""
     from fdhil.arming.standing import landed, standing, verdict
     from fdhil.guard.protocol import AT_REST
 
     status = guard.status()
-    stands, state = standing(status), status["state"]
+    residual, state = standing(status), status["state"]
     if state not in AT_REST:
-        text = f"the guard is {state}, a correction is on"
+        text = f"the guard is {state}, a correction is active"
         return {"ok": False, "code": "NotOff", "text": text, "advice": "run fdhil disarm", "state": state}
-    if state == "OFF" and stands.nothing:
-        return verdict(status) | {"text": f"guard: OFF, {stands}: there is nothing to adopt"}
+    if state == "OFF" and residual.nothing:
+        return verdict(status) | {"text": f"guard: OFF, {residual}; there is nothing to adopt"}
     if not quiet:
-        click.echo(f"the guard is {state}: {stands}", err=True)
-    if not yes and not agreed("Is the feed held? Ramp it to zero now?"):
-        raise DriveFault("adoption", f"not confirmed; nothing was sent; {stands}; {UNASKED}")
+        click.echo(f"the guard is {state}: {residual}", err=True)
+    if not yes and not agreed("Is the feed held? Ramp the offset to zero now?"):
+        raise DriveFault("adoption", f"not confirmed; nothing was sent; {residual}; {UNASKED}")
     try:
         answer = guard.adopt(token())
-        return verdict(landed(guard.status)) if answer["ok"] else {**answer, "may_stand_um": dict(stands.offset_um)}
+        return verdict(landed(guard.status)) if answer["ok"] else {**answer, "may_stand_um": dict(residual.offset_um)}
     except DeviceError as error:
-        raise ConnectError("adoption", f"{error}; {stands}") from None
+        raise ConnectError("adoption", f"{error}; {residual}") from None
 
 
 def _tell(answer: Mapping[str, Any], as_json: bool) -> None:
-    """Show an answer; exit 1 when it is no, or as the answer says where something could not be read."""
+    # exit 1 for a refusal, unless the answer names another exit code
     if difference := answer.get("config_difference"):
         click.echo(without_controls(difference), err=True)
     if as_json:
@@ -289,7 +293,7 @@ def _tell(answer: Mapping[str, Any], as_json: bool) -> None:
         advice = f"; {answer['advice']}" if answer.get("advice") else ""
         click.echo(without_controls(f"refused: {answer['code']}: {answer['text']}{advice}"), err=True)
         for more in answer.get("refused", [])[1:]:
-            told = more if isinstance(more, str) else f"{more['code']}: {more['text']}; {more['advice']}"
-            click.echo(without_controls(f"also: {told}"), err=True)
+            text = more if isinstance(more, str) else f"{more['code']}: {more['text']}; {more['advice']}"
+            click.echo(without_controls(f"also: {text}"), err=True)
     if not answer["ok"]:
         click.get_current_context().exit(answer.get("exit_code", 1))

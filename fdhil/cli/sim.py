@@ -1,4 +1,4 @@
-"""``fdhil sim``: the simulated machine as a process of its own."""
+"""``fdhil sim``: simulate a machine in a separate process."""
 
 from __future__ import annotations
 
@@ -16,34 +16,30 @@ from fdhil.cli.options import CONFIG, FILE, OutputFile, Writing
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from fdhil.config import MachineConfig
-    from fdhil.records import Trajectory
     from fdhil.sim.service import SimService
 
 LINGER_S = 10.0
 LOOK_S = 0.1
 SHOW_S = 1.0
-SHOWN_MM = 0.01  # what moves less stands still
+SHOWN_MM = 0.01  # smaller motion counts as standstill
 
 
 @click.command(cls=Writing)
 @CONFIG
-@click.option("--json", "as_json", is_flag=True, help="Write events as JSON, one line each; the first is 'ready'.")
-@click.option("--faults", type=FILE, help="A fault script: what breaks when (TOML).")
+@click.option("--json", "as_json", is_flag=True, help="Write events as JSON lines to stdout; the first is 'ready'.")
+@click.option("--faults", type=FILE, help="Fault script (TOML) with faults and their times.")
+@click.option("--demand", type=FILE, help="Demand CSV to play at the start; - reads it row by row from standard input.")
+@click.option("--program", type=FILE, help="NC program to play at the start.")
 @click.option(
-    "--demand",
-    type=FILE,
-    help="A demand CSV that the NC plays at once; - takes it from standard input, row by row, as it comes.",
+    "--trace", type=OutputFile(), help="Record reference, true table position and offset of the first motion (CSV)."
 )
-@click.option("--program", type=FILE, help="An NC program that the NC plays at once.")
-@click.option("--trace", type=OutputFile(), help="Record what is played first: reference, true table and offset (CSV).")
 def sim(
     config: Path, as_json: bool, faults: Path | None, demand: Path | None, program: Path | None, trace: Path | None
 ) -> None:
-    """Run the simulated machine of CONFIG: drives, sensors and NC on a bus that any python-can program joins.
+    """Simulate the machine of CONFIG: drives, sensors and NC on a bus for any python-can program.
 
-    The drives boot into pre-operational and only answer, until the NC is switched on ([sim] nc = true, --demand,
-    --program or the panel) or another master takes over SYNC, NMT and the set-points. Standard input is the operator's
+    The drives boot to pre-operational and only answer requests until the NC is switched on ([sim] nc = true, --demand,
+    --program or the panel), or another master provides SYNC, NMT and set-points. Standard input is the operator's
     panel, one JSON object per line:
 
     \b
@@ -53,12 +49,12 @@ def sim(
       {"command": "temperature", "celsius": 22}  {"command": "fault", "axis": "X", "fault": "reboot"}
       {"command": "trace", "file": "trace.csv"}  {"command": "stop"}  {"command": "quit"}
 
-    With --demand - the same lines may stand among the rows; the NC takes the bus with the first of them, and holds
-    still while none comes. It ends on quit, Ctrl-C or SIGTERM; the end of standard input does not end it.
-    On SIGUSR1 it ends as soon as nobody is on its buses, after 10 s at the latest.
+    With --demand - these lines may be mixed with the rows. The NC starts with the first row and stands still while no
+    row arrives. The simulator ends on quit, Ctrl-C or SIGTERM, but not at the end of standard input. On SIGUSR1 it ends
+    once no client is on its buses, after 10 s at the latest.
     """
     if demand is not None and program is not None:
-        raise click.UsageError("give --demand or --program, not both")
+        raise click.UsageError("--demand and --program exclude each other; give only one of them")
     _serve(config, as_json, faults, demand or program, trace)
 
 
@@ -67,13 +63,16 @@ def _serve(path: Path, as_json: bool, script: Path | None, play: Path | None, tr
     import signal
 
     from fdhil import config
+    from fdhil.program import load_trajectory
     from fdhil.sim import fault_script
     from fdhil.sim.service import SimService
 
     machine = config.load(path)
     entries = [] if script is None else fault_script.load(script, tuple(machine.axis))
-    tell = _tell_json if as_json else _tell
-    service = SimService(machine, tell, _load, panel_fd=_panel_descriptor(), faults=entries)
+
+    service = SimService(
+        machine, _tell_json if as_json else _tell, load_trajectory, panel_fd=_panel_descriptor(), faults=entries
+    )
 
     def stop(*_: object) -> None:
         service.stop()
@@ -83,23 +82,23 @@ def _serve(path: Path, as_json: bool, script: Path | None, play: Path | None, tr
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, stop)
     signal.signal(signal.SIGUSR1, lambda *_: _stop_when_left(service, stop))
-    sys.setswitchinterval(0.0005)  # the SYNC must not wait 5 ms for the thread that serves the sensors
+    sys.setswitchinterval(0.0005)  # default 5 ms: SYNC would wait for the thread that serves the sensors
     if not as_json and sys.stderr.isatty():
         shown = Positions(lambda: {axis: unit.drive.table_mm for axis, unit in service.machine.units.items()})
         threading.Thread(target=_show_positions, args=(shown,), daemon=True).start()
-    gc.freeze()  # what is there now stays; the collector need not look at it between two SYNCs
+    gc.freeze()  # permanent objects; keeps the collector short between two SYNCs
     service.run(play, trace)
 
 
 class Positions:
-    """The line that shows where the tables are while one of them moves."""
+    """The status line with the table positions while an axis moves."""
 
     def __init__(self, read_mm: Callable[[], Mapping[str, float]]) -> None:
         self._read_mm, self._shown_mm = read_mm, read_mm()
         self._moving = False
 
     def line(self) -> str | None:
-        """Return the line, once more when all stand again; None while none has moved since it was returned last."""
+        """Return the line while an axis moves and once after it stops; otherwise None."""
         now_mm = self._read_mm()
         moved = any(abs(mm - self._shown_mm[axis]) > SHOWN_MM for axis, mm in now_mm.items())
         self._shown_mm, due = now_mm, moved or self._moving
@@ -115,7 +114,7 @@ def _show_positions(shown: Positions) -> None:
 
 
 def _stop_when_left(service: SimService, stop: Callable[[], None]) -> None:
-    """Serve on until nobody is on the buses any more: who corrects comes to zero first; LINGER_S at the most."""
+    # keep running until guard and daemon have left the bus, so that a correction can ramp to zero; at most LINGER_S
     import signal
 
     end_s = time.monotonic() + LINGER_S
@@ -127,12 +126,6 @@ def _stop_when_left(service: SimService, stop: Callable[[], None]) -> None:
 
     signal.signal(signal.SIGALRM, look)
     signal.setitimer(signal.ITIMER_REAL, LOOK_S, LOOK_S)
-
-
-def _load(path: Path, machine: MachineConfig) -> Trajectory:
-    from fdhil.program import load_trajectory
-
-    return load_trajectory(path, machine)
 
 
 def _panel_descriptor() -> int | None:
@@ -157,22 +150,22 @@ def _lines(event: dict[str, Any]) -> list[str]:
         case "nc":
             return [f"NC {'on: it sends SYNC and has enabled the drives' if event['on'] else 'off'}"]
         case "playing":
-            rows = "as its rows come" if event["rows"] is None else f"{event['rows']} rows"
+            rows = "rows from standard input" if event["rows"] is None else f"{event['rows']} rows"
             return [f"playing {event['file']}, {rows}"]
         case "finished":
             late = ", ".join(f"{axis} {n}" for axis, n in event["late_rpdo"].items())
             how = "stopped after" if event["stopped"] else "finished"
             trace = f", recorded to {event['trace']}" if event["trace"] else ""
-            missing = f"; {n} rows came late" if (n := event.get("starved")) else ""
+            missing = f"; {n} late rows" if (n := event.get("starved")) else ""
             return [f"{how} {event['rows']} rows of {event['file']}; late offset frames: {late}{missing}{trace}"]
         case "error":
-            return [f"cannot: {event['text']}"]
+            return [f"error: {event['text']}"]
     rest = ", ".join(f"{key} {value}" for key, value in event.items() if key != "event")
     return [f"{event['event']}: {rest}"]
 
 
 def _ready_lines(event: dict[str, Any]) -> list[str]:
-    lines = ["the simulated machine is ready"]
+    lines = ["the simulator is ready"]
     for name, bus in event["buses"].items():
         arguments = ", ".join(f"{key}={value!r}" for key, value in bus.items())
         load, worst = event["bus_load"][name], event["bus_load_worst"][name]

@@ -1,4 +1,4 @@
-"""Shows the daemon's status and the stored history as tables for a person."""
+"""Shows the daemon's status and the history as text and tables."""
 
 import shutil
 from collections.abc import Mapping, Sequence
@@ -15,10 +15,10 @@ from fdhil.records import PARAMETERS
 from fdhil.report.parameter_view import MEANING, cell, half_of, head
 
 BARS = "▁▂▃▄▅▆▇█"
-COURSE = 7  # revisions in a row of bars: what fits the column of a value
+COURSE = 7  # revisions in a sparkline, limited by the column width
 SHOWN_PASSES = 3
 LIVE_S = 1.0
-GUARD_LIVE_S = 2.0  # the daemon asks it twice a second
+GUARD_LIVE_S = 2.0  # the daemon polls it twice a second
 COUNTED = {
     "records_dropped": "records dropped",
     "ring_overflow": "not read in time",
@@ -38,7 +38,7 @@ COUNTED = {
 
 
 def open_console() -> Console:
-    """Return a console for stdout: as wide as the terminal or as COLUMNS says, 80 columns where there is neither."""
+    """Return a console for stdout, as wide as the terminal or COLUMNS, else 80 columns."""
     return PrintableConsole(width=shutil.get_terminal_size((80, 24)).columns)
 
 
@@ -56,21 +56,21 @@ def show(status: Mapping[str, Any], console: Console | None = None) -> None:
     out.print(escape(f"correction: {status['state']}, guard {_guard(guard)}{loads}"))
     if lateness := guard.get("lateness"):
         out.print(lateness_line(lateness["recent"]))
-    stands = status.get("may_stand", {"nothing": True})
+    residual = status.get("may_stand", {"nothing": True})
     if guard.get("state") == "lost":
         out.print(f"[red]{escape(guard['text'])}[/red]")
-    elif not stands["nothing"] and guard.get("state") in ("OFF", "FROZEN"):
-        out.print(f"[red]{escape(stands['text'])}[/red]; hold the feed, then run fdhil adopt")
+    elif not residual["nothing"] and guard.get("state") in ("OFF", "FROZEN"):
+        out.print(f"[red]{escape(residual['text'])}[/red]; hold the feed, then run fdhil adopt")
     if guard.get("shadow_um"):
         would = ", ".join(f"{axis} {offset:+.1f} um" for axis, offset in guard["shadow_um"].items())
-        out.print(escape(f"in shadow, not sent: {would}"))
+        out.print(escape(f"shadow mode, not sent: {would}"))
     armed = status.get("armed") or {}
     if armed.get("promise"):
         out.print(escape(f"armed: {armed['program']}, {armed['promise']}"))
     for refused in (armed.get("check") or {}).get("refused", []):
         out.print(f"[red]the correction ends early: {escape(refused)}[/red]")
-    for told in status.get("passes", [])[-SHOWN_PASSES:]:
-        out.print(escape(told["text"]))
+    for one in status.get("passes", [])[-SHOWN_PASSES:]:
+        out.print(escape(one["text"]))
     if checking := status.get("checking"):
         out.print(escape(f"checking {checking['program']}: {checking['checked_s']:.0f} s, line {checking['line']}"))
     if status["store"]["fault"]:
@@ -85,21 +85,21 @@ def show(status: Mapping[str, Any], console: Console | None = None) -> None:
             f"[red]{escape(where + alarm['code'])}[/red] active since {alarm['since']}{often}: {escape(alarm['text'])}"
         )
     out.print(_axes_table(status["axes"]))
-    for axis, told in status["axes"].items():
-        if unused := _unused(told):
+    for axis, found in status["axes"].items():
+        if unused := _unused(found):
             out.print(escape(f"{axis}: {unused}"))
-        if text := believed(told):
+        if text := believed(found):
             out.print(escape(f"{axis}: {text}"))
-        if (loops := told.get("loops")) and (line := loops_line(loops)):
+        if (loops := found.get("loops")) and (line := loops_line(loops)):
             out.print(escape(f"{axis}: {line}"))
     if (waiting := status.get("unacknowledged") or {}).get("count"):
-        out.print(f"notices that wait to be acknowledged: {waiting['count']}, of them MAJOR {waiting['MAJOR']}")
+        out.print(f"pending notices: {waiting['count']}, of them MAJOR {waiting['MAJOR']}")
     for notice in status["notices"][-5:]:
         out.print(escape(_notice_line(notice)))
 
 
 def _other_alarms(status: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Return the active alarms that are no troubles of the daemon, which are shown on their own."""
+    # alarms that are also troubles are shown as troubles
     shown = {(trouble["code"], trouble["axis"]) for trouble in status.get("troubles", [])}
     alarms = (status.get("alarms") or {}).get("first", [])
     return [one for one in alarms if one["state"] == "active" and (one["code"], one["axis"]) not in shown]
@@ -115,7 +115,6 @@ def _notice_line(notice: Mapping[str, Any]) -> str:
 
 
 def _heard(status: Mapping[str, Any]) -> str:
-    """Say what is heard of the machine now, and since when what is not heard any more."""
     source, sync = status["source"], status["sync"]
     state = source["state"]
     if state != "listening":
@@ -130,17 +129,17 @@ def _heard(status: Mapping[str, Any]) -> str:
 
 
 def _guard(guard: Mapping[str, Any]) -> str:
-    """Say in which state the guard is; one that has not answered for a while may be in another by now."""
+    # an old answer may be outdated
     state, heard_s = str(guard.get("state", "absent")), guard.get("heard_s_ago")
     if state == "absent" or heard_s is None:
         return state
     if state == "lost":
-        return f"lost, heard {_ago(heard_s)} ago in state {guard.get('last_state')}"
-    return state if heard_s <= GUARD_LIVE_S else f"{state} when it answered last, {_ago(heard_s)} ago"
+        return f"lost, last seen {_ago(heard_s)} ago in state {guard.get('last_state')}"
+    return state if heard_s <= GUARD_LIVE_S else f"{state} at its last answer, {_ago(heard_s)} ago"
 
 
 def lateness_line(recent: Mapping[str, Any]) -> str:
-    """Say how late this PC was in the last minute or two, as the guard measured it."""
+    """Return the lateness of this PC in the last minute or two, measured by the guard, as text."""
     worst = f"the slowest after {recent['worst_us'] / 1e3:.2f} ms"
     if not recent["late"]:
         return f"this PC: none of the last {grouped(recent['turns'])} offsets late, {worst}"
@@ -148,9 +147,9 @@ def lateness_line(recent: Mapping[str, Any]) -> str:
 
 
 def nc_line(nc: Mapping[str, Any]) -> str:
-    """Say what the NC says of itself."""
+    """Return the state reported by the NC as text."""
     if nc["motion"] == "unknown":
-        return f"NC: not heard for {_ago(nc['heard_s_ago'])}, its moves are unknown"
+        return f"NC: no data for {_ago(nc['heard_s_ago'])}, its moves are unknown"
     program = (nc["program"] or "").rpartition("/")[2]
     line = "" if nc["line"] is None else f" line {nc['line']}" + (f" of {program}" if program else "")
     parts = [f"{nc['motion']}{line}"]
@@ -159,7 +158,7 @@ def nc_line(nc: Mapping[str, Any]) -> str:
         for what in ("feed_override", "rapid_override")
         if nc[what] is not None
     ]
-    parts += ["feed held"] if nc["feed_hold"] else []
+    parts += ["feed hold"] if nc["feed_hold"] else []
     return "NC: " + ", ".join(parts)
 
 
@@ -170,21 +169,21 @@ def _ago(seconds: float) -> str:
 
 
 def grouped(count: int) -> str:
-    """Return a count in groups of three digits."""
+    """Return a count with its digits in groups of three."""
     return f"{count:,}".replace(",", " ")
 
 
 def counted(counters: Mapping[str, Any]) -> str:
-    """Return the source's counters in words: what was received and lost, and what else is not 0."""
+    """Return the frame counters as text: received, lost, and all others that are not 0."""
     if not counters:
         return "frames: none"
-    told = f"frames received {grouped(counters.get('frames', 0))}, lost {grouped(counters.get('lost', 0))}"
+    text = f"frames received {grouped(counters.get('frames', 0))}, lost {grouped(counters.get('lost', 0))}"
     parts = []
     for name, count in counters.items():
         where, _, what = name.rpartition(".")
         if count and what in COUNTED:
             parts.append(f"{where}: {COUNTED[what]} {grouped(count)}" if where else f"{COUNTED[what]} {grouped(count)}")
-    return escape(f"{told} ({'; '.join(parts)})" if parts else told)
+    return escape(f"{text} ({'; '.join(parts)})" if parts else text)
 
 
 def _unused(axis: Mapping[str, Any]) -> str:
@@ -196,18 +195,18 @@ def _unused(axis: Mapping[str, Any]) -> str:
         )
     if moves.get("without_plateau"):
         reasons.append(f"{moves['without_plateau']} too short for a plateau")
-    return f"{moves.get('seen', 0)} moves seen; not used: {', '.join(reasons)}" if reasons else ""
+    return f"{moves.get('seen', 0)} moves detected; not used: {', '.join(reasons)}" if reasons else ""
 
 
 def believed(axis: Mapping[str, Any]) -> str:
-    """Say what joined the six parameters, what the model leaves at the table, and what is warned of."""
+    """Return additional terms, unexplained error at the table, and warnings of an axis as text."""
     terms = ", ".join(
-        f"{name} {cell(name, told['value'], half_of(told), ' ')} {told['unit']}"
-        for name, told in (axis.get("terms") or {}).items()
+        f"{name} {cell(name, term['value'], half_of(term), ' ')} {term['unit']}"
+        for name, term in (axis.get("terms") or {}).items()
     )
     left, table = axis.get("unexplained_um"), (axis.get("last_window") or {}).get("at_table")
-    seen = f"the table was {table['error_rms_um']:.2f} um RMS off in the last rapid" if table else ""
-    parts = [terms, "" if left is None else f"{left:.2f} um of a rapid unexplained", seen, *axis.get("warnings", [])]
+    seen = f"table error of {table['error_rms_um']:.2f} um RMS in the last rapid" if table else ""
+    parts = [terms, "" if left is None else f"{left:.2f} um of the rapids unexplained", seen, *axis.get("warnings", [])]
     return "; ".join(part for part in parts if part)
 
 
@@ -216,28 +215,30 @@ def _axes_table(axes: Mapping[str, Any]) -> Table:
     for text in ("axis", "windows\nok/not", "rev", *map(head, PARAMETERS)):
         table.add_column(text, no_wrap=True)
     for name, axis in axes.items():
-        told = axis["parameters"]
-        cells = [cell(p, told[p]["value"], half_of(told[p])) for p in PARAMETERS] if told else ["-"] * len(PARAMETERS)
+        found = axis["parameters"]
+        cells = (
+            [cell(p, found[p]["value"], half_of(found[p])) for p in PARAMETERS] if found else ["-"] * len(PARAMETERS)
+        )
         table.add_row(name, f"{axis['accepted']}/{axis['refused']}", str(axis["revision"] or "-"), *cells)
     return table
 
 
 def narrow_table(title: str | None = None) -> Table:
-    """Return a table whose columns of parameters fit 80 columns, and which says what ± means in it."""
+    """Return a table whose parameter columns fit 80 columns, with a caption that explains ±."""
     table = Table(title=title, title_justify="left", caption=MEANING, caption_justify="left", box=box.SIMPLE_HEAD)
     table.show_edge, table.pad_edge, table.collapse_padding = False, False, True
     return table
 
 
 def sparkline(values: Sequence[float]) -> str:
-    """Return values as a row of bars, the lowest to the highest."""
+    """Return values as a row of bars, scaled from the lowest to the highest."""
     low, high = min(values), max(values)
     span = high - low or 1.0
     return "".join(BARS[min(7, int((value - low) / span * 8))] for value in values)
 
 
 def show_history(rows: Sequence[Mapping[str, Any]], console: Console | None = None, newest: int = 15) -> None:
-    """Print the newest revisions of every axis, and each parameter's course over all of them."""
+    """Print the newest revisions of every axis, and the trend of each parameter."""
     out = console or open_console()
     for axis in sorted({row["axis"] for row in rows}):
         of_axis = [row for row in rows if row["axis"] == axis]
@@ -248,10 +249,10 @@ def show_history(rows: Sequence[Mapping[str, Any]], console: Console | None = No
             table.add_column(text, no_wrap=True)
         for row in of_axis[-newest:]:
             degrees = "-" if row["temperature_c"] is None else f"{row['temperature_c']:.1f}"
-            cells = [cell(name, told["value"], half_of(told)) for name, told in row["parameters"].items()]
+            cells = [cell(name, found["value"], half_of(found)) for name, found in row["parameters"].items()]
             time = row["time"][5:16].replace("T", "\n")
             table.add_row(str(row["revision"]), time, degrees, str(row["windows_used"]), *cells)
         courses = [sparkline([row["parameters"][name]["value"] for row in of_axis[-COURSE:]]) for name in names]
         table.add_section()
-        table.add_row("", "course", "", "", *courses)
+        table.add_row("", "trend", "", "", *courses)
         out.print(table)

@@ -1,4 +1,4 @@
-"""Text on a terminal: names of machines, programs, files and devices made harmless, and how far a command is."""
+"""Text for a terminal: control characters of foreign names are replaced, and progress is shown."""
 
 import sys
 import unicodedata
@@ -10,21 +10,20 @@ _REPLACEMENT = "\N{REPLACEMENT CHARACTER}"
 
 
 def without_controls(text: str) -> str:
-    """Return text in which each control or direction character but a line's end and a tab is a mark.
+    """Return text with each control or direction character, except newline and tab, replaced by a mark.
 
     >>> without_controls("axis \\x1b[2J X\\n") == "axis \\N{REPLACEMENT CHARACTER}[2J X\\n"
     True
     """
     if text.isprintable():
         return text
-    return "".join(_REPLACEMENT if _steers(letter) else letter for letter in text)
-
-
-def _steers(letter: str) -> bool:
-    return letter not in _LAYOUT and unicodedata.category(letter) in ("Cc", "Cf", "Zl", "Zp", "Cs")
+    return "".join(
+        _REPLACEMENT if one not in _LAYOUT and unicodedata.category(one) in ("Cc", "Cf", "Zl", "Zp", "Cs") else one
+        for one in text
+    )
 
 
 def print_progress(text: str) -> None:
-    """Print how far a command is to stderr when that is a terminal."""
+    """Print progress to stderr if that is a terminal."""
     if sys.stderr.isatty():
         click.echo(text, err=True)

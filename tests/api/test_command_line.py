@@ -88,7 +88,7 @@ def test_picture_of_an_unknown_kind_is_refused(trace: Path) -> None:
 
 
 def test_picture_belongs_to_one_recording(trace: Path) -> None:
-    assert "--plot belongs to one recording" in str(invoke("identify", trace, trace, "--plot").exception)
+    assert "--plot applies to one recording" in str(invoke("identify", trace, trace, "--plot").exception)
 
 
 def test_command_and_python_give_the_same_document(trace: Path) -> None:

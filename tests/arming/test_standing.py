@@ -334,7 +334,7 @@ def test_adopt_says_what_stands_asks_and_ends_at_zero(
     assert guard.heard[1] == "adopt"
     assert in_the_audit(machine) == [("adopt", None), ("adopt", "done")]
     code, out, _ = fdhil("adopt", machine, "--yes", capsys=capsys)
-    assert (code, out) == (0, "guard: OFF, offset 0: there is nothing to adopt\n")
+    assert (code, out) == (0, "guard: OFF, offset 0; there is nothing to adopt\n")
     assert guard.heard.count("adopt") == 1
 
 
@@ -433,4 +433,4 @@ def test_disarm_without_a_daemon_asks_the_guard(machine: Path, guard: Guard, cap
     assert (code, STANDS in err, "run fdhil adopt" in err) == (1, True, True)
     guard.close()
     code, _, err = fdhil("disarm", machine, capsys=capsys)
-    assert (code, "unknown what is applied" in err) == (3, True)
+    assert (code, "the applied offset is unknown" in err) == (3, True)

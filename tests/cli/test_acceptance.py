@@ -1,4 +1,4 @@
-"""acceptance: what was proven, what is open, the circle and the path, under one hash."""
+"""``fdhil acceptance``: commissioning, open points, circular test, program and hash."""
 
 from __future__ import annotations
 
@@ -34,7 +34,6 @@ def machine_of(folder: Path) -> MachineConfig:
 
 @pytest.fixture(name="proven")
 def _proven(tmp_path: Path) -> MachineConfig:
-    """A machine whose drives were commissioned and identified."""
     machine = machine_of(tmp_path)
     with History.open(machine.store.directory) as history:
         for axis in ("X", "Y"):
@@ -46,7 +45,6 @@ def _proven(tmp_path: Path) -> MachineConfig:
 
 
 def test_a_machine_that_is_proven_is_accepted(proven: MachineConfig, tmp_path: Path, capsys: Any) -> None:
-    """The page and JSON say the same, under a hash that anybody can form again."""
     page = tmp_path / "acceptance.html"
     options = ("--out", page, "--by", "A. Fitter", "--circle-um", "12", *CIRCLE, "--json")
     code, out, _ = fdhil("acceptance", tmp_path / "machine.toml", *options, capsys=capsys)
@@ -57,7 +55,7 @@ def test_a_machine_that_is_proven_is_accepted(proven: MachineConfig, tmp_path: P
     assert hashlib.sha256(text.encode()).hexdigest() == document["sha256"]
     shown = html.unescape(page.read_text("utf-8"))
     assert document["sha256"] in shown
-    for words in ("A. Fitter", "Circular test after ISO 230-4", "No point is open", "1 division", "No notice is open"):
+    for words in ("A. Fitter", "Circular test after ISO 230-4", "No open points", "1 division", "No open notices"):
         assert words in shown
     before, after = (document["circle"]["found"][f"predicted, {which}"] for which in ("uncorrected", "corrected"))
     assert after["deviation_both_um"] < 0.3 * before["deviation_both_um"]
@@ -65,7 +63,7 @@ def test_a_machine_that_is_proven_is_accepted(proven: MachineConfig, tmp_path: P
 
 
 def test_what_is_open_is_named(proven: MachineConfig, tmp_path: Path, capsys: Any) -> None:
-    """A void record, another configuration, a limit that is not kept: each with what to do, and exit 1."""
+    """Each open point has an action, and the exit code is 1."""
     void_record(proven.store.directory, "X", "booted")
     save_record(replace(RECORD, axis="Y", config_digest="other"), proven.store.directory)
     options = ("--out", tmp_path / "a.html", "--circle-um", "0.001", "--contour-um", "5", *CIRCLE)
@@ -75,7 +73,7 @@ def test_what_is_open_is_named(proven: MachineConfig, tmp_path: Path, capsys: An
         "X: its record is void; run fdhil check with the NC off",
         "Y: its record was made with another configuration; commission it again",
         "circular deviation: 0.001 um are allowed, it is",
-        "contour error: 5 um are allowed, and no --program was given to tell it",
+        "contour error: 5 um are allowed, but no --program was given",
     ):
         assert f"open: {point}" in out
     assert "4 points are open" in out
@@ -87,12 +85,12 @@ def test_a_machine_of_which_nothing_is_known_has_a_report_too(tmp_path: Path, ca
     assert code == 1
     for axis in ("X", "Y"):
         assert f"open: {axis}: not commissioned; run fdhil commission" in out
-        assert f"open: {axis}: no parameters were published, the nominal ones stand in" in out
-    assert "with the nominal parameters" in (tmp_path / "a.html").read_text("utf-8")
+        assert f"open: {axis}: no published parameters, nominal ones are used" in out
+    assert "use the nominal parameters" in (tmp_path / "a.html").read_text("utf-8")
 
 
 def test_a_measured_circle_stands_beside_the_predicted_ones(proven: MachineConfig, tmp_path: Path, capsys: Any) -> None:
-    """5 um outside one way and 3 um inside the other; it decides, as it was measured."""
+    """The circle is 5 um too large in one direction and 3 um too small in the other; the measured value decides."""
     angle = np.linspace(0.0, 2.5 * np.pi, 4000)
     ways = [
         (10.0 + um * 1e-3) * np.column_stack([np.cos(at), np.sin(at)]) for at, um in ((angle, 5), (angle[::-1], -3))
@@ -123,13 +121,13 @@ def test_report_has_a_header_passes_open_notices_and_lateness(
     options = ("--out", page, "--customer", "Muster AG", "--site", "Hall 3", "--by", "A. Fitter", *CIRCLE)
     code, out, err = fdhil("acceptance", tmp_path / "machine.toml", *options, capsys=capsys)
     assert (code, err) == (1, f"wrote {page}\n")
-    assert "open: 1 MAJOR notices that nobody has acknowledged" in out
+    assert "open: 1 MAJOR notices are pending" in out
     assert "no limit was set" in out
     shown = html.unescape(page.read_text("utf-8"))
     for words in (
         "Muster AG", "Hall 3", f"X {RECORD.serial}, Y {RECORD.serial}", "pass 1 of p.ngc",
         "LimitActive: an internal limit is active",
-        "No limit was set", f"of {measured['turns']} wake-ups",
+        "No limit was set", f"{measured['turns']} wake-ups",
     ):  # fmt: skip
         assert words in shown, words
     document = json.loads(fdhil("acceptance", tmp_path / "machine.toml", *options, "--json", capsys=capsys)[1])

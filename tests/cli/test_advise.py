@@ -1,4 +1,4 @@
-"""``fdhil advise`` as another program calls it."""
+"""``fdhil advise`` as called by another program."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from tests.cli.test_predict import invoke
 @pytest.mark.usefixtures("long_computation")
 @pytest.mark.parametrize(("tolerance", "code", "lines"), [(200, 0, 0), (60, 0, 2), (0.001, 1, 2)])
 def test_lists_the_lines_that_leave_the_tolerance(bench: Path, tolerance: float, code: int, lines: int) -> None:
-    """Exit code 1 when no feed helps."""
     program = bench / "corner.ngc"
     program.write_text("G21 G90 G64\nG1 X0 Y30 F15000\nG1 X40\nM2\n")
     arguments = ["advise", program, "--config", bench / "bench.toml", "--tolerance-um", tolerance]
@@ -37,19 +36,18 @@ def test_lists_the_lines_that_leave_the_tolerance(bench: Path, tolerance: float,
 
 @pytest.mark.usefixtures("long_computation")
 def test_a_written_program_that_leaves_the_tolerance_is_no_yes(bench: Path) -> None:
-    """The correction would hold both lines; the file has the feeds without it, and none of them does."""
+    """The correction would keep the tolerance in both lines, but the written feeds apply without it."""
     program, out = bench / "corner.ngc", bench / "slow.ngc"
     program.write_text("G21 G90 G64\nG1 X0 Y30 F15000\nG1 X40\nM2\n")
     arguments = ["advise", program, "--config", bench / "bench.toml", "--tolerance-um", 1]
     assert invoke(*arguments).exit_code == 0
     result = invoke(*arguments, "--out", out)
     assert result.exit_code == 1
-    assert "2 lines leave the tolerance at every feed that was tried, without the correction" in result.stderr
+    assert "2 lines leave the tolerance at every feed tried, without the correction" in result.stderr
 
 
 @pytest.fixture(scope="module")
 def wave(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a closed curve of 400 short lines."""
     folder = tmp_path_factory.mktemp("wave")
     (folder / "bench.toml").write_text(bench_toml())
     lines = ["%", "(a wave; F1)", "G21 G90 G64 F6000"]
@@ -63,7 +61,7 @@ def wave(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.usefixtures("long_computation")
 def test_many_lines_become_few_ranges_and_a_program_that_keeps_the_tolerance(wave: Path) -> None:
-    """The new program, predicted, stays within it; without its new F words it is the old one."""
+    """The written program keeps the tolerance, and differs from the original only in its F words."""
     program, out, config = wave / "wave.ngc", wave / "new.ngc", wave / "bench.toml"
     arguments = ["advise", program, "--config", config, "--tolerance-um", 40]
     result = invoke(*arguments, "--out", out)
@@ -85,7 +83,6 @@ def test_many_lines_become_few_ranges_and_a_program_that_keeps_the_tolerance(wav
 
 
 def made(line: int, feed: float, error_um: float = 30.0) -> Advice:
-    """The advice for a line of 3000 mm/min."""
     held = Held(feed / 3000.0, feed / 3000.0, 1.0, feed / 3000.0)
     return Advice(
         line, line / 10, (line + 1) / 10, error_um, "X 1.0", "corner", "X", ("X", "current", 0.5), 3000.0, held, None
@@ -94,7 +91,7 @@ def made(line: int, feed: float, error_um: float = 30.0) -> Advice:
 
 @pytest.mark.usefixtures("long_computation")
 def test_lines_that_follow_each_other_are_one_range(capsys: pytest.CaptureFixture[str]) -> None:
-    """Not over a line between them that keeps its feed, and not where one may run at twice the feed of another."""
+    """A line with its programmed feed, or a feed of twice the value, separates two ranges."""
     slow = [made(line, 2100.0, 34.0 if line == 260 else 30.0) for line in range(120, 481, 2)]
     apart = [made(line, 600.0) for line in (490, 492)]
     show([*slow, *apart], None, 20.0, True, lambda line: line % 2 == 0)
@@ -122,7 +119,7 @@ def test_what_cannot_be_written_is_told_before_anything_is(bench: Path) -> None:
 
 @pytest.mark.parametrize("tolerance", ["0", "-3", "nan", "inf", "wide"])
 def test_the_tolerance_must_be_a_positive_number(bench: Path, tolerance: str) -> None:
-    """Against nan every path would be within the tolerance."""
+    """nan would accept every path."""
     result = invoke("advise", bench / "demand.csv", "--config", bench / "bench.toml", "--tolerance-um", tolerance)
     assert result.exit_code == 2
     assert "--tolerance-um" in result.stderr

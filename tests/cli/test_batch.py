@@ -1,4 +1,4 @@
-"""Many recordings at once: the same answers from other processes, and how far the work is."""
+"""Analysis of many recordings: identical results from several processes, and progress."""
 
 from __future__ import annotations
 
@@ -32,7 +32,6 @@ SETTINGS = Identification()
 
 @pytest.fixture
 def recordings(tmp_path: Path) -> list[Path]:
-    """Two recordings of two rapids each."""
     paths = [tmp_path / f"{k}.csv" for k in range(2)]
     for k, path in enumerate(paths):
         path.write_text(bench.as_csv(signals(moves=2), 0.003, seed=k))
@@ -68,12 +67,11 @@ def test_a_process_that_dies_is_a_sentence(recordings: list[Path], monkeypatch: 
     monkeypatch.setattr(batch, "MANY_FILES", 1)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     monkeypatch.setattr(batch, "_analyse_some", dying)
-    with pytest.raises(FdhilError, match="was ended from outside"):
+    with pytest.raises(FdhilError, match="was killed"):
         list(batch.analyse_files(recordings, SETTINGS))
 
 
 def dying(numbered: Any, **how: Any) -> None:
-    """Die as a process does that the kernel ends."""
     os.kill(os.getpid(), signal.SIGKILL)
 
 
@@ -90,7 +88,7 @@ def test_a_folder_is_all_its_recordings_and_a_stored_window_the_bits_that_a_flee
         (told,) = files[again.window.name]["windows"]
         fleet = json.loads(again.text)
         window = read_window(objects.path_of(folder, again.window.name))
-        assert told["start_s"] == round(window.start_s + moving_range(window)[0] * window.dt_s, 6)  # as it was recorded
+        assert told["start_s"] == round(window.start_s + moving_range(window)[0] * window.dt_s, 6)  # original time
         assert told["validated"] == fleet["accepted"]
         assert told["fit_percent"] == fleet["fit_percent"]
         for name, found in fleet["parameters"].items():
@@ -109,7 +107,7 @@ def test_a_terminal_sees_how_far_the_work_is(recordings: list[Path], capsys: pyt
         patch.setattr(sys, "stderr", terminal)
         assert run_safely(cli) == 0
         seen = ""
-        while "identifying" not in seen or "%" not in seen:  # a terminal hands it over in as many parts as it likes
+        while "identifying" not in seen or "%" not in seen:  # a terminal delivers it in arbitrary parts
             assert select.select([master], [], [], 100)[0], seen
             seen += os.read(master, 65536).decode()
     os.close(master)
@@ -136,4 +134,4 @@ def test_processes_that_analyse_end_with_the_command_when_it_is_killed(tmp_path:
         assert process.stdout is not None
         assert process.stdout.readline() == b"up\n"
         process.kill()
-        assert process.stdout.read() in (b"", b"up\n")  # the end: none has it open any more
+        assert process.stdout.read() in (b"", b"up\n")  # end of file: no process has it open

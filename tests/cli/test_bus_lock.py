@@ -1,4 +1,4 @@
-"""One owner per bus, whatever the bus is called, and nobody else can be in the way."""
+"""One owner per bus, whatever its name, and no interference by other users."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ NOBODY = 65534
 
 @pytest.fixture(autouse=True)
 def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The directory of the unit, of this user."""
     made = tmp_path / "run"
     made.mkdir(mode=0o755)
     monkeypatch.setattr(bus_lock, "SHARED_DIRECTORY", made)
@@ -106,7 +105,7 @@ def test_what_lies_in_the_place_of_the_file_is_not_followed(directory: Path, tmp
 @pytest.mark.usefixtures("processes")
 @pytest.mark.skipif(os.getuid() != 0, reason="needs root, to be somebody else")
 def test_somebody_else_can_neither_lock_nor_block(directory: Path) -> None:
-    """The file is out of reach, and the name that the lock once was may be taken by anyone."""
+    """The lock file is inaccessible; its former name may be used by anyone."""
     lock_bus(CanBus(port=47)).close()
     squatter = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     squatter.bind("\0fdhil-guard:socketcand:127.0.0.1:47:can0")
@@ -122,7 +121,7 @@ def test_somebody_else_can_neither_lock_nor_block(directory: Path) -> None:
 
 @pytest.mark.usefixtures("processes")
 def test_it_survives_an_exec(directory: Path) -> None:
-    """The guard becomes another program; the lock stays until that one ends."""
+    """The guard replaces its program by exec; the lock lasts until the process ends."""
     lock = lock_bus(CanBus(port=47))
     os.set_inheritable(lock.fileno(), True)
     read, write = os.pipe()

@@ -1,4 +1,4 @@
-"""``fdhil commission`` on a simulated drive inside this process: plans, resuming, and the set-ups that it refuses."""
+"""``fdhil commission`` with a simulated drive in this process: plans, continuation, refused setups."""
 
 from __future__ import annotations
 
@@ -40,14 +40,12 @@ TRUE = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075}
 
 @dataclass
 class Bench:
-    """A drive on a bus of this process, and the command that commissions it."""
-
     peer: DrivePeer
     file: Path
     capsys: pytest.CaptureFixture[str]
 
     def commission(self, *arguments: str, said: str | io.StringIO = "") -> tuple[int, str, str]:
-        """Run the command, whose operator says these lines; return exit code, stdout and stderr."""
+        """Run the command with these answers; return exit code, stdout and stderr."""
         sys.stdin = said if isinstance(said, io.StringIO) else io.StringIO(said)
         sys.argv[1:] = ["commission", str(self.file), *arguments]
         code = run_safely(cli)
@@ -55,7 +53,6 @@ class Bench:
         return code, heard.out, heard.err
 
     def say(self, old: str, new: str) -> None:
-        """Change what the configuration says."""
         text = self.file.read_text()
         assert old in text
         self.file.write_text(text.replace(old, new, 1))
@@ -94,8 +91,8 @@ def test_a_dry_run_says_what_each_step_moves_and_sends_nothing(bench: Bench) -> 
         assert words in out, words
     code, out, _ = bench.commission("--dry-run", "--json")
     plan = json.loads(out)
-    assert (code, plan["dry_run"], len(plan["axes"]["X"])) == (0, True, 13)  # it would be asked for the room
-    assert "within the room that you give at up to 500 mm/s" in plan["axes"]["X"][9]["moves"]
+    assert (code, plan["dry_run"], len(plan["axes"]["X"])) == (0, True, 13)  # because the room would be prompted for
+    assert "within the room that you allow at up to 500 mm/s" in plan["axes"]["X"][9]["moves"]
     assert len(json.loads(bench.commission("--dry-run", "--json", "--yes")[1])["axes"]["X"]) == 7
     assert plan["axes"]["X"][0] | {"does": ""} == {"step": "listen", "does": "", "moves": "nothing", "done_utc": None}
     code, _, err = bench.commission("--room", "-10", "60", "--dry-run")
@@ -107,7 +104,7 @@ def test_a_dry_run_says_what_each_step_moves_and_sends_nothing(bench: Bench) -> 
 @pytest.mark.parametrize("room", [("10", "100"), ("-10", "-1"), ("nan", "100"), ("-10", "inf")])
 def test_a_room_that_is_none_is_told(room: tuple[str, str], bench: Bench) -> None:
     code, _, err = bench.commission("--room", *room)
-    assert (code, "--room wants two numbers of mm" in err) == (2, True)
+    assert (code, "--room needs the travel back" in err) == (2, True)
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -119,34 +116,34 @@ def test_what_was_stopped_goes_on_where_it_ended(bench: Bench, monkeypatch: pyte
         stopped.setattr("fdhil.commissioning.steps.watchdog_test", stop)
         code, out, err = bench.commission("--yes")
         assert (code, err.strip()) == (130, "fdhil: stopped by the operator")
-        assert out.endswith("next: run the same command again; it continues with the step that was not finished\n")
+        assert out.endswith("next: run the same command again; it continues with the unfinished step\n")
         assert "axis X: sign test: the axis moved by +" in out
     assert bench.peer.drive.power.state.name == "SWITCH_ON_DISABLED"
     assert load_record(bench.store, "X") is None
 
     code, out, _ = bench.commission("--yes")
     assert code == 0
-    for kept in ("step 4 of 7, sign test: kept, it was done 2", "step 5 of 7, feed-forward test: kept"):
+    for kept in ("step 4 of 7, sign test: skipped, done 2", "step 5 of 7, feed-forward test: skipped"):
         assert kept in out
     assert "step 6 of 7, watchdog test: Sending" in out
-    assert "axis X is not tried by moving it: no --room was given" in out
+    assert "axis X: no trial, because no --room was given" in out
     first = load_record(bench.store, "X")
     assert first is not None
     assert first.watchdog == "proven"
 
     heard = len(bench.peer.heard)
     code, out, _ = bench.commission("--yes")
-    assert (code, "step 3" in out, "watchdog test: kept" in out) == (0, False, True)
+    assert (code, "step 3" in out, "watchdog test: skipped" in out) == (0, False, True)
     assert not {0x000, 0x080, 0x201, 0x301} & set(bench.peer.heard[heard:])
     again = load_record(bench.store, "X")
     assert again is not None
     assert again.sign_test_um == first.sign_test_um
 
     code, out, _ = bench.commission("--yes", "--dry-run")
-    assert out.count("kept if the drive is the same") == 3
-    bench.peer.drive.set_object(0x6085, 0, 1_000_000)  # set up otherwise by its own tool
+    assert out.count("skipped if the drive is unchanged") == 3
+    bench.peer.drive.set_object(0x6085, 0, 1_000_000)  # changed by the vendor's tool
     code, out, _ = bench.commission("--yes")
-    assert (code, "kept" in out, "step 4 of 7, sign test: Moving" in out) == (0, False, True)
+    assert (code, "skipped" in out, "step 4 of 7, sign test: Moving" in out) == (0, False, True)
 
 
 @pytest.mark.usefixtures("long_computation")
@@ -157,13 +154,13 @@ def test_an_axis_is_tried_where_the_operator_agrees_and_known_to_the_history(
     code, out, err = bench.commission(said="-2 130\n" + 4 * "y\n")
     assert code == 0, err
     for asked in (
-        "How far may axis X go from here",
-        "Now axis X moves 1 mm toward plus at 5 mm/s, and back. Is its way free, and may it?",
+        "How far may axis X move from here",
+        "Axis X will move 1 mm toward plus at 5 mm/s, and back. Is its path free? Start?",
         "The drive went 1 mm toward plus at 5 mm/s, and back. Is that what you saw the table do?",
-        "Now axis X moves 127.4 mm toward plus at 394 mm/s with 4000 mm/s2, and back, 2 times.",
+        "Axis X will move 127.4 mm toward plus at 394 mm/s with 4000 mm/s2, and back, 2 times.",
     ):
         assert asked in err, asked
-    assert "step 10 of 13, test rapids: Moving the axis as fast as G0" in out
+    assert "step 10 of 13, test rapids: Moving the axis at rapid speed" in out
     assert "axis X: identification: R 50" in out or "axis X: identification: R 49" in out
     assert " mohm, L " in out
     assert out.index("axis X: jog: ") < out.index("step 10 of 13") < out.index("axis X: acceptance: ")
@@ -176,7 +173,7 @@ def test_an_axis_is_tried_where_the_operator_agrees_and_known_to_the_history(
         assert newest.set.parameters.as_dict()[name] == pytest.approx(true, rel=0.01), name
 
     beats = bench.peer.heard.count(0x700 + machine_config.load(bench.file).play.node_id)
-    assert beats > 4  # the drive stops by itself when this process is gone
+    assert beats > 4  # the drive stops by itself after this process ends
     assert [bench.peer.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
 
     heard = len(bench.peer.heard)
@@ -195,15 +192,14 @@ def test_an_axis_is_tried_where_the_operator_agrees_and_known_to_the_history(
 def test_who_does_not_agree_is_not_moved(said: str, code: int, bench: Bench) -> None:
     got, out, err = bench.commission(said=said)
     assert (got, "jog: " in out) == (code, False)
-    assert ("is not tried by moving it" in out) is (code == 0)
-    assert ("not confirmed; the axis was not moved, its record holds" in err) is ("130" in said)
+    assert ("no trial, because" in out) is (code == 0)
+    assert ("not confirmed; the axis was not moved and its record stays valid" in err) is ("130" in said)
     assert ("'far' is not two numbers" in err) is ("far" in said)
     assert (load_record(bench.store, "X") is None) is ("far" in said)
     assert bench.peer.drive.power.state.name == "SWITCH_ON_DISABLED"
 
 
 def without(peer: DrivePeer, index: int) -> None:
-    """Take an object out of the drive."""
     dictionary = peer.drive.dictionary
     dictionary.indices.discard(index)
     for key in [key for key in dictionary.entries if key >> 8 == index]:
@@ -211,7 +207,7 @@ def without(peer: DrivePeer, index: int) -> None:
 
 
 def other_eds(bench: Bench) -> None:
-    """The configuration names the EDS of another maker's drive, and the profile that is made from it."""
+    """The configuration names the EDS of another vendor's drive, with the profile derived from it."""
     eds = write_eds("elmo", bench.file.parent)
     bench.say("node_id = 1\n", f'node_id = 1\nprofile = "cia402"\neds = "{eds.name}"\n')
 
@@ -250,7 +246,6 @@ WRONG: dict[str, tuple[Callable[[Bench], None], str, bool]] = {
 
 
 def in_the_audit(bench: Bench) -> list[tuple[str, str, str | None]]:
-    """What was asked or answered, of which axis, and with which result."""
     found = [entry for entry, wrong in audit.entries(bench.store) if wrong is None]
     return [(entry.get("asked") or entry["answered"], entry["axis"], entry.get("result")) for entry in found]
 
@@ -328,10 +323,10 @@ def test_an_nc_that_is_switched_on_in_the_sign_test_leaves_no_record(what: str, 
 @pytest.mark.parametrize(
     ("question", "sync"),
     [
-        (1, 0),  # how far the axis may go
+        (1, 0),  # prompt for the room
         (2, 0),  # before the drive is switched on
-        (3, A_FEW),  # before it jogs: our SYNC runs, the drive is off
-        (4, A_FEW),  # whether the table moved: the drive is on
+        (3, A_FEW),  # before the jog: SYNC runs, the drive is off
+        (4, A_FEW),  # prompt whether the table moved: the drive is on
     ],
 )
 def test_nothing_begins_where_an_nc_came_while_a_question_stood(question: int, sync: int, bench: Bench) -> None:

@@ -1,4 +1,4 @@
-"""A trial that is stopped in the middle of a rapid: the axis is braked, then switched off."""
+"""A trial that is interrupted during a rapid: the axis is braked, then switched off."""
 
 from __future__ import annotations
 
@@ -48,7 +48,6 @@ def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[TwinProcess
 
 @contextmanager
 def rapid(twin: tuple[TwinProcess, Path]) -> Iterator[tuple[subprocess.Popen[str], Callable[[], can.Message]]]:
-    """A trial in the middle of its first rapid, and the frames of the bus from there on."""
     running, file = twin
     command = [sys.executable, "-c", QUICK, "commission", str(file), "--yes", "--room", "-2", "150"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -72,7 +71,6 @@ def rapid(twin: tuple[TwinProcess, Path]) -> Iterator[tuple[subprocess.Popen[str
 
 
 def target_of(frame: can.Message) -> int | None:
-    """The set-point of a frame, None of another."""
     return struct.unpack("<Hi", frame.data)[1] if frame.arbitration_id == 0x201 else None
 
 
@@ -86,7 +84,7 @@ def test_a_stopped_trial_brakes_and_switches_off(twin: tuple[TwinProcess, Path])
             if (target := target_of(frame)) is not None:
                 targets.append(target)
                 words.append(struct.unpack_from("<H", frame.data)[0])
-                if len(targets) == 60:  # an impatient operator does not end the braking
+                if len(targets) == 60:  # a second signal does not interrupt the braking
                     process.send_signal(signal.SIGINT)
             if frame.arbitration_id == 0x000:
                 break
@@ -96,5 +94,5 @@ def test_a_stopped_trial_brakes_and_switches_off(twin: tuple[TwinProcess, Path])
     assert np.abs(np.diff(targets, 2)).max() <= ACCELERATION + 2.0
     assert targets[-1] == targets[-60]
     still = next(k for k in range(len(targets)) if targets[k] == targets[-1])
-    assert set(words[1 : still + 1]) == {0x0F}  # it is braked before it is switched off
+    assert set(words[1 : still + 1]) == {0x0F}  # braked before switched off
     assert words[-1] == 0

@@ -1,4 +1,4 @@
-"""scan, check and commission against the simulated machine, a process of its own behind its hub."""
+"""scan, check and commission with the simulator as a separate process behind its hub."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ WAITS: tuple[tuple[str, str, float], ...] = (
     ("commissioning.survey", "LISTEN_S", 0.3),
     ("commissioning.steps", "SETTLE_CYCLES", 120),
     ("commissioning.steps", "AVERAGE_CYCLES", 400),
-    ("commissioning.watchdog", "STARVE_TIMEOUT_S", 15.0),  # a slow host's drives live slower
+    ("commissioning.watchdog", "STARVE_TIMEOUT_S", 15.0),  # simulated drives are slower on a slow host
     ("drivers.can.sdo", "RESPONSE_TIMEOUT_S", 5.0),
     ("drivers.can.sdo", "DEADLINE_S", 20.0),
     ("drivers.can.sdo", "QUIET_S", 0.1),
@@ -56,15 +56,12 @@ main()
 
 @dataclass
 class Bench:
-    """The simulated machine, and the config with which others join its bus."""
-
     twin: TwinProcess
     folder: Path
 
     def config(
         self, name: str = "bench.toml", old: str = "", new: str = "", voltage: str = "", axes: str = "XY"
     ) -> Path:
-        """Write a config of its own folder for this bus, with ``old`` replaced by ``new``."""
         folder = self.folder / Path(name).stem
         folder.mkdir(exist_ok=True)
         port = self.twin.bus_settings["port"]
@@ -73,7 +70,6 @@ class Bench:
         return path
 
     def fault(self, index: int, value: int) -> None:
-        """Set an object of drive X behind everybody's back, as its own tool would."""
         with self.twin.join() as bus:
             size = {0x6007: 2, 0x6065: 4, 0x1017: 2, 0x1801: 1}[index]
             head = 0x23 | (4 - size) << 2
@@ -99,7 +95,7 @@ Said = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture
 def fdhil(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Said:
-    """Run a command in this process, with shorter waits than on a real machine: exit code, stdout and stderr."""
+    """Run a command in this process with shorter waits; return exit code, stdout and stderr."""
     for module, name, value in WAITS:
         monkeypatch.setattr(f"fdhil.{module}.{name}", value)
 
@@ -114,7 +110,6 @@ def fdhil(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -
 
 
 def document(fdhil: Said, *arguments: object, code: int = 0) -> dict[str, Any]:
-    """Run a command with --json; return the one document on stdout."""
     got, out, err = fdhil(*arguments, "--json")
     assert got == code, err
     found: dict[str, Any] = json.loads(out)
@@ -161,7 +156,7 @@ def test_a_scan_lists_the_drives_with_their_eds(fdhil: Said, bench: Bench) -> No
 def test_a_scan_reads_well(fdhil: Said, bench: Bench) -> None:
     code, out, err = fdhil("scan", bench.config())
     assert (code, err) == (0, "")
-    for words in ("no NC is heard; 2 nodes", "pre-operational", "fdhil twin drive", "CiA 402", "none fits"):
+    for words in ("no NC is active; 2 nodes", "pre-operational", "fdhil twin drive", "CiA 402", "no match"):
         assert words in out
 
 
@@ -243,7 +238,7 @@ def test_a_sensor_is_read_and_a_silent_one_is_told(fdhil: Said, bench: Bench) ->
 def test_where_the_guard_took_nothing_of_a_comparison_void_records_stay_so(
     fdhil: Said, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: dict[str, str] | None
 ) -> None:
-    """It refuses all of it, or hangs up before it has answered."""
+    """The guard refuses the comparison, or disconnects before its answer."""
     path = write_config(tmp_path, bus='interface = "virtual"')
     config = load(path)
     config.guard_directory.mkdir(parents=True, exist_ok=True)
@@ -260,7 +255,7 @@ def test_where_the_guard_took_nothing_of_a_comparison_void_records_stay_so(
     void_record(config.store.directory, "X", "booted")
     code, _, err = fdhil("check", path, "--json")
     assert code == 0
-    assert ("NotOff: a correction is on; run fdhil check again" if answer else "records that are void stay so") in err
+    assert ("NotOff: a correction is on; run fdhil check again" if answer else "void records stay void") in err
     assert is_void(config.store.directory, "X")
     guard.close()
 
@@ -268,7 +263,7 @@ def test_where_the_guard_took_nothing_of_a_comparison_void_records_stay_so(
 def test_what_is_seen_while_drives_are_compared_speaks_against_them(
     fdhil: Said, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """X boots again, which a daemon hears, and so does Y, which the guard alone has heard: both stay void."""
+    """X reboots, which the daemon detects, and Y, which only the guard detects: both records stay void."""
     path = write_config(tmp_path, bus='interface = "virtual"')
     config = load(path)
     store = config.store.directory
@@ -289,7 +284,7 @@ def test_what_is_seen_while_drives_are_compared_speaks_against_them(
     assert code == 0
     assert guard.requests[-1]["touched"] == {"X": 3, "Y": 0}
     assert [is_void(store, axis) for axis in "XY"] == [True, True]
-    assert "RecordVoid: axis X: something was seen against it since it was compared" in err
+    assert "RecordVoid: axis X: its drive changed again after the comparison" in err
     assert "RecordVoid: axis Y: it has booted; run fdhil check again" in err
     guard.close()
     (config.guard_directory / "guard.sock").unlink()
@@ -307,7 +302,7 @@ def test_nobody_moves_without_a_yes(fdhil: Said, bench: Bench) -> None:
             assert code == 1
             assert "step 2 of 7, compare" in out
             assert "step 3" not in out
-            assert "the axis moves by 10 um" in err
+            assert "the axis will move by 10 um" in err
             assert "nothing was moved or written" in err
     assert 0x601 in heard
     assert not {0x000, 0x080, 0x201, 0x301} & set(heard)
@@ -316,7 +311,7 @@ def test_nobody_moves_without_a_yes(fdhil: Said, bench: Bench) -> None:
 
 @pytest.mark.usefixtures("real_time")
 def test_pdos_are_written_after_a_yes_and_nothing_moves(fdhil: Said, bench: Bench) -> None:
-    """By a profile that differs from the drive in one PDO; then by the one that the other tests need."""
+    """First with a profile that differs from the drive in one PDO, then with the matching one."""
     own = bench.folder / "own.toml"
     tpdo2 = "entries = [[0x6041, 0, 16, false], [0x2101, 0, 16, true], [0x6078, 0, 16, true]]"
     packaged = files("fdhil.drivers.cia402.profiles").joinpath("fdhil_twin.toml").read_text("utf-8")
@@ -337,7 +332,6 @@ def test_pdos_are_written_after_a_yes_and_nothing_moves(fdhil: Said, bench: Benc
 
 @contextmanager
 def overheard(bench: Bench) -> Iterator[list[int]]:
-    """The COB-IDs of all frames on the bus meanwhile."""
     heard: list[int] = []
 
     def keep(frame: can.Message) -> None:
@@ -389,7 +383,7 @@ def test_a_drive_that_must_not_be_used_is_refused(fdhil: Said, bench: Bench) -> 
 
 @pytest.mark.usefixtures("processes")
 def test_a_stopped_commissioning_leaves_the_drive_off(fdhil: Said, bench: Bench) -> None:
-    lasting = QUICK.replace("'AVERAGE_CYCLES', 400", "'AVERAGE_CYCLES', 1_000_000")  # a sign test without an end
+    lasting = QUICK.replace("'AVERAGE_CYCLES', 400", "'AVERAGE_CYCLES', 1_000_000")  # an endless sign test
     command = [sys.executable, "-c", lasting, "commission", str(bench.config("stopped.toml")), "--axis", "X", "--yes"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -406,7 +400,6 @@ def test_a_stopped_commissioning_leaves_the_drive_off(fdhil: Said, bench: Bench)
 
 
 def words_until_pre_operational(bus: can.BusABC) -> Sequence[int]:
-    """Controlwords sent to drive X until it is taken out of Operational."""
     words = []
     deadline = time.monotonic() + 300
     while time.monotonic() < deadline:
@@ -448,7 +441,6 @@ def test_help_tells_what_is_sent(fdhil: Said, command: str) -> None:
 
 @pytest.fixture
 def cut(fdhil: Said, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    """The machine while its NC runs the bus, which is listened to as long as on a real machine."""
     for module in ("scan", "config_check", "survey"):
         monkeypatch.setattr(f"fdhil.commissioning.{module}.LISTEN_S", LISTEN_S)
     bench.twin.command("nc", on=True)
@@ -459,7 +451,7 @@ def cut(fdhil: Said, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> Iterator[
 
 
 def undisturbed(fdhil: Said, cut: Bench, *arguments: object, code: int = 0) -> str:
-    """Run a command and be sure that no SDO went over the bus meanwhile; return what it said."""
+    """Run a command and assert that no SDO was sent meanwhile; return its output."""
     with overheard(cut) as heard:
         got, out, err = fdhil(*arguments)
     assert got == code, (out, err)
@@ -471,13 +463,15 @@ def undisturbed(fdhil: Said, cut: Bench, *arguments: object, code: int = 0) -> s
 @pytest.mark.usefixtures("real_time")
 def test_a_scan_beside_an_nc_only_listens(fdhil: Said, cut: Bench) -> None:
     said = undisturbed(fdhil, cut, "scan", cut.config())
-    assert "an NC runs it (SYNC heard), so no node was asked" in said
+    assert "an NC runs it (SYNC received), so no node was queried" in said
     assert "operational" in said
 
 
 @pytest.mark.usefixtures("real_time")
 def test_a_check_beside_an_nc_compares_what_is_heard(fdhil: Said, cut: Bench) -> None:
-    config = cut.config("counted.toml", "[machine]", '[guard]\nclock = "sync"\n[machine]')  # a busy host is late
+    config = cut.config(
+        "counted.toml", "[machine]", '[guard]\nclock = "sync"\n[machine]'
+    )  # a busy host sends SYNC late
     found = json.loads(undisturbed(fdhil, cut, "check", config, "--json"))
     assert found["matches"] is True
     assert found["complete"] is False

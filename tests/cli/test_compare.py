@@ -1,4 +1,4 @@
-"""``fdhil compare``: two passes by the contour error, two models and recordings by their parameters."""
+"""``fdhil compare``: passes by contour error, models and recordings by parameters."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ROWS = 500
 
 
 def trace(path: Path, away_um: float, along_um: float = 0.0, end: str = "_table_mm") -> Path:
-    """Write a straight pass in X at 10 mm/s whose table is off in Y, and behind in X."""
+    """Write a straight pass in X at 10 mm/s whose table deviates in Y and lags in X."""
     rows = [f"time_s,X_reference_mm,X{end},Y_reference_mm,Y{end}"]
     rows += [
         f"{k * 1e-3:.3f},{k * 0.01:.6f},{k * 0.01 - along_um * 1e-3:.6f},0,{away_um * 1e-3:.6f}" for k in range(ROWS)
@@ -39,7 +39,7 @@ def test_lag_along_the_path_is_no_contour_error(tmp_path: Path, capsys: Any) -> 
     before, after = trace(tmp_path / "before.csv", 3.0), trace(tmp_path / "after.csv", 3.0, along_um=50.0)
     document = json.loads(fdhil("compare", before, after, "--json", capsys=capsys)[1])
     assert document["after"]["axes"]["X"]["rms_um"] == pytest.approx(50.0)
-    assert document["after"]["contour"]["rms_um"] < math.hypot(3.0, 5.0)  # the start alone, where the path begins
+    assert document["after"]["contour"]["rms_um"] < math.hypot(3.0, 5.0)  # only the start of the path
 
 
 def test_models_are_compared_by_their_parameters(tmp_path: Path, capsys: Any) -> None:
@@ -60,7 +60,7 @@ def test_models_are_compared_by_their_parameters(tmp_path: Path, capsys: Any) ->
         ("time_s,X_reference_mm\n0,1\n", 3, "is not a pass"),
         ("time_s,X_reference_mm,X_table_mm\n0,1,1\n0.001,nan,1\n", 3, "is not a pass"),
         ("time_s,X_reference_mm,X_table_mm\n0,1,1\n", 3, "is not a pass"),
-        ("X_mm\n", 2, "give two of one kind"),
+        ("X_mm\n", 2, "give two files of one kind"),
         (None, 3, "cannot be read"),
     ],
 )

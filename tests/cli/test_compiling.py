@@ -1,4 +1,4 @@
-"""Seconds of silence are foretold: when the numerics are not compiled yet, and only then."""
+"""A compilation of the kernels is announced before it delays a command, and only then."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_a_cold_cache_is_told_once_with_its_seconds(
 
 
 def test_what_numba_keeps_is_found_where_it_keeps_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A kernel that this process compiled, or found compiled: its cache is the one that is looked at."""
+    """The cache of a kernel of this process is the one that is examined."""
     source = Path(kernels.__file__)
     assert Path(kernels._differences.stats.cache_path) in list(compiling._caches(source))  # type: ignore[attr-defined]
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
@@ -36,5 +36,5 @@ def test_what_numba_keeps_is_found_where_it_keeps_it(tmp_path: Path, monkeypatch
     made = folder / f"kernels._solve_plain-51.{version}.nbi"
     made.touch()
     assert compiling.compiled("fdhil.correction.kernels")
-    os.utime(made, (0, 0))  # older than the source: numba compiles anew
+    os.utime(made, (0, 0))  # older than the source: numba recompiles
     assert not compiling.compiled("fdhil.correction.kernels")

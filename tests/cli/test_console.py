@@ -1,4 +1,4 @@
-"""Text from outside - names of machines, programs, files - cannot steer the terminal on which it is shown."""
+"""Foreign text, such as names of machines, programs and files, cannot control the terminal."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_no_control_character_gets_through_rich(hostile: str) -> None:
     table.add_row(Text(hostile))
     shown = written(escape(hostile), Text(hostile), table)
     assert without_controls(shown) == shown
-    assert "\N{REPLACEMENT CHARACTER}" in shown or hostile in ("a\rb", "\b\b")  # which rich takes out itself
+    assert "\N{REPLACEMENT CHARACTER}" in shown or hostile in ("a\rb", "\b\b")  # removed by rich itself
 
 
 def test_colours_of_the_console_itself_stay() -> None:

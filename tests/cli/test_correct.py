@@ -1,4 +1,4 @@
-"""``fdhil correct`` as another program calls it."""
+"""``fdhil correct`` as called by another program."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.paths import bench_trajectory, smooth, trajectory
 
 
 def one_corner(folder: Path) -> Path:
-    """A demand of one corner and a rest, whose page is soon drawn."""
+    """A demand with one corner and a rest, for a small page."""
     ramp = np.linspace(0.0, 30.0, 180)
     corner = np.column_stack(
         [np.append(ramp, np.full(480, 30.0)), np.concatenate([np.zeros(180), ramp, np.full(300, 30.0)])]
@@ -31,7 +31,6 @@ def one_corner(folder: Path) -> Path:
 
 
 def test_writes_json_and_csv(bench: Path) -> None:
-    """Offsets, what is left with them, and the gain."""
     out = bench / "out.csv"
     arguments = ["--config", bench / "bench.toml", "--method", "mirror", "--json", "--out", out]
     result = invoke("correct", bench / "demand.csv", *arguments)
@@ -49,7 +48,6 @@ def test_writes_json_and_csv(bench: Path) -> None:
 
 
 def test_a_refusal_writes_zeros_and_exits_1(bench: Path) -> None:
-    """The file is there, its offsets are 0, and the document says why."""
     write_demand_csv(bench_trajectory(20, (0.030, 0.015)), bench / "fast.csv")
     out = bench / "out.csv"
     result = invoke("correct", bench / "fast.csv", "--config", bench / "bench.toml", "--json", "--out", out)
@@ -62,7 +60,7 @@ def test_a_refusal_writes_zeros_and_exits_1(bench: Path) -> None:
 
 
 def test_text_for_people(bench: Path) -> None:
-    """A model that is measured against itself alone is not called better."""
+    """A gain without an independent check is not called better."""
     result = invoke("correct", bench / "demand.csv", "--config", bench / "bench.toml", "--method", "mirror")
     assert result.exit_code == 0
     assert "predicted with the mirror correction: " in result.stdout
@@ -72,7 +70,7 @@ def test_text_for_people(bench: Path) -> None:
 
 @pytest.mark.usefixtures("long_computation")
 def test_with_a_history_a_gain_has_its_uncertainty_and_a_spread_below_the_digits_is_not_zero(bench: Path) -> None:
-    """Parameters known to 1e-6 promise no more than the last moves were predicted to."""
+    """With parameters known to 1e-6 the gain is limited by the prediction error of held-out moves."""
     remember(bench, [{}], known_to=1e-6)
     with History.open(bench / "fdhil-data") as history:
         for axis in "XY":
@@ -96,14 +94,12 @@ def test_with_a_history_a_gain_has_its_uncertainty_and_a_spread_below_the_digits
 
 
 def test_an_unknown_method_is_refused(bench: Path) -> None:
-    """The methods are those of the table."""
     result = invoke("correct", bench / "demand.csv", "--config", bench / "bench.toml", "--method", "magic")
     assert result.exit_code == 2
     assert "mirror" in result.stderr
 
 
 def test_flatness_writes_speed_and_torque(bench: Path) -> None:
-    """Position offsets stay 0; the columns of the on-line feed-forward are there."""
     out = bench / "out.csv"
     arguments = ["--config", bench / "bench.toml", "--method", "flatness", "--json", "--out", out]
     result = invoke("correct", bench / "demand.csv", *arguments)
@@ -117,7 +113,6 @@ def test_flatness_writes_speed_and_torque(bench: Path) -> None:
 
 
 def test_the_default_method_is_the_best_one(bench: Path) -> None:
-    """Without --method: the inverse, more than 60 times better."""
     result = invoke("correct", bench / "demand.csv", "--config", bench / "bench.toml", "--json")
     document = json.loads(result.stdout)
     assert document["method"] == "inverse"
@@ -127,7 +122,6 @@ def test_the_default_method_is_the_best_one(bench: Path) -> None:
 
 @pytest.mark.usefixtures("long_computation")
 def test_a_report_shows_before_and_after(bench: Path) -> None:
-    """``predict`` and ``correct`` write a page of their own."""
     for command, shown in (("predict", "predicted, RMS"), ("correct", "not known here")):
         page = bench / f"{command}.html"
         arguments = [command, one_corner(bench), "--config", bench / "bench.toml", "--report", page]

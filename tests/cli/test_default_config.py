@@ -1,4 +1,4 @@
-"""CONFIG is ./machine.toml where it is left out; what is misspelt is suggested; what is written is reported."""
+"""CONFIG defaults to ./machine.toml, misspelt words get a suggestion, written files are reported."""
 
 from __future__ import annotations
 
@@ -18,13 +18,11 @@ DEMAND = "time_s,X_mm,Y_mm\n" + "".join(f"{k / 1000:.3f},{min(k, 400) / 100:.5f}
 
 
 def config_of(command: click.Command) -> click.Argument | None:
-    """Return the argument CONFIG of a command."""
     return next((p for p in command.params if p.name == "config" and isinstance(p, click.Argument)), None)
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current folder, with a machine.toml and a demand."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "machine.toml").write_text(bench_toml())
     (tmp_path / "part.csv").write_text(DEMAND)
@@ -48,7 +46,7 @@ def test_argument_after_config_is_understood_without_config(
     arguments: tuple[str, ...], folder: Path, capsys: Any
 ) -> None:
     code, _, err = fdhil(*arguments, capsys=capsys)
-    assert (code, "daemon" in err) == (3, True), err  # understood: there is only no daemon
+    assert (code, "daemon" in err) == (3, True), err  # parsed; only the daemon is missing
     (folder / "machine.toml").unlink()
     code, _, err = fdhil(*arguments, capsys=capsys)
     assert code == 2

@@ -1,4 +1,4 @@
-"""The demonstration's realistic machine: its configuration, and its page whether it was believed or refused."""
+"""The realistic machine of the demonstration: configuration, page, and refused corrections."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_a_refusal_is_told_with_its_reasons(tmp_path: Path) -> None:
         dict.fromkeys("XY", AxisVerdict(None, 0, 4, {"Implausible": 4})),
         None,
         passes("uncorrected"),
-        "the daemon refuses to arm: ModelNotValidated",
+        "the daemon refuses the request arm: ModelNotValidated",
     )
     section = realistic_page.section(refused)
     assert "ModelNotValidated" in section.text
@@ -77,11 +77,11 @@ def test_a_refusal_is_told_with_its_reasons(tmp_path: Path) -> None:
 def test_what_was_believed_stands_beside_the_truth() -> None:
     verdict = AxisVerdict(published(), 4, 4, {})
     believed = Realistic(machine(), {"X": TRUE}, {"X": verdict}, None, passes("uncorrected", "inverse"), "")
-    assert realistic_page.headline(believed) == ("on a realistic machine smaller by", "4.0 x")
+    assert realistic_page.headline(believed) == ("on a realistic machine reduced by", "4.0 x")
     rows = realistic_page.parameter_rows(believed)
     assert [row[1] for row in rows] == [*PARAMETERS, "load"]
     assert rows[-1][3] == "2.500 ±0.002 N.m"
-    assert realistic_page.verdict_rows(believed)[0] == ["X", "4 of 4", "the six and load", ""]
+    assert realistic_page.verdict_rows(believed)[0] == ["X", "4 of 4", "six parameters and load", ""]
     told = _realistic(believed)
     assert told["axes"]["X"]["terms"] == {"load": 2.5}
     assert [cut["label"] for cut in told["cuts"]] == ["uncorrected", "inverse"]
@@ -149,7 +149,7 @@ from pathlib import Path
 from fdhil.child import stopping_in_order
 from fdhil.cli.demo import loop
 from fdhil.cli.demo.machines import machine_document
-loop._commission = lambda stage: None  # nothing is armed here
+loop._commission = lambda stage: None  # arming is not needed here
 with stopping_in_order(), loop.running(Path(sys.argv[1]), False, lambda text: None, machine_document()) as stage:
     loop._await(lambda: stage.ask("status")["may_stand"]["nothing"], "the guard did not read the drives", stage)
     print(stage.twin.pid, *(process.pid for process in stage.others), flush=True)

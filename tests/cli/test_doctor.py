@@ -1,4 +1,4 @@
-"""fdhil doctor names each planted trouble first."""
+"""``fdhil doctor`` lists each planted problem first."""
 
 from __future__ import annotations
 
@@ -31,15 +31,13 @@ from tests.short_waits import shorten_waits
 
 @pytest.fixture(autouse=True)
 def quick(virtual_threads: object, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shorter waits than on a real machine, and a PC that nobody else uses."""
+    """Use shorter waits, and a PC without other load."""
     shorten_waits(monkeypatch, {"drivers.can.sdo.RESPONSE_TIMEOUT_S": 0.2})
     monkeypatch.setattr("os.getloadavg", lambda: (0.1, 0.1, 0.1))
     monkeypatch.setattr("fdhil.cli.doctor.computer.GOVERNOR", Path("/none"))
 
 
 class Pc:
-    """A PC with a machine: one axis on a bus of this process, which has a drive where ``peer`` was called."""
-
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.store = folder / "store"
@@ -87,7 +85,7 @@ def store_is_a_file(pc: Pc, patch: pytest.MonkeyPatch) -> None:
 
 
 def store_may_not_be_written(pc: Pc, patch: pytest.MonkeyPatch) -> None:
-    # root may write everywhere
+    # root can write everywhere
     patch.setattr("fdhil.cli.doctor.storage.may_write", lambda _: False)
 
 
@@ -132,7 +130,7 @@ def kernel_without_can(pc: Pc, patch: pytest.MonkeyPatch) -> None:
 
 
 def adapter(pc: Pc, patch: pytest.MonkeyPatch, flags: str | None, details: dict[str, Any] | None = None) -> None:
-    """A CAN interface as the kernel and ``ip`` tell of it; ``flags`` None: there is none."""
+    """Fake a CAN interface of the kernel and ``ip``; ``flags`` None: no interface."""
     pc.bus = {"interface": "socketcan", "channel": "can9", "bitrate": 500_000}
     patch.setattr("fdhil.cli.doctor.computer._opens_can", lambda: True)
     patch.setattr("fdhil.cli.doctor.computer.INTERFACES", pc.folder)
@@ -288,5 +286,5 @@ def test_it_reads_well(pc: Pc) -> None:
     pc.document["store"]["run_directory"] = str(pc.folder / ("x" * 120))
     result = CliRunner().invoke(doctor, [str(pc.write()), "--offline"], standalone_mode=False)
     assert "1. sockets: " in result.stdout
-    assert "   mend:  give [store] run_directory a shorter one" in result.stdout
-    assert "1 to mend, 0 that could be better" in result.stdout
+    assert "   fix:   choose a shorter [store] run_directory" in result.stdout
+    assert "1 to fix, 0 to improve" in result.stdout

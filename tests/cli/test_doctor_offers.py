@@ -1,4 +1,4 @@
-"""fdhil doctor tells of an offer that waits, and of what keeps it from being looked at."""
+"""``fdhil doctor`` reports pending and unreadable configuration changes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from tests.fleet.offers import Works, machine_of
 
 @pytest.fixture
 def machine(tmp_path: Path) -> MachineConfig:
-    """A machine with an offer that nobody has answered."""
     works = Works(tmp_path)
     config = machine_config.load(machine_of(works, tmp_path / "mill"))
     config.offers_directory.mkdir(parents=True)
@@ -48,7 +47,7 @@ def test_answers_that_cannot_be_read(machine: MachineConfig) -> None:
 def test_what_this_user_may_not_read(what: str, machine: MachineConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = machine.offers_directory
     shut = folder if what == "the folder" else folder / file_name("friction", 3)
-    monkeypatch.setattr(os, "access", lambda path, _: path != shut)  # root may read all
+    monkeypatch.setattr(os, "access", lambda path, _: path != shut)  # root can read everything
     assert ("OffersUnread", True) in told(machine)
 
 

@@ -1,4 +1,4 @@
-"""fdhil doctor looks at what goes to the works, and sends nothing."""
+"""``fdhil doctor`` examines the uplink without sending."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ JETSTREAM = b'INFO {"server_id":"A","jetstream":true}\r\n'
 
 @contextmanager
 def answering(words: bytes) -> Iterator[tuple[str, list[bytes]]]:
-    """Answer one caller with a server's greeting; yields the server, and what it was sent."""
+    """Answer one client with a server's greeting; yield the server address and the received bytes."""
     sent: list[bytes] = []
     with socket.create_server(("127.0.0.1", 0)) as door:
 
@@ -39,7 +39,7 @@ def answering(words: bytes) -> Iterator[tuple[str, list[bytes]]]:
 
 
 def recorded(folder: Path, **uplink: str) -> Machine:
-    """Return a machine that has recorded, and whose records of now are told to be all sent."""
+    """Return a machine with records that are marked as sent."""
     machine = Machine(written(folder, **uplink))
     machine.record(1)
     machine.config.uplink_directory.mkdir()
@@ -64,7 +64,7 @@ def change(machine: Machine, statement: str) -> None:
 def waits(machine: Machine) -> None:
     (machine.config.uplink_directory / POSITION_FILE).unlink()
     change(machine, "DELETE FROM outbox WHERE of = 'windows'")
-    change(machine, "UPDATE revisions SET wall_s = 5")  # damaged, and of no known time
+    change(machine, "UPDATE revisions SET wall_s = 5")  # damaged, with an invalid time
 
 
 def damaged_position(machine: Machine) -> None:
@@ -101,7 +101,7 @@ def test_how_many_wait_and_since_when(tmp_path: Path) -> None:
     machine = recorded(tmp_path)
     waits(machine)
     (trouble,) = examine_uplink(machine.config, True)
-    assert trouble.what == "5 records wait, the oldest since 1970-01-01 00:00"
+    assert trouble.what == "5 records are unsent, the oldest since 1970-01-01 00:00"
 
 
 def test_a_file_of_the_credentials_that_is_not_there(tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_a_machine_that_tells_nobody_is_not_looked_at(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "told"), [(JETSTREAM, ""), (b'INFO {"a":1}\r\n', "JetStream"), (b"220 mail\r\n", "kind")]
+    ("words", "told"), [(JETSTREAM, ""), (b'INFO {"a":1}\r\n', "JetStream"), (b"220 mail\r\n", "greeting")]
 )
 def test_who_answers_is_heard_and_told_nothing(words: bytes, told: str, tmp_path: Path) -> None:
     with answering(words) as (server, sent):

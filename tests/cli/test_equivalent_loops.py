@@ -1,4 +1,4 @@
-"""Cascade and PID with the same sum and product of gains are reported as the same controller."""
+"""Cascade and PID with the same sum and product of gains are reported as equivalent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""fdhil-guard: what it makes of a config, what it refuses, and that it becomes the guard's process."""
+"""``fdhil-guard``: settings, refusals, and the transition to the guard process."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_no_hub_is_one_sentence(
 def test_no_drive_is_commissioned_while_a_guard_owns_the_bus(
     tmp_path: Path, peer: Peer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It has read the records when it started, and would not know the new one."""
+    """The running guard read the records at its start and would not use a new one."""
     config = write_config(tmp_path, peer.port)
     monkeypatch.setattr(sys, "argv", ["fdhil", "commission", str(config), "--yes"])
     with lock_bus(machine_config.load(config).bus["can0"]):
@@ -95,7 +95,6 @@ def test_no_drive_is_commissioned_while_a_guard_owns_the_bus(
 
 
 def never(*_: object) -> None:
-    """Stand in for becoming the guard, where that must not be."""
     raise AssertionError("a second guard")
 
 
@@ -103,7 +102,7 @@ def never(*_: object) -> None:
 def test_it_becomes_the_guard_owns_its_bus_and_stops_cleanly(
     tmp_path: Path, peer: Peer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A second one, by another name of the same hub and from another directory, exits with 3 and sends nothing."""
+    """A second guard on another name of the same hub exits with 3 and sends nothing."""
     config = write_config(tmp_path, peer.port)
     (tmp_path / "other").mkdir()
     other = write_config(tmp_path / "other", peer.port)
@@ -129,7 +128,7 @@ def test_it_becomes_the_guard_owns_its_bus_and_stops_cleanly(
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
 def test_a_guard_whose_output_is_closed_says_nothing_on_the_bus(closed: str, tmp_path: Path, peer: Peer) -> None:
-    """The descriptor that is free must not become the bus: the journal would be written to it."""
+    """Otherwise the bus would get the descriptor of stdout, and log lines would be sent on it."""
     config = write_config(tmp_path, peer.port)
     command = f"exec {sys.executable} -m fdhil.cli.guard {config} {closed}"
     with subprocess.Popen(["bash", "-c", command], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
@@ -158,7 +157,7 @@ def test_the_process_alone_refuses_what_it_cannot_use(tmp_path: Path) -> None:
 def test_a_guard_under_a_user_of_its_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its files are in a directory of its own, the token is given to it by systemd, and it knows the daemon's user."""
+    """The guard has its own directory, gets the token from systemd, and accepts the daemon's user."""
     config = write_config(tmp_path, 1)
     config.write_text(config.read_text() + 'run_directory = "own"\ndaemon_user = "daemon"\n')
     given = tmp_path / "credentials"

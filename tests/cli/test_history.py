@@ -1,4 +1,4 @@
-"""history: slopes against temperature and time, what changed and why, and when a maintenance limit will be reached."""
+"""``fdhil history``: slopes over temperature and time, changes with causes, maintenance dates."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PER_KELVIN = -0.25  # of Cd, N.m
 
 @pytest.fixture(scope="module")
 def worn(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A machine whose ft wears, whose Cd follows the temperature, and whose table was loaded on day 40."""
+    """A machine with wearing ft, temperature-dependent Cd, and a table load added on day 40."""
     tmp_path = tmp_path_factory.mktemp("worn")
     path = tmp_path / "machine.toml"
     path.write_text(BENCH)
@@ -76,7 +76,7 @@ def test_a_changed_load_is_found_and_named(worn: Path, capsys: Any) -> None:
     assert change["cause"] == "a changed load"
     told = change["parameters"]["Jt"]
     assert (told["before"], told["after"]) == (pytest.approx(0.075, rel=2e-3), pytest.approx(0.08475, rel=2e-3))
-    # the trend of Jt begins anew at the step: a step is no wear
+    # the trend of Jt restarts at the step, which is not wear
     assert _days(document["trends"]["X"]["Jt"]["since"]) == pytest.approx(STEP_DAY, abs=0.6)
     assert document["trends"]["X"]["Jt"]["low"] <= 0 <= document["trends"]["X"]["Jt"]["high"]
 
@@ -85,7 +85,7 @@ def test_the_date_of_a_limit_comes_with_its_interval(worn: Path, capsys: Any) ->
     document = json.loads(fdhil("history", worn, "--json", capsys=capsys)[1])
     (limit,) = [limit for name, limit in document["limits"]["X"].items() if name == "ft"]
     first = document["revisions"][0]["parameters"]["ft"]["value"]
-    assert limit["limit"] == pytest.approx(2 * first)  # the limit that is set where the config says nothing
+    assert limit["limit"] == pytest.approx(2 * first)  # default limit
     due = (2 * first - 0.05) / WEAR_PER_DAY
     assert _days(limit["earliest"]) <= due <= _days(limit["latest"])
     assert _days(limit["date"]) == pytest.approx(due, rel=0.05)
@@ -110,7 +110,6 @@ def test_the_plot_and_the_report_show_it(worn: Path, tmp_path: Path, capsys: Any
 
 @pytest.mark.usefixtures("long_computation")
 def test_the_report_begins_with_how_the_drives_are(worn: Path, tmp_path: Path, capsys: Any) -> None:
-    """What to do next, the newest values against nominal ones, then a course of each parameter with both."""
     document = json.loads(fdhil("history", worn, "--json", capsys=capsys)[1])
     assert fdhil("report", worn, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
     page = (tmp_path / "report.html").read_text()
@@ -128,7 +127,6 @@ def test_the_report_begins_with_how_the_drives_are(worn: Path, tmp_path: Path, c
 
 
 def test_rapids_that_were_not_believed_are_in_the_report(tmp_path: Path, capsys: Any) -> None:
-    """An axis of which nothing was believed is seen too, and why."""
     path = tmp_path / "machine.toml"
     path.write_text(BENCH)
     with History.open(config_of(tmp_path, ("X", "Y")).store.directory) as history:
@@ -139,14 +137,14 @@ def test_rapids_that_were_not_believed_are_in_the_report(tmp_path: Path, capsys:
     assert fdhil("report", path, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
     page = (tmp_path / "report.html").read_text()
     assert "None of 3 rapids was accepted, most often (3 ×) because of MissingStage(cruise): no plateau." in page
-    assert "Rapids that were not believed: 3 of 3" in page
+    assert "Refused rapids: 3 of 3" in page
     assert "<dt>axis Y</dt><dd>not identified</dd>" in page
     assert "<h2>Axis Y</h2>" in page
 
 
 @pytest.mark.usefixtures("long_computation")
 def test_a_long_store_is_a_small_page(tmp_path: Path, capsys: Any) -> None:
-    """Of many rapids each day's median is drawn, and where most of its estimates lie."""
+    """With many rapids the plot shows the daily median and a percentile band."""
     path = tmp_path / "machine.toml"
     path.write_text(BENCH)
     rng = np.random.default_rng(1)
@@ -170,10 +168,10 @@ def test_a_long_store_is_a_small_page(tmp_path: Path, capsys: Any) -> None:
 
 
 def test_an_axis_that_there_is_not_is_refused(worn: Path, capsys: Any) -> None:
-    """It is a wrong option, not an empty history."""
+    """An unknown axis is a wrong option, not an empty history."""
     code, _, told = fdhil("history", worn, "--axis", "Q", capsys=capsys)
     assert code == 2
-    assert "Q is no axis" in told
+    assert "has no axis Q" in told
 
 
 def test_every_table_fits_80_columns_and_says_what_its_intervals_are(worn: Path, capsys: Any) -> None:
@@ -199,7 +197,7 @@ def test_history_and_report_tell_what_waits_and_who_acknowledged(tmp_path: Path,
         history.add_notice(Notice("BusDown", "info", "the bus is back"), Stamp(START_S + 9, "boot", 9))
         history.add_acknowledgement(Acknowledgement((1,), "anna", "plug", Stamp(START_S + 60, "boot", 60)))
     out = fdhil("history", path, capsys=capsys)[1]
-    assert "wait to be acknowledged (fdhil acknowledge): 1" in out
+    assert "pending notices (see fdhil acknowledge): 1" in out
     assert "acknowledged by anna" in out
     assert "the bus is back" not in out
     told = json.loads(fdhil("history", path, "--json", capsys=capsys)[1])["notices"]

@@ -1,4 +1,4 @@
-"""history of an axis without a voltage sensor: its ratios to K still tell wear and a changed load."""
+"""History of an axis without voltage sensor: ratios to K show wear and load changes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ WEAR_PER_DAY = 0.01  # of Cd/K
 
 @pytest.fixture(scope="module")
 def deaf(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A machine that measures no voltage, whose friction wears and whose table is loaded on day 12."""
+    """A machine without voltage sensor, with wearing friction and a table load added on day 12."""
     tmp_path = tmp_path_factory.mktemp("deaf")
     path = tmp_path / "machine.toml"
     path.write_text(BENCH)

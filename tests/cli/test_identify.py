@@ -1,4 +1,4 @@
-"""``fdhil identify`` as users and programs call it."""
+"""``fdhil identify`` as called by users and programs."""
 
 from __future__ import annotations
 
@@ -26,19 +26,16 @@ from tests.identification.recorded import signals
 
 @pytest.fixture
 def shuttle(tmp_path: Path) -> Path:
-    """A recording of two rapids."""
     path = tmp_path / "shuttle.csv"
     path.write_text(bench.as_csv(signals(moves=2), 0.003))
     return path
 
 
 def invoke(*arguments: object) -> Result:
-    """Run ``fdhil identify`` with these arguments."""
     return CliRunner().invoke(cli, ["identify", *map(str, arguments)], standalone_mode=False)
 
 
 def told_document(result: Result) -> dict[str, Any]:
-    """Return the JSON document that it wrote."""
     document: dict[str, Any] = json.loads(result.stdout)
     return document
 
@@ -78,7 +75,7 @@ def test_the_delay_of_a_slow_sensor_is_told_with_its_deviation(tmp_path: Path) -
     assert set(window["delay_s"]) == {"value", "std", "unit"}
     assert window["delay_s"]["unit"] == "s"
     assert abs(window["delay_s"]["value"] - 0.0012) < 4 * window["delay_s"]["std"] < 2e-4
-    assert "voltage is late by 1.2" in invoke(path).stdout
+    assert "voltage is delayed by 1.2" in invoke(path).stdout
 
 
 @pytest.mark.parametrize("method", ["least_squares", "maximum_likelihood"])
@@ -131,7 +128,7 @@ def _config(rapid: float) -> str:
 
 
 def test_one_bad_recording_does_not_end_a_batch(shuttle: Path, tmp_path: Path) -> None:
-    """The others are identified; the bad one has its error in the document, in the table and on stderr."""
+    """The error of the bad recording is in the document, in the table and on stderr."""
     bad, absent = tmp_path / "bad.csv", tmp_path / "absent.csv"
     bad.write_bytes(b"time_s,voltage_V\n1,two\n")
     result = invoke(bad, shuttle, absent, "--json")
@@ -169,7 +166,6 @@ def test_a_bad_place_does_not_end_a_batch(place: str, shuttle: Path, tmp_path: P
 
 
 def identified_without_rights(*recordings: Path) -> subprocess.CompletedProcess[str]:
-    """Run ``fdhil identify`` as one who may not read everything."""
     command = [sys.executable, "-m", "fdhil", "identify", "--json", *map(str, recordings)]
     if os.geteuid() == 0:
         command = ["setpriv", "--bounding-set=-dac_override,-dac_read_search", *command]
@@ -177,7 +173,7 @@ def identified_without_rights(*recordings: Path) -> subprocess.CompletedProcess[
 
 
 def test_an_axis_that_the_config_lacks_is_told(shuttle: Path, tmp_path: Path) -> None:
-    """It is compared with no nominal values; without a config nobody asked for that."""
+    """Without the axis in the configuration no comparison with nominal values is possible."""
     shuttle.write_text(shuttle.read_text().replace("# axis: X", "# axis: Q", 1))
     (tmp_path / "machine.toml").write_text(_config(500.0))
     (told,) = told_document(invoke(shuttle, "--json", "--config", tmp_path / "machine.toml"))["files"]
@@ -239,7 +235,7 @@ demand_m = { name = "Demand", unit = "mm" }
 
 
 def _trace(tmp_path: Path, every: int = 1, sampling: str = "interval_mean") -> tuple[Path, Path]:
-    """Write a trace as a scope does: decimal commas, quoted, the position by a counter of 16 bits; and its map."""
+    """Write an oscilloscope trace with decimal commas, quotes and a 16-bit position counter, and its column map."""
     lines = bench.as_csv(signals(moves=2), 0.003).partition("time_s")[2].splitlines()[1::every]
     rows = ['"Time","Voltage","Current","Speed","Position","Demand"']
     for line in lines:

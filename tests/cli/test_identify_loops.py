@@ -1,4 +1,4 @@
-"""``fdhil identify --loops``: the drive's own loops, told and used."""
+"""``fdhil identify --loops``: the identified loops of the drive."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ pytestmark = pytest.mark.usefixtures("long_computation")
 
 @pytest.fixture
 def filtered(tmp_path: Path) -> Path:
-    """A recording of a drive with a filter on its speed feedback."""
     mechanics = real.Mechanics()
     run = real.run(mechanics, shuttle(2, 0.25, 0.5), real.Loops(speed_filter_s=0.001))
     path = tmp_path / "filtered.csv"
@@ -32,7 +31,7 @@ def test_a_filter_that_is_not_configured_is_told_and_used(filtered: Path, tmp_pa
     result = CliRunner().invoke(cli, ["identify", str(filtered), "--config", str(config), "--json"])
     (told,) = json.loads(result.stdout)["files"]
     assert told["pooled"]["validated"]
-    loops = told["loops"]  # the configured ones do not explain the rapids: nobody had to ask
+    loops = told["loops"]  # identified without --loops, because the configured ones do not explain the rapids
     assert (loops["structure"], loops["configured_structure"]) == ("p_pi_pi", "p_pi_pi")
     found = loops["gains"]["speed_filter_s"]
     assert found["value"] == pytest.approx(0.001, rel=0.06)
@@ -46,4 +45,4 @@ def test_people_read_a_table_of_the_loops(filtered: Path) -> None:
     assert result.exit_code == 0
     assert "loops: p_pi_pi" in result.stdout
     assert "speed_filter_s" in result.stdout
-    assert "these loops leave 0." in result.stdout
+    assert "not explained by these loops: 0." in result.stdout

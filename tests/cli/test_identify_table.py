@@ -1,4 +1,4 @@
-"""``fdhil identify`` with what was seen at the table: columns of the recording, or a printer's accelerometer file."""
+"""``fdhil identify`` with measurements at the table: columns of the recording, or an accelerometer file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SOFT = Mechanics(resonance_hz=HERTZ)
 
 @cache
 def signals() -> dict[str, bench.Array]:
-    """Return the columns of two rapids of an axis whose screw gives, the table's place among them."""
+    """Return the columns of two rapids of an axis with a compliant screw, including the table position."""
     run = real_plant.run(SOFT, DEMAND_M, None, 1e-3)
     told = real_plant.reported(run, SOFT, Sensors(noise=0.001, speed="difference"), 1)
     return {**told, "table_mm": np.round(1e3 * run.table_m, 4)}
@@ -38,7 +38,7 @@ def written(folder: Path, table: bool) -> Path:
 
 
 def printed(folder: Path, begin_s: float = 4321.0, lead: int = 400) -> Path:
-    """Write what an ADXL345 with 3200 samples a second makes of the same run: y against the axis, gravity on z."""
+    """Write the data of an ADXL345 at 3200 samples/s in the same run: y opposite to the axis, gravity on z."""
     place = real_plant.run(SOFT, DEMAND_M, None, real_plant.STEP_S).table_m
     push = np.gradient(np.gradient(place, real_plant.STEP_S), real_plant.STEP_S)
     push = np.convolve(push, np.ones(10) / 10, "same")[::10]  # every 0.3125 ms
@@ -108,7 +108,7 @@ def test_status_says_what_the_table_did_and_how_it_swings() -> None:
     }
     text = believed({"terms": {"resonance": figures}, "last_window": {"at_table": seen}, "warnings": []})
     assert "resonance 60" in text
-    assert "the table was 46.20 um RMS off in the last rapid" in text
+    assert "table error of 46.20 um RMS in the last rapid" in text
     assert "table" not in believed({"terms": {}, "last_window": {"at_table": None}})
 
 
@@ -123,4 +123,4 @@ def test_a_file_of_another_run_or_kind_is_refused(tmp_path: Path) -> None:
         "is not an accelerometer recording" in told(invoke(path, "--accelerometer", other, "--json"))["error"]["text"]
     )
     result = CliRunner().invoke(cli, ["identify", str(path), str(path), "--accelerometer", str(other)])
-    assert "belongs to one recording" in str(result.output) + str(result.exception)
+    assert "applies to one recording" in str(result.output) + str(result.exception)

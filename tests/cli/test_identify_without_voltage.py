@@ -1,4 +1,4 @@
-"""``fdhil identify`` of recordings without a voltage, and the model file that it writes."""
+"""``fdhil identify`` of recordings without voltage, and its model file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""fdhil init: answers, questions, LinuxCNC's files and drives become a file that every command accepts."""
+"""``fdhil init`` creates a valid configuration from answers, prompts, LinuxCNC files and drives."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ RAPID = {"screw_pitch_mm": 20.0, "rapid_speed_mm_s": 500.0, "max_acceleration_mm
 
 @pytest.fixture
 def fdhil(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Said:
-    """Run a command in this process, ``said`` on its standard input: exit code, stdout and stderr."""
+    """Run a command in this process with ``said`` on standard input; return exit code, stdout and stderr."""
     monkeypatch.setattr("fdhil.cli.init.INTERFACES", Path("no interfaces"))
     shorten_waits(monkeypatch, {"commissioning.scan.ANSWER_S": 1.0, "drivers.can.sdo.RESPONSE_TIMEOUT_S": 0.2})
 
@@ -54,13 +54,11 @@ def fdhil(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.fixture
 def bus() -> dict[str, Any]:
-    """A bus inside this process."""
     return {"can0": {"interface": "virtual", "channel": uuid.uuid4().hex}}
 
 
 @pytest.fixture
 def peer(virtual_threads: object, bus: dict[str, Any]) -> Iterator[DrivePeer]:
-    """A simulated drive on that bus."""
     with DrivePeer(machine(bus=bus["can0"])) as running:
         yield running
 
@@ -120,7 +118,7 @@ def test_rotary_axis_and_gantry_of_linuxcnc_need_a_radius_and_two_node_ids(fdhil
     a, text = made.axis["A"], file.read_text()
     assert (a.rapid_speed_mm_s / a.mm_per_unit, a.screw_pitch_mm / a.mm_per_unit) == pytest.approx((90.0, 8.192))
     assert "rapid_speed_deg_s = 90.0  # LinuxCNC: [AXIS_A] MAX_VELOCITY" in text
-    assert "[axis.Y2.nominal]" not in text  # taken over
+    assert "[axis.Y2.nominal]" not in text  # copied from Y
 
 
 def test_what_is_missing_is_named_at_once_and_nothing_is_written(fdhil: Said, tmp_path: Path) -> None:
@@ -183,7 +181,7 @@ def test_a_wrong_answer_is_told_by_its_key(tables: dict[str, Any], words: str, f
 def test_the_drive_tells_its_scales_and_the_operator_the_rest(
     fdhil: Said, peer: DrivePeer, bus: dict[str, Any], tmp_path: Path
 ) -> None:
-    """A wrong answer is asked again, an empty line takes the proposal."""
+    """A wrong answer is prompted again, an empty line accepts the proposal."""
     lines = [
         "tin can", "virtual", bus["can0"]["channel"], "", "", "X1", "X", "20", "500", "4 m/s2", "4000", "0,5", "0.5",
         "0.005", "", "0.075", *[""] * 8, "yes",
@@ -191,7 +189,7 @@ def test_the_drive_tells_its_scales_and_the_operator_the_rest(
     file = tmp_path / "m.toml"
     code, out, err = fdhil("init", file, said="\n".join(lines) + "\n")
     assert code == 0, err
-    assert err.count("once more") == 4
+    assert err.count("try again") == 4
     assert "node 1 (fdhil twin drive" in err
     made = machine_config.load(file).axis["X"]
     assert (made.drive.profile, made.drive.increments_per_rev, made.nominal.K) == ("fdhil_twin", 65536, 0.8)
@@ -203,7 +201,7 @@ def test_the_drive_tells_its_scales_and_the_operator_the_rest(
 def test_numbers_that_cannot_be_of_one_machine_are_asked_again(
     fdhil: Said, bus: dict[str, Any], tmp_path: Path
 ) -> None:
-    """5 H instead of 5 mH is seen at the end, and only that is asked again."""
+    """5 H instead of 5 mH is detected at the end, and only this value is prompted again."""
     lines = [
         "virtual", bus["can0"]["channel"], "", "", "X", "", "fdhil_twin", "20", "65536", "500", "4000", "50", "0.5",
         "5", "0.8", "0.075", "", "300", *[""] * 8, "no", "0.005", "12.566",
@@ -230,10 +228,10 @@ def test_an_eds_that_cannot_be_read_is_asked_again(fdhil: Said, tmp_path: Path) 
 
 
 def test_who_goes_away_leaves_nothing(fdhil: Said, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At a terminal that is the operator's will; else nobody is there, and a file of answers is what helps."""
+    """At a terminal this is Ctrl-C; otherwise standard input has ended, and the error suggests an answers file."""
     code, _, err = fdhil("init", tmp_path / "m.toml", "--offline", said="socketcan\n")
     assert code == 2
-    assert "bus.can0.channel: is asked for, and nobody is there to answer (give --answers FILE)" in err
+    assert "bus.can0.channel: needs an answer, and standard input has ended (give --answers FILE)" in err
     monkeypatch.setattr("fdhil.cli.init.sys", SimpleNamespace(stdin=SimpleNamespace(isatty=lambda: True)))
     code, _, err = fdhil("init", tmp_path / "m.toml", "--offline", said="socketcan\n")
     assert code == 130
@@ -256,7 +254,7 @@ def test_what_a_file_says_cannot_break_the_comments(fdhil: Said, tmp_path: Path)
 def test_beside_an_nc_nothing_is_sent(
     fdhil: Said, peer: DrivePeer, bus: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The drive is known by its node-ID alone, so that its scales are asked; the period is heard."""
+    """Only the node-ID of the drive is known, so scales are prompted; the SYNC period is measured."""
     monkeypatch.setattr("fdhil.commissioning.scan.LISTEN_S", 2.0)
     axis = SHEET | RAPID | {"drive": SHEET["drive"] | {"increments_per_rev": 65536}}
     answers = written(tmp_path, axis={"X": axis}, bus=bus, machine={"sync_period_s": 0.001})

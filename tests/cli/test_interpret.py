@@ -1,4 +1,4 @@
-"""``fdhil interpret``: one document on stdout, or one sentence on stderr and the exit code."""
+"""``fdhil interpret``: one document on stdout, or one sentence on stderr with the exit code."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from tests.bench import bench_toml
 
 
 def call(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    """Run the command line with ``arguments``."""
     monkeypatch.setattr("sys.argv", ["fdhil", *arguments])
     return run_safely(cli)
 
@@ -65,7 +64,6 @@ PROBED += "G10 L20 P0 X0\nG0 X5\nG1 X[#1] F1000\nM2\n"
 def document_of(
     text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *more: str
 ) -> dict[str, Any]:
-    """Return what ``fdhil interpret --json`` writes of a program."""
     program = tmp_path / "p.ngc"
     program.write_text(text)
     call(monkeypatch, "interpret", str(program), "--json", *more)

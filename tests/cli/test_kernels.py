@@ -1,4 +1,4 @@
-"""What is compiled: all of it before it is needed, by as many processes as like, wherever it can be kept."""
+"""Compilation of all kernels, by concurrent processes, in any cache folder."""
 
 from __future__ import annotations
 
@@ -38,7 +38,6 @@ print(sum(_coast.stats.cache_hits.values()))
 
 
 def python(code: str, **environment: str) -> subprocess.Popen[str]:
-    """Start Python on a text."""
     return subprocess.Popen([sys.executable, "-c", code], env={**os.environ, **environment}, stdout=-1, text=True)
 
 
@@ -63,7 +62,7 @@ def test_two_processes_that_compile_at_once_leave_what_a_third_finds(tmp_path: P
 def test_without_a_place_to_keep_them_it_says_which_to_name(tmp_path: Path) -> None:
     shutil.copytree(ROOT, tmp_path / "fdhil", ignore=shutil.ignore_patterns("__pycache__"))
     for folder in {path.parent for path in (tmp_path / "fdhil").rglob("*.py")}:
-        (folder / "__pycache__").touch()  # no folder can be made there, by whatever user
+        (folder / "__pycache__").touch()  # no user can create a folder there
     command = [sys.executable, "-m", "fdhil", "sim", str(tmp_path / "fdhil" / "cli" / "demo" / "machine.toml")]
     nowhere = {"HOME": "/dev/null", "XDG_CACHE_HOME": "/dev/null/cache", "PYTHONPATH": str(tmp_path)}
     environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}

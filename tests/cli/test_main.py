@@ -1,4 +1,4 @@
-"""The command line as a whole: the list of commands, exit codes, and no traceback for wrong input."""
+"""The command line as a whole: list of commands, exit codes, no tracebacks."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_help_imports_no_numerics() -> None:
         "import sys; from fdhil.cli.main import cli; cli.main(['--help'], standalone_mode=False); print(*sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "Commands:" in done.stdout
+    assert "Set up:" in done.stdout
     for heavy in ("numpy", "scipy", "numba", "pyarrow", "canopen", "pymodbus", "pydantic", "rich"):
         assert heavy not in done.stdout.split()
 
@@ -72,13 +72,13 @@ def test_errors_are_sentences_with_their_exit_code(capsys: pytest.CaptureFixture
 
 def test_the_list_is_in_the_order_of_the_workflow() -> None:
     listed = cli.list_commands(click.Context(cli))
-    assert listed[:7] == ["demo", "paper", "init", "scan", "check", "commission", "run"]
+    assert listed[:8] == ["demo", "paper", "sim", "init", "scan", "check", "commission", "doctor"]
 
 
 def test_the_entry_point_shows_no_advice_of_libraries(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It is for developers, who ask for it; the processes that a command starts show none either."""
+    """Warnings of libraries are for developers; child processes hide them as well."""
     monkeypatch.setattr("sys.argv", ["fdhil", "--version"])
     monkeypatch.setattr("sys.warnoptions", [])
     monkeypatch.setenv("PYTHONWARNINGS", "")

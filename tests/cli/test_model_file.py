@@ -1,4 +1,4 @@
-"""A model file has the loops that any of its recordings showed, and is not written where they are unknown."""
+"""A model file contains identified loops, and is not written while they are unknown."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The loops by which a model was validated are in its file: a correction planned with it helps the real drive."""
+"""A correction planned with the loops of a model file improves the real drive."""
 
 from __future__ import annotations
 
@@ -31,13 +31,12 @@ WORSE_UM = 1.0
 
 
 def invoke(*arguments: str | Path) -> Result:
-    """Run a command of ``fdhil``."""
     return CliRunner().invoke(cli, list(map(str, arguments)))
 
 
 @dataclass(frozen=True)
 class Shop:
-    """A bench whose drives filter their speed over 2 ms: folder, recording, configuration, and the model written."""
+    """A bench whose drives filter their speed over 2 ms."""
 
     folder: Path
     recording: Path
@@ -47,7 +46,6 @@ class Shop:
 
 @pytest.fixture(scope="module")
 def shop(tmp_path_factory: pytest.TempPathFactory, long_computation: None) -> Shop:
-    """Identify the drive once and write its model file."""
     folder = tmp_path_factory.mktemp("filtered")
     shop = Shop(folder, folder / "filtered.csv", folder / "bench.toml", folder / "model.json")
     run = real.run(MECHANICS, shuttle(2, 0.25, 0.5), LOOPS)
@@ -86,7 +84,7 @@ def test_correction_from_the_history_uses_the_loops_of_the_published_sets(shop: 
     assert refused.exit_code == 2
     assert "X.loops: LoopsDiffer: is missing" in refused.stderr
     assert "speed_filter_s 0.002" in refused.stderr
-    path.write_text(json.dumps({axis: model | {"loops": {}} for axis, model in older.items()}))  # said to be right
+    path.write_text(json.dumps({axis: model | {"loops": {}} for axis, model in older.items()}))  # declared as correct
     assert run("predict", shop.folder / "demand.csv", "--config", shop.config, "--model", path).exit_code == 0
 
 
@@ -98,7 +96,7 @@ def test_model_of_recordings_without_a_configuration_says_that_its_loops_are_not
 
 
 def assert_corrected(shop: Shop, *source: str | Path) -> None:
-    """Plan a correction of the bench path with a model, and make the real drives follow it."""
+    """Plan a correction of the bench path with a model, and simulate the real drives with it."""
     reference, out = bench_trajectory(10), shop.folder / "out.csv"
     write_demand_csv(reference, shop.folder / "demand.csv")
     result = invoke("correct", shop.folder / "demand.csv", "--config", shop.config, "--out", out, *source)
@@ -114,5 +112,4 @@ def assert_corrected(shop: Shop, *source: str | Path) -> None:
 
 
 def table_mm(order_mm: Float) -> Float:
-    """Return where the real table goes (n, 2)."""
     return np.column_stack([real.run(MECHANICS, column / 1e3, LOOPS).table_m * 1e3 for column in order_mm.T])

@@ -1,4 +1,4 @@
-"""The paper claim by claim: the rule of the verdicts, what is covered, and the figures that are known."""
+"""``fdhil paper``: rule of the verdicts, coverage, and known figures."""
 
 from __future__ import annotations
 
@@ -32,7 +32,6 @@ def claim(trials: Sequence[Trial]) -> Claim:
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory: pytest.TempPathFactory, long_computation: None) -> tuple[dict[str, Any], Path]:
-    """What the command wrote, with few runs: its document, and the folder."""
     out = tmp_path_factory.mktemp("paper")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", ["fdhil", "paper", "--out", str(out), "--runs", "2"])
@@ -159,7 +158,7 @@ def test_the_path_is_that_of_the_programs_of_the_demonstration() -> None:
 
 
 def test_the_simulated_machine_obeys_the_equations() -> None:
-    """The voltage that the machine was driven by moves the model as it moved the machine."""
+    """The model responds to the recorded voltage like the machine."""
     plant = bench.plant()
     recording = bench.rapid(plant)
     assert recording.voltage_v is not None

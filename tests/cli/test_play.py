@@ -1,4 +1,4 @@
-"""fdhil play as a process beside the simulated machine: when it or its bus dies, the drives stop by themselves."""
+"""``fdhil play`` with the simulator: the drives stop if the process or its bus fails."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("processes")
 
 PER_MM = 65536 / 20
 HEARTBEAT_LOST = 0x8130
-STROKE = "G21 G90 G94\nG1 X300 F1500\nM2\n"  # longer than a host is held up
+STROKE = "G21 G90 G94\nG1 X300 F1500\nM2\n"  # longer than any delay of the host
 SETPOINTS = "[axis.X.setpoints]\ntravel_mm = [-10.0, 400.0]\n[axis.Y.setpoints]\ntravel_mm = [-10.0, 10.0]\n"
 # fdhil as a process of its own that waits a shorter time than on a real machine
 QUICK = """
@@ -39,7 +39,7 @@ main()
 
 
 class Relay:
-    """A cable between fdhil and the hub that can be cut."""
+    """A connection between fdhil and the hub that can be closed."""
 
     def __init__(self, port: int) -> None:
         self._hub = port
@@ -65,7 +65,6 @@ class Relay:
             return
 
     def cut(self) -> None:
-        """Both ends lose the connection at once."""
         for end in self._ends:
             end.shutdown(socket.SHUT_RDWR)
         self._thread.join()
@@ -75,8 +74,6 @@ class Relay:
 
 @dataclass
 class Shop:
-    """The simulated machine as a process, what is heard on its bus, and its commissioned config."""
-
     twin: TwinProcess
     folder: Path
     bus: can.BusABC
@@ -87,7 +84,6 @@ class Shop:
         return path
 
     def playing(self, port: int) -> subprocess.Popen[str]:
-        """Start to play, and return as soon as X is in motion."""
         program = self.folder / "part.ngc"
         program.write_text(STROKE)
         arguments = ["play", program, "--config", self.config(port), "--yes", "--go-to-start"]
@@ -109,7 +105,6 @@ class Shop:
         return process
 
     def last_in_the_audit(self) -> tuple[str, str | None]:
-        """What was asked or answered last, and with which result."""
         *_, (entry, _) = audit.entries(machine_config.load(self.folder / "machine.toml").store.directory)
         return entry.get("asked") or entry["answered"], entry.get("result")
 
@@ -120,7 +115,7 @@ class Shop:
             time.sleep(0.005)
 
     def stopped_by_themselves(self) -> bool:
-        """Both drives report that our heartbeat is lost, fall into fault, and stand."""
+        """Both drives report the lost heartbeat, enter the fault state and stop."""
         lost: set[int] = set()
 
         def told() -> bool:
@@ -141,7 +136,6 @@ class Shop:
         return places[-1] < 300 * PER_MM
 
     def read(self, index: int) -> int:
-        """Read an object of drive X by SDO."""
         request = bytes([0x40]) + struct.pack("<HB", index, 0) + bytes(4)
         self.bus.send(can.Message(arbitration_id=0x601, data=request, is_extended_id=False))
         answers: list[bytes] = []
@@ -170,7 +164,7 @@ def test_a_killed_process_leaves_drives_that_stop(shop: Shop) -> None:
     process.send_signal(signal.SIGKILL)
     said = process.communicate()
     assert process.returncode == -signal.SIGKILL, said
-    assert shop.last_in_the_audit() == ("play", None)  # what it came to is not known
+    assert shop.last_in_the_audit() == ("play", None)  # without a result
     assert shop.stopped_by_themselves()
 
 

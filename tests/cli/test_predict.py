@@ -1,4 +1,4 @@
-"""``fdhil predict`` as another program calls it."""
+"""``fdhil predict`` as called by another program."""
 
 from __future__ import annotations
 
@@ -23,14 +23,12 @@ from tests.paths import bench_trajectory
 
 @pytest.fixture(name="bench")
 def _bench(tmp_path: Path) -> Path:
-    """A folder with the bench's configuration and a demand."""
     (tmp_path / "bench.toml").write_text(bench_toml())
     write_demand_csv(bench_trajectory(10), tmp_path / "demand.csv")
     return tmp_path
 
 
 def invoke(*arguments: object) -> Result:
-    """Run a command in this process; errors become exit codes as on the command line."""
     codes: list[int] = []
     runner = CliRunner()
     with runner.isolation() as streams:
@@ -43,7 +41,6 @@ def invoke(*arguments: object) -> Result:
 
 
 def test_writes_json_and_csv(bench: Path) -> None:
-    """The document and the columns of the contract."""
     out = bench / "out.csv"
     result = invoke("predict", bench / "demand.csv", "--config", bench / "bench.toml", "--json", "--out", out)
     assert result.exit_code == 0
@@ -66,14 +63,13 @@ def test_writes_json_and_csv(bench: Path) -> None:
 
 
 def test_text_for_people(bench: Path) -> None:
-    """One line for the path, one per zone."""
     result = invoke("predict", bench / "demand.csv", "--config", bench / "bench.toml")
     assert "24.2 um RMS" in result.stdout
     assert "corner" in result.stdout
 
 
 def test_the_time_of_a_path_is_that_of_the_path(bench: Path) -> None:
-    """Not the clock's, where the times of a demand begin at another time than 0."""
+    """The duration does not depend on the start time of the demand."""
     names, *rows = (bench / "demand.csv").read_text().splitlines()
     shifted = [f"{float(t) + 1.7e9:.6f},{rest}" for t, _, rest in (row.partition(",") for row in rows)]
     (bench / "later.csv").write_text("".join(f"{line}\n" for line in [names, *shifted]))
@@ -81,7 +77,6 @@ def test_the_time_of_a_path_is_that_of_the_path(bench: Path) -> None:
 
 
 def test_sensitivity_names_the_parameter(bench: Path) -> None:
-    """Per zone: what 1 % of each parameter does."""
     arguments = ["predict", bench / "demand.csv", "--config", bench / "bench.toml", "--sensitivity"]
     document = json.loads(invoke(*arguments, "--json").stdout)
     assert set(document["zones"][0]["um_per_percent"]["X"]) == {"R", "L", "K", "Jt", "ft", "Cd"}
@@ -89,7 +84,6 @@ def test_sensitivity_names_the_parameter(bench: Path) -> None:
 
 
 def test_history_gives_parameters_and_their_uncertainty(bench: Path) -> None:
-    """The newest published set of each axis, with the standard deviation of the contour error."""
     values = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.085, "ft": 0.05, "Cd": 5.0}
     covariance = np.diag([(0.003 * value) ** 2 for value in values.values()])
     with History.open(bench / "fdhil-data") as history:
@@ -106,7 +100,7 @@ def test_history_gives_parameters_and_their_uncertainty(bench: Path) -> None:
 
 
 def remember(folder: Path, revisions: list[dict[str, float]], known_to: float = 0.003) -> None:
-    """Store equal revisions of X and Y, one a day, with some values other than nominal."""
+    """Store equal daily revisions of X and Y, with some values other than nominal."""
     for number, changed in enumerate(revisions, 1):
         for axis in "XY":
             publish(folder, axis, number, known_to, **changed)
@@ -115,10 +109,7 @@ def remember(folder: Path, revisions: list[dict[str, float]], known_to: float = 
 def publish(
     folder: Path, axis: str, number: int, known_to: float = 0.003, *, days: float | None = None, **changed: float
 ) -> None:
-    """Store one more revision of an axis, whose values are known to a share of themselves.
-
-    One a day, or ``days`` after the epoch.
-    """
+    """Store another revision of an axis with relative standard deviations, one per day or ``days`` after the epoch."""
     nominal = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
     covariance = np.diag([(known_to * value) ** 2 for value in nominal.values()])
     with History.open(folder / "fdhil-data") as history:
@@ -127,7 +118,7 @@ def publish(
 
 
 def test_history_tells_what_a_fixture_costs(bench: Path) -> None:
-    """Since the last step, or since the revision that is asked for; an unknown one is refused."""
+    """The cost is that since the last step or since --since; an unknown revision is refused."""
     remember(bench, [{}, {}, {"Jt": 0.085}, {"Jt": 0.085}])
     program = bench / "corner.ngc"
     program.write_text("G21 G90 G64\nG1 X0 Y30 F10000\nG1 X40\nM2\n")
@@ -136,15 +127,14 @@ def test_history_tells_what_a_fixture_costs(bench: Path) -> None:
     assert {(step["axis"], step["what"], step["since_revision"]) for step in steps} >= {("X", "inertia", 2)}
     assert steps[0]["line"] == 3
     assert steps[0]["parameters"] == {"Jt": {"before": 0.075, "now": 0.085}}
-    assert "has changed since revision 2 (Jt 0.075 -> 0.085): it costs" in invoke(*arguments).stdout
+    assert "changed since revision 2 (Jt 0.075 -> 0.085): it costs" in invoke(*arguments).stdout
     assert json.loads(invoke(*arguments, "--since", 3, "--json").stdout)["steps"] == []
     assert invoke(*arguments, "--since", 99).exit_code == 2
     assert invoke("predict", program, "--config", bench / "bench.toml", "--since", 1).exit_code == 2
 
 
 def test_the_next_prediction_of_a_program_tells_what_became_of_it(bench: Path) -> None:
-    """A fixture on X between two predictions: each zone's change in um, the parameter that caused it, and the text; the
-    same again says it again, another program nothing."""
+    """A fixture on X changes zones and parameter; a repetition reports the same, another program nothing."""
     program = bench / "corner.ngc"
     program.write_text("G21 G90 G64\nG1 X0 Y30 F10000\nG1 X40\nG1 Y60\nM2\n")
     arguments = ["predict", program, "--config", bench / "bench.toml", "--from-history"]
@@ -177,13 +167,13 @@ def test_the_next_prediction_of_a_program_tells_what_became_of_it(bench: Path) -
 
 
 def test_a_changed_configuration_is_told_apart_from_the_drives(bench: Path) -> None:
-    """Less position gain: what that did is not blamed on a parameter; nothing changed, nothing is told."""
+    """A lower position gain is not attributed to a parameter; without a change nothing is reported."""
     remember(bench, [{}])
     config = bench / "bench.toml"
     arguments = ["predict", bench / "demand.csv", "--config", config, "--from-history"]
     invoke(*arguments)
     publish(bench, "X", 2, Cd=5.0001)
-    assert "nothing has changed beyond chance since" in invoke(*arguments).stdout
+    assert "no significant change since" in invoke(*arguments).stdout
     config.write_text(config.read_text().replace("position_gain_per_s = 50.0", "position_gain_per_s = 40.0"))
     found = json.loads(invoke(*arguments, "--json").stdout)["compared"]
     assert found["configuration_changed"] is True
@@ -194,7 +184,6 @@ def test_a_changed_configuration_is_told_apart_from_the_drives(bench: Path) -> N
 
 
 def test_a_store_that_takes_nothing_is_told(bench: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The prediction itself is not lost."""
     remember(bench, [{}])
 
     def full(_directory: Path) -> History:
@@ -203,12 +192,12 @@ def test_a_store_that_takes_nothing_is_told(bench: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(History, "open", full)
     result = invoke("predict", bench / "demand.csv", "--config", bench / "bench.toml", "--from-history", "--json")
     assert result.exit_code == 0
-    assert "not kept for the next one to compare with: the disk is full" in result.stderr
+    assert "not stored for later comparison: the disk is full" in result.stderr
     assert json.loads(result.stdout)["compared"] is None
 
 
 def test_history_tells_when_a_zone_leaves_the_tolerance(bench: Path) -> None:
-    """Jt rises by 0.2 % a day: the corners leave 105 um within weeks, the largest are over 98 um already."""
+    """Jt rises by 0.2 % per day: corners exceed 105 um within weeks, the largest exceed 98 um already."""
     remember(bench, [{"Jt": 0.075 * (1 + 0.002 * (day - 20))} for day in range(21)])
     arguments = ["predict", bench / "demand.csv", "--config", bench / "bench.toml", "--from-history"]
     document = json.loads(invoke(*arguments, "--tolerance-um", 105, "--json").stdout)
@@ -221,16 +210,16 @@ def test_history_tells_when_a_zone_leaves_the_tolerance(bench: Path) -> None:
         assert crosses["parameter"] == "Jt"
     assert all(zone["std_um"] >= 0 for zone in document["zones"])
     text = invoke(*arguments, "--tolerance-um", 98).stdout
-    assert "is over 98 um" in text
-    assert "will have left 98 um about 1970-" in text  # the newest parameters are of January 1970
+    assert "exceeds 98 um now" in text
+    assert "has probably exceeded 98 um since 1970-" in text  # the newest parameters are from January 1970
 
 
 @pytest.mark.parametrize(
     ("days", "state", "words"),
-    [(6 / 1440, "not_enough_history", "not enough history: 6 min"), (3.0, "not_foreseen", "within 15 days")],
+    [(6 / 1440, "not_enough_history", "6 min of history are too short"), (3.0, "not_foreseen", "within 15 days")],
 )
 def test_no_day_is_told_that_the_history_cannot_know(bench: Path, days: float, state: str, words: str) -> None:
-    """A slope as sure as can be, of six minutes or of three days: neither reaches the weeks that it takes."""
+    """An exact slope over six minutes or three days does not permit a forecast of weeks."""
     for number in range(1, 13):
         at = 20.0 + days * (number - 1) / 11
         for axis in "XY":
@@ -244,13 +233,13 @@ def test_no_day_is_told_that_the_history_cannot_know(bench: Path, days: float, s
 
 
 def test_a_date_that_has_passed_is_told_as_such() -> None:
-    """The newest parameters may be older than the day that they foresee."""
+    """The forecast date can be earlier than today."""
     entry = {"state": "foreseen", "date": "2999-01-02", "earliest": "2999-01-01", "latest": None}
     entry |= {"axis": "X", "parameter": "Jt"}
-    assert crossing_text(entry, 20.0).startswith("leaves 20 um about 2999-01-02 (2999-01-01 to later)")
+    assert crossing_text(entry, 20.0).startswith("is expected to exceed 20 um about 2999-01-02 (2999-01-01 to later)")
     past = crossing_text(entry | {"date": "2001-01-02"}, 20.0)
-    assert past.startswith("will have left 20 um about 2001-01-02")
-    assert past.endswith("identify anew")
+    assert past.startswith("has probably exceeded 20 um since 2001-01-02")
+    assert past.endswith("identify again")
 
 
 @pytest.mark.parametrize(
@@ -270,7 +259,6 @@ def test_a_date_that_has_passed_is_told_as_such() -> None:
 def test_trouble_is_one_sentence(
     bench: Path, arguments: list[str], code: int, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Exit code and a sentence, never a traceback."""
     monkeypatch.chdir(bench)
     good = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
     (bench / "x.json").write_text(json.dumps({"X": good}))

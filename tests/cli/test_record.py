@@ -1,4 +1,4 @@
-"""``fdhil record`` beside the simulated machine, both as processes on the hub."""
+"""``fdhil record`` with the simulator, both as processes on the hub."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ NC = '[nc]\nprofile = "jerk_limited"\n'
 
 @pytest.fixture(scope="module")
 def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[TwinProcess, Path]]:
-    """The twin with its NC on, and the config with which it is joined."""
     folder = tmp_path_factory.mktemp("twin")
     path = write_config(folder, sim="modbus = false")
     path.write_text(path.read_text() + NC)
@@ -39,8 +38,6 @@ def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[TwinProcess
 
 
 class Recording:
-    """A running ``fdhil record --json`` that waits for a motion."""
-
     def __init__(self, config: Path, out: Path, *options: str) -> None:
         command = [sys.executable, "-m", "fdhil.cli.main", "record", str(config), "--out", str(out), "--json", *options]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

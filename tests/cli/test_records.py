@@ -1,4 +1,4 @@
-"""replay, history, report, export: what was kept comes back; wrong input is one sentence and an exit code."""
+"""replay, history, report, export: stored data and errors for wrong input."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ from tests.store.made import outcome, published, window
 
 @pytest.fixture
 def machine(tmp_path: Path) -> Path:
-    """A machine's config with a history of three revisions."""
     path = tmp_path / "machine.toml"
     path.write_text(BENCH)
     store = OutcomeStore(config_of(tmp_path, ("X", "Y")))
@@ -38,7 +37,6 @@ def machine(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def rapid(tmp_path: Path) -> Path:
-    """A stored window of a rapid that validates."""
     path = tmp_path / "w00000001-X.parquet"
     config = config_of(tmp_path)
     path.write_bytes(encode_window(nominal_rapid("X", config.axis["X"], 0.001), config.digest))
@@ -77,7 +75,7 @@ def test_an_export_is_a_recording_that_replays(rapid: Path, tmp_path: Path, caps
     before = rapid.read_bytes()
     code, _, err = fdhil("export", rapid, "--out", rapid, capsys=capsys)
     assert code == 2
-    assert "is also what" in err
+    assert "is also named by" in err
     assert rapid.read_bytes() == before
 
 
@@ -102,7 +100,7 @@ def test_an_export_keeps_a_slow_sensors_samples_to_the_last_bit(tmp_path: Path, 
     assert other["parameters"]["L"]["value"] == pytest.approx(one["parameters"]["L"]["value"], rel=1e-3)
     assert other["delay_s"]["value"] == pytest.approx(one["delay_s"]["value"], abs=1e-6)
     assert (one["delay_s"]["unit"], one["validated"], other["validated"]) == ("s", True, True)
-    # any other program finds the sample under way in each row
+    # other programs find the current sample in each row
     voltage = read_recording(out).voltage_v
     assert voltage is not None
     assert np.isfinite(voltage).all()
@@ -194,8 +192,8 @@ def test_a_report_is_one_page_without_anything_from_elsewhere(machine: Path, tmp
     page = out.read_text()
     assert "Axis X" in page
     assert "<svg" in page
-    assert "<script " not in page  # none with an address
-    assert "default-src 'none'" in page  # and the browser is told to load nothing
+    assert "<script " not in page  # no external script
+    assert "default-src 'none'" in page  # the browser must not load anything
 
 
 @pytest.mark.parametrize("command", ["replay", "history", "report", "export", "run", "status", "arm", "disarm"])

@@ -1,4 +1,4 @@
-"""status, arm and disarm against a socket that answers; run's refusals."""
+"""status, arm and disarm with a fake daemon; refusals of run."""
 
 from __future__ import annotations
 
@@ -33,7 +33,6 @@ from tests.store.made import outcome, published
 
 @pytest.fixture
 def machine(tmp_path: Path) -> Path:
-    """A machine's config and its run directory with a token."""
     path = tmp_path / "machine.toml"
     path.write_text(BENCH)
     (tmp_path / "p.ngc").touch()
@@ -45,7 +44,7 @@ def machine(tmp_path: Path) -> Path:
 
 @contextmanager
 def answering(machine: Path, answer: Mapping[str, Any], *told: Mapping[str, Any]) -> Iterator[list[dict[str, Any]]]:
-    """Stand in for the daemon: take one request, tell its progress and give ``answer``."""
+    """Fake the daemon: accept one request, report its progress, and send ``answer``."""
     requests: list[dict[str, Any]] = []
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as server:
         server.bind(str(machine.parent / "fdhil-data" / "run" / "daemon.sock"))
@@ -66,7 +65,6 @@ def answering(machine: Path, answer: Mapping[str, Any], *told: Mapping[str, Any]
 
 
 def status_of(tmp_path: Path) -> dict[str, Any]:
-    """Return a status as a daemon gives it after a window and a notice."""
     watch = Watch(config_of(tmp_path, ("X", "Y")), 0.0)
     for told in (outcome(), published(), Notice("LoadChanged", "MAJOR", "[red]Jt rose[/red]", "X")):
         watch.outcome_came(told, 1.0)
@@ -93,13 +91,13 @@ def test_status_as_a_table_and_as_json(machine: Path, tmp_path: Path, capsys: An
     [
         (
             {"state": "lost", "last_state": "ACTIVE", "heard_s_ago": 20.0, "text": "the guard is gone; -38 um stands"},
-            ("guard lost, heard 20 s ago in state ACTIVE", "the guard is gone; -38 um stands"),
+            ("guard lost, last seen 20 s ago in state ACTIVE", "the guard is gone; -38 um stands"),
         ),
         (
             {"state": "FROZEN", "heard_s_ago": 0.3},
             ("guard FROZEN", "-4.6 um on axis X may still be applied; hold the feed, then run fdhil adopt"),
         ),
-        ({"state": "ACTIVE", "heard_s_ago": 7.0}, ("guard ACTIVE when it answered last, 7 s ago",)),
+        ({"state": "ACTIVE", "heard_s_ago": 7.0}, ("guard ACTIVE at its last answer, 7 s ago",)),
     ],
 )
 def test_status_says_what_may_still_be_applied_and_how_old_the_guards_word_is(
@@ -170,11 +168,11 @@ def test_a_faulty_configuration_keeps_nobody_from_disarming(
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("how", ["--json", "in words"])
 def test_a_no_that_nobody_took_is_no_yes(how: str, machine: Path) -> None:
-    """What may still be applied is then known to nobody; exit code 0 would say that nothing is."""
+    """Without a reader the residual offset would be unknown, which exit code 0 would hide."""
     refused = {"ok": False, "code": "OffsetStands", "text": "30 um may still be applied", "advice": "hold the feed"}
     command = [sys.executable, "-m", "fdhil", "disarm", str(machine), *(["--json"] if how == "--json" else [])]
     read, write = os.pipe()
-    os.close(read)  # whoever read it has gone
+    os.close(read)  # the reader has closed the pipe
     out, err = (write, subprocess.PIPE) if how == "--json" else (subprocess.DEVNULL, write)
     with answering(machine, refused):
         done = subprocess.run(command, stdout=out, stderr=err, text=True, check=False)
@@ -188,7 +186,7 @@ def test_arm_shows_how_far_the_check_of_a_long_program_is(machine: Path, capsys:
     with answering(machine, refused, told | {"refused": 0}, told):
         code, out, err = fdhil("arm", machine, machine.parent / "p.ngc", capsys=capsys)
     assert (code, out) == (1, "")
-    assert "\rchecked 1:23 of the program, line 40, 32 x real time, 2 places refused" in err
+    assert "\rchecked 1:23 of the program, line 40, 32 x real time, 2 positions refused" in err
     assert err.splitlines()[-2:] == ["refused: A: one; do", "also: B: two"]
     (machine.parent / "fdhil-data" / "run" / "daemon.sock").unlink()
     with answering(machine, refused, told):
@@ -206,7 +204,7 @@ def test_without_a_daemon_it_is_3_and_how_to_start_one(command: str, machine: Pa
 
 @pytest.mark.usefixtures("processes")
 def test_a_daemon_that_may_not_be_asked_is_not_told_to_be_away(machine: Path) -> None:
-    """Who was told to start it would start another one."""
+    """The advice to start a daemon would start a second one."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as server:
         place = machine.parent / "fdhil-data" / "run" / "daemon.sock"
         server.bind(str(place))
@@ -250,7 +248,7 @@ def test_small_pictures() -> None:
     assert cell("R", 0.5, half_of({"low": 0.488, "high": 0.512}), " ") == "500 ±12"
     assert cell("K", 0.8, half_of({"low": None, "high": None}), " ") == "0.8 (no ±)"
     assert cell("K", None, None) == "-"
-    # value and half width end at the same place, whatever their size
+    # value and half width end at the same digit
     assert cell("bus_sag", 1.4234e-6, 6.4e-8, " ") == "(1.42 ±0.06)e-6"
     assert cell("bus_sag", 0.0053, 2.3e-5, " ") == "0.00530 ±0.00002"
     assert cell("bus_sag", 12_345.0, 234.0, " ") == "12300 ±200"
@@ -258,7 +256,7 @@ def test_small_pictures() -> None:
 
 
 def test_lines_of_the_daemon_as_json(capsys: pytest.CaptureFixture[str]) -> None:
-    """For programs: one object a line on stdout, only while it is asked for."""
+    """One JSON object per line on stdout, only with --json."""
     with journal.lines_as_json(True):
         journal.write_line("X: LoadChanged", "MAJOR")
     with journal.lines_as_json(False):
@@ -273,7 +271,7 @@ def test_lines_of_the_daemon_as_json(capsys: pytest.CaptureFixture[str]) -> None
 def test_terms_and_what_is_warned_of_are_told_beside_the_table() -> None:
     load = {"value": 2.5, "std": 0.01, "low": 2.48, "high": 2.52, "unit": "N.m"}
     axis = {"terms": {"load": load}, "unexplained_um": 0.25, "warnings": ["OneDirection: all moves go one way"]}
-    told = "load 2.50 ±0.02 N.m; 0.25 um of a rapid unexplained; OneDirection: all moves go one way"
+    told = "load 2.50 ±0.02 N.m; 0.25 um of the rapids unexplained; OneDirection: all moves go one way"
     assert believed(axis) == told
     assert believed({"terms": None, "unexplained_um": None, "warnings": []}) == ""
 
@@ -318,7 +316,7 @@ def test_status_tells_what_waits_and_who_acknowledged(machine: Path, tmp_path: P
     with answering(machine, told):
         out = fdhil("status", machine, capsys=capsys)[1]
     assert "X: HeartbeatLost active since 2026-11-22T14:00:00+00:00, 8 times since" in " ".join(out.split())
-    assert "notices that wait to be acknowledged: 3, of them MAJOR 1" in out
+    assert "pending notices: 3, of them MAJOR 1" in out
     assert "41" in out
     assert "(acknowledged by anna)" in " ".join(out.split())
 
@@ -338,4 +336,4 @@ def test_status_is_shown_again_each_second_until_ctrl_c(
         code, out, err = fdhil("status", machine, "--watch", "--json", capsys=capsys)
     assert (code, len(out.splitlines()), len(waits)) == (0, 1, 2)
     assert json.loads(out)["axes"]["X"]["parameters"]["K"]["value"] == 0.8
-    assert "daemon" in err  # it answered once only: the second time says so, and the watch goes on
+    assert "daemon" in err  # only one answer; the second poll reports this, and watching continues

@@ -1,4 +1,4 @@
-"""Every command and every wrong input: the exit code, one sentence, no traceback, and the same as JSON."""
+"""Every command with every wrong input: exit code, one sentence, no traceback, and the same as JSON."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ WITHOUT_CONFIG = {
     "interpret": ["part.ngc"],
     "export": ["w.parquet", "--out", "out.csv"],
     "compare": ["before.json", "after.json"],
-    # whose configuration is another
+    # with another kind of configuration
     "fleet collect": ["fleet.toml"],
     "fleet status": ["fleet.toml"],
     "fleet trend": ["fleet.toml", "--machine", "mill-1", "--axis", "X", "--parameter", "ft"],
@@ -118,7 +118,6 @@ WITH_OUT = {
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with everything that is wrong in it, and what is right beside it."""
     monkeypatch.chdir(tmp_path)
     Path("bench.toml").write_text(bench_toml())
     Path("part.ngc").write_text("G21 G90 G64\nG1 X10 F1000\nM2\n")
@@ -128,7 +127,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         Path(f"junk{suffix}").write_bytes(bytes(range(256)) * 8)
         Path(f"empty{suffix}").touch()
         Path(f"folder{suffix}").mkdir()
-        Path(f"loop{suffix}").symlink_to(f"loop{suffix}")  # nobody can read it, not even root
+        Path(f"loop{suffix}").symlink_to(f"loop{suffix}")  # unreadable even for root
     for suffix in ("", ".png"):
         os.mkfifo(f"pipe{suffix}")
         Path(f"dir{suffix}").mkdir()
@@ -136,18 +135,17 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def told(capsys: Any, code: int, *arguments: str) -> str:
-    """Call a command with and without --json; return its sentence."""
     said = fdhil(*arguments, capsys=capsys)
     assert said[0] == code, said
     assert said[1] == ""
     first, *rest = said[2].splitlines()
     assert first.startswith("fdhil: "), said[2]
-    assert all(line.startswith("  ") for line in rest), said[2]  # the faults of a configuration, one a line
+    assert all(line.startswith("  ") for line in rest), said[2]  # faults of a configuration, one per line
     assert "Traceback" not in said[2]
     code_of_json, out, err = fdhil(*arguments, "--json", capsys=capsys)
     assert (code_of_json, err) == (code, "")
     document = json.loads(out)
-    if document["schema"] == "fdhil-identify-1":  # the others of a batch are told too
+    if document["schema"] == "fdhil-identify-1":  # the other files of a batch are reported as well
         error = document["files"][0]["error"]
     else:
         assert set(document) == {"schema", "error"}
@@ -211,7 +209,7 @@ def test_a_file_that_cannot_be_written_is_3_and_found_at_once(out: str, words: s
 
 @pytest.mark.usefixtures("processes")
 def test_a_file_without_the_right_to_read_it_is_3_and_a_configuration_2() -> None:
-    """In a process that has not root's way past the rights."""
+    """In a process without root's privileges."""
     for suffix in (".toml", ".ngc", ".csv"):
         Path(f"locked{suffix}").write_text("")
         Path(f"locked{suffix}").chmod(0)

@@ -1,4 +1,4 @@
-"""The tutorial, typed as it is written: terminals are processes, the panel is the simulator's standard input."""
+"""The one-hour tutorial, executed line by line: terminals are processes, the panel is standard input."""
 
 from __future__ import annotations
 
@@ -19,15 +19,13 @@ from tests.ports import free_port
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs/tutorial/an-hour.md"
-PATIENCE_S = 900.0  # only ends what hangs
+PATIENCE_S = 900.0  # only for hanging processes
 SERVERS = {"fdhil sim": "is ready", "fdhil run": " ready: ", "fdhil-guard": '"event": "ready"'}
 TYPED_BY_THE_TEST = ("make setup", ". .venv", "mkdir", "cd ")
 RAPIDS = 20
 
 
 class Terminal:
-    """A command that stays in its terminal; what it prints is read line by line."""
-
     def __init__(self, words: list[str], folder: Path) -> None:
         self._child = subprocess.Popen(
             ending_with_parent(words),
@@ -49,13 +47,11 @@ class Terminal:
         self._lines.put(None)
 
     def type(self, line: str) -> None:
-        """Type a line and return."""
         assert self._child.stdin is not None
         self._child.stdin.write(line + "\n")
         self._child.stdin.flush()
 
     def wait_for(self, text: str, times: int = 1) -> None:
-        """Read on until this text was printed so many times."""
         while times:
             line = self._lines.get(timeout=PATIENCE_S)
             assert line is not None, "".join(self._printed)
@@ -63,15 +59,12 @@ class Terminal:
             times -= text in line
 
     def end(self) -> None:
-        """End the command and wait for it."""
         self._child.terminate()
         self._child.communicate(timeout=PATIENCE_S)
         self._reader.join()
 
 
 class Desk:
-    """The user's terminals, and the folder ``hour`` that the tutorial makes."""
-
     def __init__(self, folder: Path) -> None:
         self._ports = {"29536": str(free_port()), "port = 5020": "port = 0", "port = 5021": "port = 0"}
         shutil.copytree(ROOT / "configs", folder / "configs", symlinks=True)
@@ -87,7 +80,6 @@ class Desk:
         return text
 
     def do(self, language: str, block: str) -> str:
-        """Do what a fenced block of the page says; return what was printed last."""
         match language:
             case "toml":
                 (self.folder / "answers.toml").write_text(self._with_free_ports(block), "utf-8")
@@ -125,7 +117,6 @@ class Desk:
         return ""
 
     def close(self) -> None:
-        """End all, the guard after the daemon, the machine last."""
         for server in ("fdhil run", "fdhil-guard", "fdhil sim"):
             if server in self.open:
                 self.open[server].end()

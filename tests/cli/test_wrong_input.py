@@ -1,4 +1,4 @@
-"""Wrong input to the commands: one sentence, the right exit code, never a traceback; the process itself, too."""
+"""Wrong input to commands as processes: one sentence, the correct exit code, no traceback."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ Said = tuple[int, str, str]
 
 
 def assert_told(said: Said, code: int, *words: str) -> None:
-    """The exit code, the words in one sentence on stderr, and no traceback."""
     got, out, err = said
     assert (got, out) == (code, ""), said
     assert "Traceback" not in err
@@ -31,7 +30,7 @@ def assert_told(said: Said, code: int, *words: str) -> None:
 
 @pytest.mark.usefixtures("processes")
 def test_a_wrong_config_is_told_by_the_process_itself(tmp_path: Path) -> None:
-    """One process for all of it: the sentence, the exit code, JSON alone on stdout, and no advice of a library."""
+    """One process covers sentence, exit code, JSON on stdout, and hidden library warnings."""
     path = write_config(tmp_path)
     path.write_text(path.read_text().replace("Cd = 5.0", "Cd = nan", 1))
     command = [sys.executable, "-m", "fdhil", "run", str(path), "--json"]
@@ -43,7 +42,7 @@ def test_a_wrong_config_is_told_by_the_process_itself(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("sink", ["> /dev/full", "| head -1", ">&-"])
 def test_an_output_that_takes_nothing_is_no_traceback(sink: str, tmp_path: Path) -> None:
-    """A full disk is trouble; a reader that has seen enough, or none at all, is not."""
+    """A full disk is an error; a reader that closed the pipe is not."""
     program = tmp_path / "part.ngc"
     program.write_text("G21 G90\n" + "G1 X10 F1000\nX0\n" * 2_000 + "M2\n")
     command = f"{sys.executable} -m fdhil interpret {program} {sink}"
@@ -55,7 +54,6 @@ def test_an_output_that_takes_nothing_is_no_traceback(sink: str, tmp_path: Path)
 
 
 def unread(*arguments: str | Path) -> int:
-    """Run fdhil with a standard output that nobody reads any more; return the exit code."""
     read, write = os.pipe()
     os.close(read)
     try:
@@ -71,7 +69,7 @@ def unread(*arguments: str | Path) -> int:
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("form", [(), ("--json",)], ids=["text", "json"])
 def test_an_answer_that_nobody_took_is_no_yes(form: tuple[str, ...], tmp_path: Path) -> None:
-    """Neither where fdhil writes itself, nor where a library draws the table, which tells it in another way."""
+    """Neither with fdhil's own output, nor with a table of rich, which raises another exception."""
     config, program, out = write_config(tmp_path), tmp_path / "part.ngc", tmp_path / "page.html"
     program.write_text("G21 G90\nG1 X1 F1000\nM2\n")
     for command in (
@@ -86,7 +84,7 @@ def test_an_answer_that_nobody_took_is_no_yes(form: tuple[str, ...], tmp_path: P
 
 
 def test_every_command_that_answers_no_by_its_exit_code_is_marked_so() -> None:
-    """A command that returns a number, or ends with one, is a verdict: that its answer was not read is told by 3."""
+    """A command that returns or exits with a number must use the decorator."""
     for name, command in leaves(cli):
         assert command.callback is not None
         body = inspect.getsource(inspect.unwrap(command.callback))
@@ -115,12 +113,13 @@ def test_bytes_that_are_no_text_are_told(arguments: tuple[str, ...], tmp_path: P
     command = [sys.executable, "-m", "fdhil", *arguments, os.fsdecode(b"k\xe4se")]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100)
     assert done.returncode == 2
-    assert "'k\\udce4se' is no text" in (json.loads(done.stdout)["error"]["text"] if done.stdout else done.stderr)
+    assert "'k\\udce4se' is not valid text" in (
+        json.loads(done.stdout)["error"]["text"] if done.stdout else done.stderr
+    )
     assert "Traceback" not in done.stderr
 
 
 def said_by_shell(command: str, redirected: str) -> tuple[int, str]:
-    """Run fdhil from a shell; the exit code and what stands on stderr."""
     line = f"{sys.executable} -m fdhil {command} {redirected}"
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, timeout=100)
     return done.returncode, done.stderr
@@ -176,4 +175,4 @@ def test_a_sensor_that_is_not_there_is_told(tmp_path: Path, capsys: pytest.Captu
 def test_a_demo_without_a_place_for_its_files_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").touch()
     said = fdhil("demo", "--out", tmp_path / "file" / "out", capsys=capsys)
-    assert_told(said, 3, "cannot be made: Not a directory; choose another --out")
+    assert_told(said, 3, "cannot be created: Not a directory; choose another --out")

@@ -171,7 +171,7 @@ def test_a_drive_that_boots_while_it_plays_is_not_vouched_for(floor: Floor) -> N
     assert [sorted(request["axes"]) for request in told] == [["X", "Y"], ["Y"]]  # when it begins, and at its end
     assert [request["touched"] for request in told] == [{"X": 4, "Y": 5}] * 2
     assert [is_void(floor.config.store.directory, axis) for axis in "XY"] == [True, False]
-    assert "RecordVoid: axis X: its drive has booted since it was compared" in err
+    assert "RecordVoid: axis X: its drive rebooted after the comparison" in err
     assert "axis Y" not in err
 
 

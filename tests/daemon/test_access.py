@@ -256,7 +256,7 @@ def test_the_command_shows_the_audit_and_whether_it_was_changed(tmp_path: Path) 
     shown = CliRunner().invoke(cli, ["audit", str(config)], standalone_mode=False)
     assert shown.return_value == 0
     assert "fdhil-web for anna  arm a.ngc (asked)" in shown.output
-    assert "2 entries, each as it was written" in shown.output
+    assert "2 entries, all intact" in shown.output
     path = folder / audit.FILE_NAME
     path.write_text(path.read_text().replace("a.ngc", "c.ngc"))
     shown = CliRunner().invoke(cli, ["audit", str(config), "--json"], standalone_mode=False)
@@ -264,7 +264,7 @@ def test_the_command_shows_the_audit_and_whether_it_was_changed(tmp_path: Path) 
     assert json.loads(shown.output)["broken"] == [1]
     for nonsense in ({}, {"who": "root"}, {"who": {}, "result": 5}):  # sealed, but by no command of fdhil
         audit.append(folder, nonsense)
-    assert CliRunner().invoke(cli, ["audit", str(config)], standalone_mode=False).output.count("NOT AS WRITTEN") == 3
+    assert CliRunner().invoke(cli, ["audit", str(config)], standalone_mode=False).output.count("NOT INTACT") == 3
 
 
 def test_who_may_look_at_the_machine_is_not_the_machine(tmp_path: Path) -> None:

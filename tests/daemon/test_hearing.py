@@ -299,7 +299,7 @@ async def test_the_daemon_tells_moves_it_cannot_use_instead_of_0_accepted_0_refu
     assert [notice["code"] for notice in told["notices"]].count("MovesNotUsed") == 1
     assert "X 0/0" in text
     assert "X: MovesNotUsed: 3 moves seen, none used" in text
-    assert "X: 3 moves seen; not used: 3 slower than a rapid (the fastest of all reached 5" in text
+    assert "X: 3 moves detected; not used: 3 slower than a rapid (the fastest of all reached 5" in text
 
 
 def test_counters_are_told_in_words() -> None:

@@ -48,12 +48,12 @@ def test_the_status_says_what_the_nc_does() -> None:
     status = watch.status(1.25)
     assert status is not None
     assert (status["heard_s_ago"], status["motion"], status["tool"]) == (0.25, "rapid", 3)
-    line = "NC: rapid line 12 of part.ngc, feed override 100 %, rapid override 50 %, feed held"
+    line = "NC: rapid line 12 of part.ngc, feed override 100 %, rapid override 50 %, feed hold"
     assert nc_line(status) == line
     watch.note(NcState(0, 0, MoveKind.UNKNOWN), 2.0)
     status = watch.status(5.0)
     assert status is not None
-    assert nc_line(status) == "NC: not heard for 3 s, its moves are unknown"
+    assert nc_line(status) == "NC: no data for 3 s, its moves are unknown"
 
 
 def test_a_name_that_is_no_unicode_is_told_escaped() -> None:

@@ -423,7 +423,7 @@ def test_a_log_is_no_recording_and_an_empty_one_is_told(tmp_path: Path, capsys: 
     log = tmp_path / "bus.log"
     log.write_text(CANDUMP)
     code, _, err = fdhil("export", log, "--out", tmp_path / "bus.csv", capsys=capsys)
-    assert (code, "is a log of the bus, which becomes candump, blf, asc, trc" in err) == (2, True)
+    assert (code, "is a bus log, which converts to candump, blf, asc, trc" in err) == (2, True)
     log.write_text("\n")
     code, _, err = fdhil("export", log, "--out", tmp_path / "bus.blf", capsys=capsys)
     assert (code, "has no frame" in err) == (3, True)

@@ -77,13 +77,13 @@ async def test_the_questions(
     (found,) = document["outliers"]
     assert (found["machine"], found["axis"], found["parameter"], found["sisters"]) == ("mill-3", "X", "ft", 6)
     assert "mill-3 axis X: ft = 0.09" in text
-    assert asked(capsys, 0, "outliers", works, "--axis", "Y")[1] == "no axis is unlike its sisters\n"
+    assert asked(capsys, 0, "outliers", works, "--axis", "Y")[1] == "no axis differs from its peers\n"
     assert asked(capsys, 1, "outliers", works, "--by", "screw")[0]["outliers"][0]["label"] == "A"
 
     document, text = asked(capsys, 0, "compare", works, "--parameter", "ft", "--axis", "X")
     (group,) = document["groups"]
     assert [sister["machine"] for sister in group["sisters"]][-1] == "mill-3"
-    assert "UNLIKE ITS SISTERS" in text
+    assert "DIFFERS FROM ITS PEERS" in text
 
     words = ("trend", works, "--machine", "mill-3", "--axis", "X", "--parameter", "ft")
     document, text = asked(capsys, 0, *words)
@@ -131,7 +131,7 @@ async def test_two_machines_of_one_name_are_reported(
     (told,) = document["machines"]
     assert "two machines send under this name" in told["doubt"]
     assert told["missing"] == 0
-    assert "give each machine a name of its own" in text
+    assert "give each machine a unique name" in text
 
 
 def test_a_database_without_the_fleet_is_told(works: Path, capsys: pytest.CaptureFixture[str]) -> None:

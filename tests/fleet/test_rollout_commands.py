@@ -55,7 +55,7 @@ def lay(works: Works, file: Path, **changes: Any) -> MachineConfig:
 def test_from_the_works_to_a_machine_by_hand(works: Works, file: Path, capsys: Any) -> None:
     Path("change.toml").write_text(CHANGE)
     _, said, _ = fdhil("fleet", "key", "works.key", capsys=capsys)
-    assert said.splitlines() == ["works.key is there already; its public key, for [offers] trust of each machine:",
+    assert said.splitlines() == ["works.key exists already; its public key, for [offers] trust of each machine:",
                                  works.public]  # fmt: skip
     signed = ["fleet", "sign", "change.toml", "--key", "works.key", "--by", "Anna", "--machine", "mill-1"]
     assert fdhil(*signed, "--out", "stick.offer", capsys=capsys)[0] == 0
@@ -70,7 +70,7 @@ def test_from_the_works_to_a_machine_by_hand(works: Works, file: Path, capsys: A
     code, said, _ = fdhil("offers", "accept", file, "stick.offer", "--by", "Bert", capsys=capsys)
     assert code == 0
     assert "machine.toml.before-friction-3" in said
-    assert said.splitlines()[-1].endswith("until it is started anew: systemctl restart fdhil; nothing is armed by it")
+    assert said.splitlines()[-1].endswith("still uses the old configuration: systemctl restart fdhil; nothing is armed")
     code, said, _ = fdhil("offers", "list", file, "stick.offer", "--json", capsys=capsys)
     (told,) = json.loads(said)["offers"]
     assert (told["changes"], told["answers"][0]["by"]) == ([], "Bert")
@@ -112,7 +112,7 @@ def test_a_refused_offer_is_exit_1_and_says_why(works: Works, file: Path, capsys
     assert fdhil("offers", "list", file, place, capsys=capsys)[0] == 1
     assert fdhil("offers", "list", file, "absent.offer", capsys=capsys)[0] == 3
     code, _, said = fdhil("offers", "accept", file, "wear", "--by", "Bert", capsys=capsys)
-    assert (code, "these do: friction" in said) == (2, True)
+    assert (code, "choose one of: friction" in said) == (2, True)
     for by in ("", " ", "x" * 65):
         assert fdhil("offers", "accept", file, "friction", "--by", by, capsys=capsys)[0] == 2
 
@@ -126,7 +126,7 @@ def test_the_newest_of_a_name_is_meant(works: Works, file: Path, capsys: Any) ->
 
 def test_a_limit_that_is_loosened_has_its_own_line(works: Works, file: Path, capsys: Any) -> None:
     lay(works, file, values={"maintenance.ft": 2.0})
-    line = "  LOOSENS maintenance.ft 1 -> 2: more is let through than before; accepted with --loosens alone"
+    line = "  LOOSENS maintenance.ft 1 -> 2: more is permitted than before; accepting needs --loosens"
     assert line in fdhil("offers", "list", file, capsys=capsys)[1].splitlines()
     assert fdhil("offers", "accept", file, "friction", "--by", "Bert", capsys=capsys)[0] == 1
     assert fdhil("offers", "accept", file, "friction", "--by", "Bert", "--loosens", capsys=capsys)[0] == 0
@@ -137,9 +137,9 @@ def test_what_becomes_void_is_said(works: Works, file: Path, capsys: Any) -> Non
     for axis in "XY":
         save_record(replace(RECORD, axis=axis, config_digest=axis_digest(config, axis)), config.store.directory)
     said = fdhil("offers", "list", file, capsys=capsys)[1]
-    assert "the commissioning record of axis X holds no longer" in said
+    assert "the commissioning record of axis X becomes invalid" in said
     assert "record of axis Y" not in said
-    assert "none is armed until the axes are identified anew" in said
+    assert "arming is refused until the axes are identified again" in said
 
 
 def test_a_machine_that_trusts_nobody_is_told_so(works: Works, file: Path, capsys: Any) -> None:

@@ -74,12 +74,12 @@ def asked(works: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., tupl
 async def test_a_service_is_entered_and_what_it_changed_is_told(
     asked: Callable[..., tuple[int, str]], database: Postgres, tmp_path: Path
 ) -> None:
-    assert "no service was entered" in asked("services")[1]
+    assert "no service recorded yet" in asked("services")[1]
     assert due(asked) == []  # as far as is known it rises and falls
     day = (BEGIN + timedelta(days=SERVICED)).date().isoformat()
     words = ("--machine", "mill-1", "--axis", "X", "--date", day)
     code, text = asked("service", *words, "--note", "lubricated")
-    assert (code, "age and its limits count from there" in text) == (0, True)
+    assert (code, "age and limits count from then" in text) == (0, True)
     code, out = asked("services", "--json")
     (told,) = json.loads(out)["services"]
     change = next(each for each in told["changes"] if each["parameter"] == "ft")
@@ -99,7 +99,7 @@ async def test_a_service_is_entered_and_what_it_changed_is_told(
     assert "mill-1 axis X: ft = " in asked("status")[1]
 
     code, text = asked("service", *words, "--remove")
-    assert (code, "is taken out" in text) == (0, True)
+    assert (code, "deleted" in text) == (0, True)
     assert asked("service", *words, "--remove")[0] == 3
 
 

@@ -73,7 +73,7 @@ def test_the_command_writes_devices_xml(tmp_path: Path, capsys: pytest.CaptureFi
     assert 'uuid="works.mill-3"' in text
     assert set(data_items(text)) == set(data_items(xml_of(Daemon(tmp_path).news())))
     code, _, err = fdhil("publish", "prometheus", machine, "--devices", file, capsys=capsys)
-    assert (code, "--devices is of use with mtconnect alone" in err) == (2, True)
+    assert (code, "--devices applies only to mtconnect" in err) == (2, True)
 
 
 def test_an_agent_that_knows_nothing_is_told_every_data_item(tmp_path: Path) -> None:

@@ -152,7 +152,7 @@ def test_events_are_one_line_of_json_each(capsys: pytest.CaptureFixture[str]) ->
             {"event": "finished", "file": "a", "rows": 3, "stopped": True, "late_rpdo": {"X": 1}, "trace": "t.csv"},
             "stopped after 3 rows of a; late offset frames: X 1, recorded to t.csv",
         ),
-        ({"event": "error", "text": "no"}, "cannot: no"),
+        ({"event": "error", "text": "no"}, "error: no"),
         ({"event": "fault", "sync": 5, "fault": "reboot", "axis": "X"}, "fault: sync 5, fault reboot, axis X"),
     ],
 )

@@ -326,7 +326,7 @@ def test_wrong_scripts_and_options_are_exit_code_2(failing: Callable[..., tuple[
     assert "'meteor' is none of" in text
     code, text = failing(path, "--demand", "a.csv", "--program", "b.ngc")
     assert code == 2
-    assert "not both" in text
+    assert "exclude each other" in text
     code, text = failing(tmp_path / "missing.toml")
     assert code == 2
     assert "cannot be read" in text

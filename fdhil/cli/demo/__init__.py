@@ -1,4 +1,4 @@
-"""fdhil demo: twin, guard and daemon as processes of their own, and the whole loop run through them."""
+"""``fdhil demo``: run the whole loop with simulator, guard and daemon as separate processes."""
 
 from __future__ import annotations
 
@@ -20,18 +20,16 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.option("--out", type=FOLDER, default=Path("out"), show_default=True,
-              help="Folder for the report, the recordings and the logs.")  # fmt: skip
-@click.option(
-    "--realtime", is_flag=True, help="Run the twin on the host's clock instead of as fast as the bus answers."
-)
-@click.option("--pdf", is_flag=True, help="Print the report as report.pdf too (needs chromium).")
+              help="Folder for report, recordings and logs.")  # fmt: skip
+@click.option("--realtime", is_flag=True, help="Run the simulator in real time instead of as fast as possible.")
+@click.option("--pdf", is_flag=True, help="Write the report as report.pdf as well (needs chromium).")
 @AS_JSON
 def demo(out: Path, realtime: bool, pdf: bool, as_json: bool) -> None:
-    """Run the whole loop on the simulated machine: no hardware, no root, under a minute.
+    """Run the whole loop on a simulated machine, without hardware or root, in less than a minute.
 
-    Starts the twin (drives, sensors, NC), the guard and the daemon; commissions the drives; shuttles the axes and
-    identifies them; predicts the path of the paper, cuts it, arms, cuts it corrected; warms the slide-ways and cuts
-    again. At the same time it identifies and cuts on a machine with what real ones have. Needs the extra 'report'.
+    Starts simulator (drives, sensors, NC), guard and daemon, commissions the drives, identifies them from shuttle
+    moves, predicts the paper's path, executes it without and with the correction, then warms the slide-ways and
+    repeats. In parallel it does the same on a machine with realistic imperfections. Needs the extra 'report'.
     """
     from fdhil.cli.demo import realistic_page
     from fdhil.cli.demo.loop import run_loop
@@ -39,7 +37,7 @@ def demo(out: Path, realtime: bool, pdf: bool, as_json: bool) -> None:
     from fdhil.cli.demo.report import page
     from fdhil.report import deliver, find_browser, require
 
-    require()  # said before the work, not after it
+    require()  # before the computation
 
     def say(text: str) -> None:
         if not as_json or sys.stderr.isatty():
@@ -76,13 +74,13 @@ def _parameters(found: Published, truth: Parameters) -> dict[str, Any]:
 def _realistic(realistic: Realistic) -> dict[str, Any]:
     axes = {
         axis: {
-            "rapids": told.rapids,
-            "believed": told.believed,
-            "reasons": dict(told.reasons),
-            "parameters": told.published and _parameters(told.published, realistic.truth[axis]),
-            "terms": told.published and dict(told.published.parameters.terms),
+            "rapids": found.rapids,
+            "believed": found.believed,
+            "reasons": dict(found.reasons),
+            "parameters": found.published and _parameters(found.published, realistic.truth[axis]),
+            "terms": found.published and dict(found.published.parameters.terms),
         }
-        for axis, told in realistic.verdicts.items()
+        for axis, found in realistic.verdicts.items()
     }
     cuts = [{"label": cut.label, "rms_um": cut.rms_um, "max_um": cut.max_um} for cut in realistic.cuts]
     return {"axes": axes, "cuts": cuts, "refused": realistic.refused or None}
@@ -117,8 +115,8 @@ def _tables(loop: Loop, realistic: Realistic, report: Path) -> None:
     console = PrintableConsole()
     for title, head, rows in (
         ("Identified from the rapids", PARAMETER_HEAD, parameter_rows(loop)),
-        ("Contour error, measured by the twin at its own table", CUT_HEAD, cut_rows(loop)),
-        ("Believed of the realistic machine", realistic_page.VERDICT_HEAD, realistic_page.verdict_rows(realistic)),
+        ("Contour error, measured at the simulated table", CUT_HEAD, cut_rows(loop)),
+        ("Results of the realistic machine", realistic_page.VERDICT_HEAD, realistic_page.verdict_rows(realistic)),
         ("Contour error of the realistic machine", CUT_HEAD, realistic_page.cut_rows(realistic)),
     ):
         table = Table(title=title, title_justify="left")
@@ -129,5 +127,5 @@ def _tables(loop: Loop, realistic: Realistic, report: Path) -> None:
         console.print(table)
     before, mirror, after = loop.cuts[:3]
     gains = f"mirror {before.rms_um / mirror.rms_um:.1f}, inverse {before.rms_um / after.rms_um:.1f}"
-    console.print(f"RMS contour error, measured, smaller by a factor of: [bold]{gains}[/].")
+    console.print(f"Measured RMS contour error reduced by a factor of: [bold]{gains}[/].")
     console.print(f"wrote {report}", soft_wrap=True)

@@ -1,4 +1,4 @@
-"""Runs the demonstration's loop: commission, shuttle, identify, predict, cut, arm, cut corrected, warm, cut again."""
+"""The loop of the demonstration: commission, identify, predict, execute, correct, warm up, correct again."""
 
 import shutil
 import time
@@ -41,7 +41,7 @@ WARM_C = (20.5, 21.0, 21.5, 22.0)
 
 @dataclass
 class Stage:
-    """The means to drive the demonstration: the twin with its panel, and the daemon's socket."""
+    """A running demonstration: simulator with panel, guard and daemon, and the passes so far."""
 
     out: Path
     config: MachineConfig
@@ -53,39 +53,39 @@ class Stage:
 
     @property
     def run(self) -> Path:
-        """The folder of the machine's run-time files."""
+        """Run directory of the machine."""
         folder = self.config.store.run_directory
         assert folder is not None
         return folder
 
     def ask(self, request: str, **fields: Any) -> dict[str, Any]:
-        """Ask the daemon; FdhilError with the daemon's own words when it refuses."""
+        """Send a request to the daemon. Raises FdhilError with the daemon's text if it refuses."""
         answer = ask(self.run / SOCKET_NAME, {"request": request, **fields}, timeout_s=PATIENCE_S)
         if not answer.get("ok"):
-            raise FdhilError(f"the daemon refuses to {request}: {answer.get('code')}: {answer.get('text')}")
+            raise FdhilError(f"the daemon refuses the request {request}: {answer.get('code')}: {answer.get('text')}")
         return answer
 
 
 def run_loop(out: Path, realtime: bool, say: Say) -> Loop:
-    """Run the whole loop below ``out`` and return what was measured; FdhilError when a step fails."""
+    """Run the whole loop in ``out`` and return the results. Raises FdhilError if a step fails."""
     with running(out, realtime, say, machine_document()) as stage:
         return _measure(stage)
 
 
 def make_folder(out: Path) -> None:
-    """Make the folder of a machine; FdhilError when that is not possible."""
+    """Create the folder of a machine. Raises FdhilError if that fails."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise FdhilError(f"the folder {out} cannot be made: {error.strerror}; choose another --out") from None
+        raise FdhilError(f"the folder {out} cannot be created: {error.strerror}; choose another --out") from None
 
 
 @contextmanager
 def running(out: Path, realtime: bool, say: Say, document: dict[str, Any]) -> Iterator[Stage]:
-    """Have a machine, commissioned, with guard and daemon, its NC on; all of it ends with the block."""
+    """Start a commissioned machine with guard, daemon and NC; all processes end with the block."""
     make_folder(out)
     with ExitStack() as stack:
-        say("starting the simulated machine: two drives, two voltage sensors, an NC")
+        say("starting the simulator: two drives, two voltage sensors, an NC")
         stage = _start_twin(out, realtime, say, stack, document)
         _commission(stage)
         for name, module in (("guard", ["fdhil.cli.guard"]), ("daemon", ["fdhil", "run"])):
@@ -103,7 +103,8 @@ def _start_twin(out: Path, realtime: bool, say: Say, stack: ExitStack, document:
     (out / "twin.toml").write_text(to_toml(document), "utf-8")
     twin = stack.enter_context(Twin(out / "twin.toml", out / "twin.log"))
     document["bus"] = twin.ready["buses"]
-    for axis, sensor in twin.ready["modbus"].items():  # the twin's voltage sensors tell the slide-way's temperature too
+    # the simulated voltage sensors also measure the slide-way temperature
+    for axis, sensor in twin.ready["modbus"].items():
         document["axis"][axis]["temperature"] = {**sensor, "period_s": 0.2}
     (out / "machine.toml").write_text(to_toml(document), "utf-8")
     folder = Path(__file__).parent
@@ -119,7 +120,6 @@ def _alive(stage: Stage) -> bool:
 
 
 def _await(done: Callable[[], bool], failure: str, stage: Stage) -> None:
-    """Wait for what the processes bring about; ConnectError as soon as one of them has ended."""
     deadline = time.monotonic() + PATIENCE_S
     while not done():
         for process in (stage.twin, *stage.others):
@@ -134,15 +134,15 @@ def _commission(stage: Stage) -> None:
         stage.say(f"commissioning {axis}: identity, read-back, +10 um, feed-forward, watchdog")
         record = commission(stage.config, axis)
         save_record(record, stage.config.store.directory, stage.config.store.commissioning_key)
-        where = "sees" if record.offset_in_feedforward else "does not see"
-        stage.say(f"  the offset moved the axis {record.sign_test_um:+.1f} um; the feed-forward {where} it")
+        where = "includes" if record.offset_in_feedforward else "does not include"
+        stage.say(f"  the offset moved the axis by {record.sign_test_um:+.1f} um; the feed-forward {where} it")
 
 
 def _measure(stage: Stage) -> Loop:
     config = stage.config
     programs = {label: load_trajectory(path, config) for label, path in stage.programs.items() if label != "shuttle"}
     published: dict[str, list[Published]] = {axis: [] for axis in config.axis}
-    stage.say("shuttling both axes at rapid speed, listening")
+    stage.say("shuttling both axes at rapid speed")
     cold = _shuttle(stage, published)
     models = {axis: found[0].parameters for axis, found in published.items()}
     predicted = predict(programs["10 m/min"], models, config)
@@ -171,7 +171,7 @@ def _measure(stage: Stage) -> Loop:
 
 
 def _shuttle(stage: Stage, published: dict[str, list[Published]]) -> dict[str, tuple[Window, float | None]]:
-    """Play the shuttle, wait until both axes publish, and return the last accepted window of each with its fit."""
+    # the last accepted window of each axis with its fit
     play_shuttle(stage)
     newest: dict[str, tuple[Window, float | None]] = {}
     with History.read(stage.config.store.directory) as history:
@@ -184,35 +184,35 @@ def _shuttle(stage: Stage, published: dict[str, list[Published]]) -> dict[str, t
 
 
 def play_shuttle(stage: Stage) -> None:
-    """Play the shuttle and wait until all its rapids were analysed."""
+    """Play the shuttle program and wait until all its rapids are analysed."""
     before = _analysed(stage)
     stage.twin.play(stage.programs["shuttle"])
-    _await(lambda: _settled(stage, before), "the rapids of the shuttle were not analysed", stage)
+    _await(
+        lambda: all(now >= before[axis] + RAPIDS for axis, now in _analysed(stage).items()),
+        "the rapids of the shuttle were not analysed",
+        stage,
+    )
 
 
 def published_of(found: ParameterSet) -> Published:
-    """Return a published set as the pages show it."""
+    """Return a published set for the report."""
     names = (*PARAMETERS, *(name for name, _ in found.parameters.terms))
     std = dict(zip(names, np.sqrt(np.diag(found.covariance)).tolist(), strict=True))
     return Published(found.parameters, std, found.temperature_c or 20.0)
 
 
 def true_plants(config: MachineConfig) -> dict[str, Parameters]:
-    """Return what the six parameters of each axis truly are."""
+    """Return the true parameters of each axis."""
     return {axis: true_parameters(settings.nominal, config.sim.axis[axis]) for axis, settings in config.axis.items()}
 
 
 def _analysed(stage: Stage) -> dict[str, int]:
     axes = stage.ask("status")["axes"]
-    return {axis: told["accepted"] + told["refused"] for axis, told in axes.items()}
-
-
-def _settled(stage: Stage, before: Mapping[str, int]) -> bool:
-    return all(now >= before[axis] + RAPIDS for axis, now in _analysed(stage).items())
+    return {axis: found["accepted"] + found["refused"] for axis, found in axes.items()}
 
 
 def cut(stage: Stage, label: str, celsius: float, method: str | None = None) -> None:
-    """Cut the path, corrected by ``method`` if there is one; FdhilError when the daemon refuses to."""
+    """Execute the path, with the correction ``method`` if given. Raises FdhilError if the daemon refuses it."""
     program, trace = stage.programs["10 m/min"], stage.out / f"cut-{len(stage.cuts) + 1}.csv"
     finished = stage.twin.play(program, trace) if method is None else _corrected(stage, program, trace, method)
     reference, table = read_trace(trace, tuple(stage.config.axis))
@@ -220,15 +220,14 @@ def cut(stage: Stage, label: str, celsius: float, method: str | None = None) -> 
     late = sum(int(n) for n in finished["late_rpdo"].values())
     done = Cut(label, celsius, reference, table, contour, late)
     stage.cuts.append(done)
-    stage.say(f"cut {label}: {done.rms_um:.2f} um RMS, {done.max_um:.1f} um at most, {late} late offset frames")
+    stage.say(f"pass {label}: {done.rms_um:.2f} um RMS, {done.max_um:.1f} um at most, {late} late offset frames")
 
 
 def _corrected(stage: Stage, program: Path, trace: Path, method: str) -> dict[str, Any]:
-    """Arm and cut; FdhilError when the correction ended for anything but the end of the path."""
-    stage.say(f"arming by {method}: predicted to help, inside the limits, drives commissioned")
+    stage.say(f"arming {method}: improvement predicted, within limits, drives commissioned")
     stage.ask("arm", program=str(program), method=method, token=(stage.run / "token").read_text("utf-8").strip())
     finished = stage.twin.play(program, trace)
-    _await(lambda: stage.ask("status")["state"] == "OFF", "the guard did not come to rest", stage)
+    _await(lambda: stage.ask("status")["state"] == "OFF", "the guard did not become idle", stage)
     cause = stage.ask("status")["guard"]["cause"]
     if cause["code"] != "Finished":
         raise FdhilError(f"the guard ended the correction: {cause['code']}: {cause['text']}; {cause['advice']}")
@@ -236,7 +235,7 @@ def _corrected(stage: Stage, program: Path, trace: Path, method: str) -> dict[st
 
 
 def read_trace(path: Path, axes: Sequence[str]) -> tuple[Any, Any]:
-    """Return reference and table positions (n, axes) in mm of a trace that the twin wrote; RecordingError otherwise."""
+    """Return reference and table positions, (n, axes) each, mm, of a simulator trace. Raises RecordingError."""
     rows = np.genfromtxt(path, delimiter=",", names=True)
     if rows.dtype.names is None or rows.size == 0:
         raise RecordingError(f"the trace {path} is empty")

@@ -1,4 +1,4 @@
-"""The demonstration's machines: the paper's plant, and the same with what real ones have."""
+"""Machines of the demonstration: that of the paper, and one with realistic imperfections."""
 
 import tomllib
 from collections.abc import Mapping
@@ -9,7 +9,7 @@ PAPER, REAL = "machine.toml", "realistic.toml"
 
 
 def machine_document(*more: str) -> dict[str, Any]:
-    """Return the configuration of the demonstration's machine as a parsed file; ``more`` names what it has besides."""
+    """Return the machine configuration as a parsed file, with the files ``more`` merged into it."""
     document: dict[str, Any] = {}
     for name in (PAPER, *more):
         merge(document, tomllib.loads(Path(__file__).with_name(name).read_text("utf-8")))
@@ -17,7 +17,7 @@ def machine_document(*more: str) -> dict[str, Any]:
 
 
 def merge(document: dict[str, Any], more: Mapping[str, Any]) -> None:
-    """Put what another file says into a document, table by table."""
+    """Merge another document into ``document``, table by table."""
     for key, value in more.items():
         if isinstance(value, Mapping):
             merge(document.setdefault(key, {}), value)

@@ -1,4 +1,4 @@
-"""Child processes of the demonstration: the twin with its panel, the guard, the daemon."""
+"""Child processes of the demonstration: simulator, guard and daemon."""
 
 import json
 import queue
@@ -14,19 +14,19 @@ from typing import Any, Self
 from fdhil.child import ending_with_parent
 from fdhil.errors import ConnectError, DeviceTimeout
 
-PATIENCE_S = 900.0  # a process that ended is told at once; this only ends what hangs, on however busy a host
+PATIENCE_S = 900.0  # only for hanging processes, on a busy host; an ended process is detected at once
 
 
 class Process:
     """A command of fdhil as a child process; stderr goes to a log file, stdout is read line by line.
 
-    ConnectError when it ends before it is ready, DeviceTimeout when an awaited event does not come.
+    Raises ConnectError if it ends before it is ready, DeviceTimeout if an awaited event does not arrive.
     """
 
     def __init__(
         self, name: str, arguments: list[str], log: Path, death_signal: signal.Signals = signal.SIGTERM
     ) -> None:
-        """Start it; it gets ``death_signal`` when this process ends without stopping it."""
+        """Start the process; it gets ``death_signal`` if this process ends without stopping it."""
         self.name = name
         self._log = log
         with log.open("ab") as errors:
@@ -36,7 +36,7 @@ class Process:
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 text=True,
-                start_new_session=True,  # Ctrl-C is for this process, which stops the others in their order
+                start_new_session=True,  # Ctrl-C must reach only this process, which stops the others in order
             )
         self._lines: queue.Queue[str | None] = queue.Queue()
         self._reader = threading.Thread(target=self._read, name=f"{name} events", daemon=True)
@@ -54,15 +54,17 @@ class Process:
         self._lines.put(None)
 
     def event(self, kind: str, timeout_s: float = PATIENCE_S) -> dict[str, Any]:
-        """Return the next event of this kind; what comes before it is dropped."""
+        """Return the next event of this kind and discard all events before it."""
         deadline = time.monotonic() + timeout_s
         while True:
             try:
                 line = self._lines.get(timeout=max(0.0, deadline - time.monotonic()))
             except queue.Empty:
-                raise DeviceTimeout(self.name, f"said no {kind!r} within {timeout_s:.0f} s; see {self._log}") from None
+                raise DeviceTimeout(
+                    self.name, f"did not report {kind!r} within {timeout_s:.0f} s; see {self._log}"
+                ) from None
             if line is None:
-                raise ConnectError(self.name, f"ended before it said {kind!r}: {self._last_words()}")
+                raise ConnectError(self.name, f"ended before it reported {kind!r}: {self._last_words()}")
             event = json.loads(line)
             if event.get("event") == "error":
                 raise ConnectError(self.name, str(event.get("text")))
@@ -70,7 +72,7 @@ class Process:
                 return dict(event)
 
     def command(self, command: str, **fields: Any) -> None:
-        """Send one command of the operator's panel."""
+        """Send one command to the operator's panel."""
         assert self._child.stdin is not None
         try:
             self._child.stdin.write(json.dumps({"command": command, **fields}) + "\n")
@@ -79,12 +81,12 @@ class Process:
             raise ConnectError(self.name, f"has ended: {self._last_words()}") from None
 
     def check(self) -> None:
-        """Raise ConnectError when the process has ended by itself."""
+        """Raise ConnectError if the process has ended."""
         if self._child.poll() is not None:
             raise ConnectError(self.name, f"ended with exit code {self._child.returncode}: {self._last_words()}")
 
     def stop(self, timeout_s: float = 60.0) -> int:
-        """Ask the process to end (SIGTERM), insist after ``timeout_s``, and return its exit code."""
+        """Terminate the process, kill it after ``timeout_s``, and return its exit code."""
         if self._child.poll() is None:
             self._child.terminate()
         try:
@@ -100,7 +102,7 @@ class Process:
 
     def _last_words(self) -> str:
         lines = self._log.read_text("utf-8", "replace").strip().splitlines()
-        return lines[-1] if lines else "it said nothing"
+        return lines[-1] if lines else "without a message"
 
     def __enter__(self) -> Self:
         return self
@@ -110,10 +112,10 @@ class Process:
 
 
 class Twin(Process):
-    """The simulated machine with its operator's panel; ``ready`` is its first event."""
+    """The simulator with its operator's panel; ``ready`` is its first event."""
 
     def __init__(self, config: Path, log: Path) -> None:
-        # where this process is killed it serves until guard and daemon have left the bus
+        # if this process is killed, it runs on until guard and daemon have left the bus
         super().__init__("simulated machine", ["fdhil", "sim", str(config), "--json"], log, signal.SIGUSR1)
         try:
             self.ready: Mapping[str, Any] = self.event("ready")

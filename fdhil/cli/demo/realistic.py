@@ -1,4 +1,4 @@
-"""Runs the demonstration on a machine with what real ones have: what fdhil believes of it, and what that is worth."""
+"""Demonstration on a machine with realistic imperfections: accepted rapids, identified models and correction."""
 
 import multiprocessing
 import os
@@ -27,7 +27,7 @@ AMBIENT_C = 20.0
 
 @dataclass(frozen=True, slots=True)
 class AxisVerdict:
-    """What fdhil makes of one axis: what it published, how many rapids it believed, and why not the others."""
+    """Result of one axis: published set, accepted and total rapids, and reasons of the refusals."""
 
     published: Published | None
     believed: int
@@ -37,7 +37,7 @@ class AxisVerdict:
 
 @dataclass(frozen=True, slots=True)
 class Realistic:
-    """All that was measured on the realistic machine; ``refused`` is why no correction was sent, empty if one was."""
+    """Results of the realistic machine; ``refused`` is the reason of a refused correction, or empty."""
 
     config: MachineConfig
     truth: Mapping[str, Parameters]
@@ -49,9 +49,9 @@ class Realistic:
 
 @contextmanager
 def running_realistic(out: Path, realtime: bool, say: Say) -> Iterator[Callable[[], Realistic]]:
-    """Run ``run_realistic`` in a process of its own during a with block; what it gives waits for the result.
+    """Run ``run_realistic`` in a separate process during a with block; yield a function that waits for the result.
 
-    FdhilError when a step fails. The process, and its machine, end with the block.
+    Raises FdhilError if a step fails. The process and its machine end with the block.
     """
     make_folder(out)
     context = multiprocessing.get_context("fork")
@@ -86,15 +86,15 @@ def _send_realistic(sender: Connection, parent: int, out: Path, realtime: bool, 
             sender.send(run_realistic(out, realtime, say))
     except FdhilError as error:
         sender.send((type(error), str(error)))
-    except KeyboardInterrupt:  # the demonstration ends
+    except KeyboardInterrupt:  # the demonstration was interrupted
         return
 
 
 def run_realistic(out: Path, realtime: bool, say: Say) -> Realistic:
-    """Shuttle, identify and cut below ``out``; FdhilError when a step fails, while a refusal is an answer."""
-    say("the same with what real ones have: friction, weight, ripples, a soft screw, an inverter")
+    """Identify and execute the path in ``out``. Raises FdhilError if a step fails; a refusal is a result."""
+    say("the same with realistic friction, weight, ripples, screw compliance and inverter")
     with running(out, realtime, say, machine_document(REAL)) as stage:
-        say("shuttling both axes at rapid speed, listening")
+        say("shuttling both axes at rapid speed")
         play_shuttle(stage)
         verdicts = {axis: _verdict(stage, axis) for axis in stage.config.axis}
         cut(stage, "uncorrected", AMBIENT_C)
@@ -107,13 +107,13 @@ def _verdict(stage: Stage, axis: str) -> AxisVerdict:
     with History.read(stage.config.store.directory) as history:
         sets, windows = history.revisions(axis, limit=1), history.windows(axis)
     reasons = Counter(reason.partition(":")[0] for window in windows for reason in window.reasons)
-    believed = sum(window.accepted for window in windows)
-    stage.say(f"{axis}: {believed} of {len(windows)} rapids believed, {'a' if sets else 'no'} model published")
-    return AxisVerdict(published_of(sets[0].set) if sets else None, believed, len(windows), reasons)
+    accepted = sum(window.accepted for window in windows)
+    stage.say(f"{axis}: {accepted} of {len(windows)} rapids accepted, {'a' if sets else 'no'} model published")
+    return AxisVerdict(published_of(sets[0].set) if sets else None, accepted, len(windows), reasons)
 
 
 def _predicted(stage: Stage) -> Prediction | None:
-    """Return what the published models predict, with their loops; None unless there is one of every axis."""
+    # None unless every axis has a published model
     source, program = str(stage.config.store.directory), stage.programs["10 m/min"]
     newest = read_newest_sets(stage.config.store.directory, stage.config.axis)
     if len(newest) < len(stage.config.axis):
@@ -125,7 +125,7 @@ def _predicted(stage: Stage) -> Prediction | None:
 
 
 def _corrected(stage: Stage) -> str:
-    """Cut by the inverse; return why not, in the daemon's words, where it refuses."""
+    # the daemon's text if it refuses, else empty
     try:
         cut(stage, "inverse", AMBIENT_C, "inverse")
     except FdhilError as error:

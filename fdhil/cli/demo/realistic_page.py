@@ -1,32 +1,32 @@
-"""The report's section on the realistic machine: what it has, what was believed of it, what the correction left."""
+"""Report section on the realistic machine: imperfections, accepted rapids, parameters, contour errors."""
 
 from fdhil.cli.demo.realistic import AxisVerdict, Realistic
 from fdhil.cli.demo.report import CUT_HEAD, PARAMETER_HEAD, cut_rows_of, identified_rows, rms
 from fdhil.config import Reality
 from fdhil.report import Section, Table, figures
 
-SHAPES = ("_phase", "_speed")  # end the names of what belongs to another term
-VERDICT_HEAD = ("axis", "rapids believed", "model", "why others were not")
+SHAPES = ("_phase", "_speed")  # suffixes of values that belong to another term
+VERDICT_HEAD = ("axis", "accepted rapids", "model", "reasons of refusals")
 
 
 def section(realistic: Realistic) -> Section:
-    """Lay it out; a refusal is shown as such."""
+    """Return the section, which states a refused correction."""
     errors = {cut.label: cut.contour_um for cut in realistic.cuts}
     period_s = realistic.config.machine.sync_period_s
     text = (
-        "The same loop on the same machine with what ordinary real ones have besides the equations of the paper. "
-        "The errors are those of the true table. Its motors' encoders do not see how the screws give: that resonance "
-        "is told to fdhil, the rest it found out from four rapids of each axis. The current sensors are 1 % off, and "
-        "so are R, L, Jt, ft and Cd, which are told in their amperes."
+        "The same loop on the same machine with imperfections of ordinary machines beyond the equations of the paper. "
+        "Errors are those of the true table. The motor encoders do not measure the compliance of the screws; this "
+        "resonance is configured, everything else is identified from four rapids per axis. The current sensors have "
+        "a gain error of 1 %, and so have R, L, Jt, ft and Cd, which scale with the current."
     )
     if realistic.refused:
-        text += f" It was not corrected: {realistic.refused}."
+        text += f" The correction was refused: {realistic.refused}."
     return Section(
         "A realistic machine",
         text,
         tables=[
-            Table(("what it has", *realistic.config.axis), effect_rows(realistic)),
-            Table(VERDICT_HEAD, verdict_rows(realistic), "What was believed"),
+            Table(("imperfection", *realistic.config.axis), effect_rows(realistic)),
+            Table(VERDICT_HEAD, verdict_rows(realistic), "Accepted rapids"),
             Table(PARAMETER_HEAD, parameter_rows(realistic), "Identified"),
             Table(CUT_HEAD, cut_rows(realistic), "Contour error, 10 m/min, at the true table"),
         ],
@@ -35,14 +35,14 @@ def section(realistic: Realistic) -> Section:
 
 
 def headline(realistic: Realistic) -> tuple[str, str]:
-    """Return the one line of it for the top of the page."""
+    """Return the line for the top of the page."""
     if realistic.refused:
         return "on a realistic machine", "refused"
-    return "on a realistic machine smaller by", f"{realistic.cuts[0].rms_um / realistic.cuts[-1].rms_um:.1f} x"
+    return "on a realistic machine reduced by", f"{realistic.cuts[0].rms_um / realistic.cuts[-1].rms_um:.1f} x"
 
 
 def effect_rows(realistic: Realistic) -> list[list[str]]:
-    """Return every key that is set on some axis, and its value on each."""
+    """Return every key that is set for an axis, with its value per axis."""
     config = realistic.config
     levels = [config.sim.axis[axis].reality.model_dump(exclude_defaults=True) for axis in config.axis]
     return [[key, *(str(level.get(key, "")) for level in levels)]
@@ -50,27 +50,27 @@ def effect_rows(realistic: Realistic) -> list[list[str]]:
 
 
 def verdict_rows(realistic: Realistic) -> list[list[str]]:
-    """Return one row per axis: rapids believed, whether a model was published, why the other rapids were not."""
-    return [[axis, f"{told.believed} of {told.rapids}", _model(told),
-             ", ".join(f"{count} x {code}" for code, count in told.reasons.items())]
-            for axis, told in realistic.verdicts.items()]  # fmt: skip
+    """Return one row per axis: accepted rapids, published model, reasons of refusals."""
+    return [[axis, f"{found.believed} of {found.rapids}", _model(found),
+             ", ".join(f"{count} x {code}" for code, count in found.reasons.items())]
+            for axis, found in realistic.verdicts.items()]  # fmt: skip
 
 
-def _model(told: AxisVerdict) -> str:
-    if told.published is None:
+def _model(found: AxisVerdict) -> str:
+    if found.published is None:
         return "none published"
-    terms = ", ".join(name for name, _ in told.published.parameters.terms if not name.endswith(SHAPES))
-    return f"the six and {terms}" if terms else "the six"
+    terms = ", ".join(name for name, _ in found.published.parameters.terms if not name.endswith(SHAPES))
+    return f"six parameters and {terms}" if terms else "six parameters"
 
 
 def parameter_rows(realistic: Realistic) -> list[list[str]]:
-    """Return the true and the identified parameters of the axes that have a model."""
-    return [row for axis, told in realistic.verdicts.items() if told.published is not None
-            for row in identified_rows(axis, realistic.truth[axis], told.published)]  # fmt: skip
+    """Return the true and the identified parameters of axes with a model."""
+    return [row for axis, found in realistic.verdicts.items() if found.published is not None
+            for row in identified_rows(axis, realistic.truth[axis], found.published)]  # fmt: skip
 
 
 def cut_rows(realistic: Realistic) -> list[list[str]]:
-    """Return the contour errors, predicted where there was a model to predict with, and measured."""
+    """Return the contour errors: predicted, if there is a model, and measured."""
     rows = []
     if realistic.predicted is not None:
         contour = realistic.predicted.contour_um

@@ -1,4 +1,4 @@
-"""Reports the demonstration: the paper's figures for the machine that was just identified."""
+"""Report of the demonstration: the figures of the paper for the identified machine."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,13 +24,13 @@ from fdhil.report import Page, Section, Table, figures
 from fdhil.report.figures import Curve
 from fdhil.report.parameter_view import DISPLAY, cell
 
-# the named places of the bench path, mm
+# named locations of the path, mm
 POINTS: Mapping[str, tuple[float, float]] = {
     "A": (0.0, 55.0), "B": (50.0, 55.0), "C": (100.0, 55.0), "D": (150.0, 5.0), "E": (200.0, 55.0), "F": (225.0, 55.0),
     "G": (250.0, 55.0),
 }  # fmt: skip
-ENLARGED = 100  # what the corrections leave is some micrometres
-MAGNIFIED = 10  # a hundred micrometres beside corners that the NC rounds by millimetres
+ENLARGED = 100  # for residual errors of some micrometres
+MAGNIFIED = 10  # for errors of 100 um at corners that the NC rounds by millimetres
 # [DES] 5.3: the drifts whose effect at E is shown, on X only
 DRIFTS: Sequence[tuple[str, Mapping[str, float]]] = (
     ("ft 0.01, Cd 1 on X", {"ft": 0.01, "Cd": 1.0}),
@@ -45,7 +45,7 @@ def rms(values: Float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """One pass over the path as the twin measured it at its own table."""
+    """One pass over the path, measured at the simulated table."""
 
     label: str
     temperature_c: float
@@ -56,18 +56,18 @@ class Cut:
 
     @property
     def rms_um(self) -> float:
-        """RMS contour error."""
+        """RMS contour error, um."""
         return rms(self.contour_um)
 
     @property
     def max_um(self) -> float:
-        """Largest contour error."""
+        """Largest contour error, um."""
         return float(self.contour_um.max())
 
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """One published parameter set: values, standard deviations, and the slide-way temperature it belongs to."""
+    """One published parameter set: values, standard deviations and slide-way temperature."""
 
     parameters: Parameters
     std: Mapping[str, float]
@@ -76,7 +76,7 @@ class Published:
 
 @dataclass(frozen=True, slots=True)
 class Loop:
-    """All that the demonstration measured."""
+    """Results of the demonstration."""
 
     config: MachineConfig
     truth: Mapping[str, Parameters]
@@ -90,17 +90,17 @@ class Loop:
 
 
 def page(loop: Loop, headline: Sequence[tuple[str, str]] = (), more: Sequence[Section] = ()) -> Page:
-    """Lay the loop out as a report, with lines and sections that others add to it."""
+    """Return the report, with additional headlines and sections."""
     before, mirror, after = loop.cuts[:3]
     return Page(
         title="From rapid moves to a corrected path",
-        subtitle="A simulated two-axis machine, identified while it moved, predicted, and corrected over its own bus.",
+        subtitle="A simulated two-axis machine, identified in motion, predicted, and corrected over its own bus.",
         headline=[
             ("contour error measured before, RMS", f"{before.rms_um:.1f} um"),
-            ("predicted before it was cut", f"{rms(loop.predicted.contour_um):.1f} um"),
+            ("predicted before the cut", f"{rms(loop.predicted.contour_um):.1f} um"),
             ("measured with the paper's mirror", f"{mirror.rms_um:.2f} um"),
             ("measured with the inverse, RMS", f"{after.rms_um:.2f} um"),
-            ("smaller by, as measured", f"{before.rms_um / after.rms_um:.0f} x"),
+            ("measured reduction", f"{before.rms_um / after.rms_um:.0f} x"),
             *headline,
         ],
         sections=[_identified(loop), _drifted(loop), _path(loop), _predicted(loop), _corrected(loop), *more],
@@ -108,12 +108,12 @@ def page(loop: Loop, headline: Sequence[tuple[str, str]] = (), more: Sequence[Se
 
 
 def parameter_rows(loop: Loop) -> list[list[str]]:
-    """Return the table of true and identified parameters: axis, symbol, truth, identified with interval, deviation."""
+    """Return the parameter table: axis, symbol, true value, identified value with interval, deviation."""
     return [row for axis, truth in loop.truth.items() for row in identified_rows(axis, truth, loop.published[axis][0])]
 
 
 def identified_rows(axis: str, truth: Parameters, found: Published) -> list[list[str]]:
-    """Return the rows of one axis; what has joined the six has no truth beside it."""
+    """Return the rows of one axis; additional terms have no true value."""
     rows = []
     for name in PARAMETERS:
         true, value, std = getattr(truth, name), getattr(found.parameters, name), found.std[name]
@@ -127,13 +127,13 @@ def identified_rows(axis: str, truth: Parameters, found: Published) -> list[list
 
 
 def cut_rows(loop: Loop) -> list[list[str]]:
-    """Return the table of contour errors: predicted, then each cut as measured at the table."""
+    """Return the table of contour errors: predicted, then measured per pass."""
     rows = [["predicted", "", f"{rms(loop.predicted.contour_um):.2f}", f"{loop.predicted.contour_um.max():.1f}", ""]]
     return rows + cut_rows_of(loop.cuts)
 
 
 def cut_rows_of(cuts: Sequence[Cut]) -> list[list[str]]:
-    """Return one row per pass, as measured at the table."""
+    """Return one row per measured pass."""
     return [
         [cut.label, f"{cut.temperature_c:.1f}", f"{cut.rms_um:.2f}", f"{cut.max_um:.1f}", str(cut.late_offsets)]
         for cut in cuts
@@ -148,23 +148,15 @@ def _identified(loop: Loop) -> Section:
     pictures = []
     for axis, (window, fit_percent) in loop.cold.items():
         found = loop.published[axis][0].parameters
-        pictures.append(
-            (
-                f"Axis {axis}: voltage, current and speed of one rapid move, as measured (Figure 4 of the paper)",
-                figures.signals(window),
-            )
-        )
-        pictures.append(
-            (
-                f"Axis {axis}: the model, given the measured voltage, against the drive; below, the rest (Figure 8)",
-                figures.model_against_drive(window, found, fit_percent),
-            )
-        )
+        caption = f"Axis {axis}: voltage, current and speed of one rapid move, as measured (Figure 4 of the paper)"
+        pictures.append((caption, figures.signals(window)))
+        caption = f"Axis {axis}: speed of model and drive for the measured voltage, and their difference (Figure 8)"
+        pictures.append((caption, figures.model_against_drive(window, found, fit_percent)))
     received, lost = loop.frames
     return Section(
         "Identified during rapid moves",
         f"Voltage, current and speed were recorded over CANopen while the axes shuttled; {received:,} frames were "
-        f"received and {lost} lost. Each parameter is shown with half of its 95 % interval, beside the twin's own.",
+        f"received and {lost} lost. Each parameter is shown with half of its 95 % interval and its true value.",
         tables=[Table(PARAMETER_HEAD, parameter_rows(loop))],
         figures=pictures,
     )
@@ -174,25 +166,18 @@ def _drifted(loop: Loop) -> Section:
     pictures = []
     for axis, warm in loop.warm.items():
         cold, first, last = loop.cold[axis][0], loop.published[axis][0], loop.published[axis][-1]
-        cases = [
-            (f"{first.temperature_c:.1f} degC", cold, first.parameters),
-            (f"{last.temperature_c:.1f} degC", warm, last.parameters),
-        ]
-        pictures.append(
-            (
-                f"Axis {axis}: torque of a rapid move with cold and with warm slide-ways, from the model (Figure 5)",
-                figures.torque(cases),
-            )
-        )
+        cases = [(f"{found.temperature_c:.1f} degC", window, found.parameters)
+                 for window, found in ((cold, first), (warm, last))]  # fmt: skip
+        caption = f"Axis {axis}: torque of a rapid move with cold and with warm slide-ways, from the model (Figure 5)"
+        pictures.append((caption, figures.torque(cases)))
     for symbol, meaning, number in (("ft", "Viscous friction", 6), ("Cd", "Coulomb friction", 7)):
         series = {axis: _series(sets, symbol) for axis, sets in loop.published.items()}
-        caption = (
-            f"{meaning} {symbol} over the temperature of the slide-ways, with its 95 % intervals (Figure {number})"
-        )
+        what = f"{meaning} {symbol} over the temperature of the slide-ways"
+        caption = f"{what}, with its 95 % intervals (Figure {number})"
         pictures.append((caption, figures.drift(symbol, UNITS[symbol], series)))
     return Section(
         "Drift with the slide-ways' temperature",
-        "The slide-ways were warmed while the axes went on shuttling. Nothing but the rapids was used.",
+        "The slide-ways were warmed while the axes kept shuttling. Only rapids were used.",
         figures=pictures,
     )
 
@@ -249,14 +234,14 @@ def _predicted(loop: Loop) -> Section:
     worst = [[f"{z.start_s:.2f} to {z.end_s:.2f}", z.where, f"{z.max_um:.1f}", z.cause] for z in loop.predicted.zones]
     return Section(
         "Predicted before the cut",
-        "The closed loops of both drives were simulated with the identified parameters; nothing of this was measured.",
+        "The closed loops of both drives were simulated with the identified parameters; nothing here is measured.",
         tables=[Table(("time (s)", "where", "at most (um)", "cause"), worst, "Zones of the path, 10 m/min")],
         figures=pictures,
     )
 
 
 def _drift(parameters: Parameters, change: Mapping[str, float]) -> Parameters:
-    """Apply a drift of the paper: friction as its absolute value, inertia as a factor."""
+    # friction as an absolute value, inertia as a factor
     values = {name: value * parameters.Jt if name == "Jt" else value for name, value in change.items()}
     return parameters.changed(**values)
 
@@ -275,16 +260,16 @@ def _corrected(loop: Loop) -> Section:
     larger = f"errors {ENLARGED} times as large"
     return Section(
         "Cut without and with the correction",
-        "Measured by the twin at its own table, with the offsets sent over the bus by the guard and checked there.",
+        "Measured at the simulated table; the guard checks the offsets and sends them over the bus.",
         tables=[Table(CUT_HEAD, cut_rows(loop), "Contour error, 10 m/min")],
         figures=[
             (
-                "Contour error along the path, each pass as measured at the table (the loop of Figure 16, closed)",
+                "Contour error along the path, measured per pass (the loop of Figure 16, closed)",
                 figures.contour_errors(loop.config.machine.sync_period_s, errors),
             ),
             *_maps((before, loop.cuts[2])),
             (f"Area A, measured, {larger} (Figure 17)", figures.corner(measured, POINTS["A"], 6.0)),
-            (f"The straight behind A, measured, {larger} (Figure 18)", figures.corner(measured, (20.0, 55.0), 12.0)),
+            (f"The straight after A, measured, {larger} (Figure 18)", figures.corner(measured, (20.0, 55.0), 12.0)),
             (f"Area E, measured, {larger}", figures.corner(measured, POINTS["E"], 6.0)),
             (f"Rounded path at the end of A, simulated, {larger} (Figure 20)", _rounded_figure(rounded, inverse)),
         ],
@@ -296,7 +281,7 @@ def _maps(cuts: Sequence[Cut]) -> list[tuple[str, str]]:
     places = [figures.Place(name, *at) for name, at in POINTS.items()]
     return [
         (
-            f"Where the error is, {cut.label}: {cut.max_um:.1f} um at most; the colours mean the same in both maps",
+            f"Where the error is, {cut.label}: {cut.max_um:.1f} um at most; both maps have the same colour scale",
             figures.error_map(cut.reference_mm, cut.contour_um, largest, places=places, least_um=least),
         )
         for cut in cuts

@@ -1,4 +1,4 @@
-"""A machine's configuration as the text of a file: nested tables of plain values."""
+"""TOML writer for nested tables of plain values."""
 
 import json
 from collections.abc import Mapping
@@ -6,7 +6,7 @@ from typing import Any
 
 
 def to_toml(document: Mapping[str, Any], path: str = "") -> str:
-    """Return a document of nested tables of plain values, below the table ``path``, as TOML."""
+    """Return a document of nested tables of plain values as TOML, with ``path`` as prefix of its tables."""
     plain = {key: value for key, value in document.items() if not isinstance(value, Mapping)}
     lines = [f"[{path}]"] if path and plain else []
     lines += [f"{key} = {json.dumps(value)}" for key, value in plain.items()]

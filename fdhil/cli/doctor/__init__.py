@@ -1,4 +1,4 @@
-"""``fdhil doctor``: what is wrong with this PC, bus, drive, sensor, store, clock and rights; the cause comes first."""
+"""``fdhil doctor``: diagnose PC, buses, drives, sensors, store, clock and permissions; causes come first."""
 
 from __future__ import annotations
 
@@ -18,8 +18,6 @@ from fdhil.cli.terminal_text import print_progress
 from fdhil.daemon.clock import newest_record_s
 
 if TYPE_CHECKING:
-    from rich.text import Text
-
     from fdhil.config import MachineConfig
 
 SCHEMA = "fdhil-doctor-1"
@@ -27,25 +25,24 @@ SCHEMA = "fdhil-doctor-1"
 
 @click.command()
 @CONFIG
-@click.option("--offline", is_flag=True, help="Look at this PC alone, and leave buses and sensors in peace.")
+@click.option("--offline", is_flag=True, help="Examine only this PC; do not access buses and sensors.")
 @click.option("--latency", "seconds", type=Positive(1.0, 86_400.0), metavar="SECONDS",
-              help="Measure for so long how late this PC wakes up; the acceptance report lists it.")  # fmt: skip
+              help="Measure the wake-up latency for this time, s; the acceptance report lists it.")  # fmt: skip
 @AS_JSON
 @verdict
 def doctor(config: Path, offline: bool, seconds: float | None, as_json: bool) -> int:
-    """Diagnose the PC, bus, drives, sensors, store, clock and rights; the most urgent problem comes first.
+    """Diagnose the PC, bus, drives, sensors, store, clock and permissions.
 
-    It only reads (--latency writes its result into the store), and sends nothing where an NC runs the bus (with the NC
-    off the drives are read, as by fdhil check). What cannot be examined before something else is corrected is left out,
-    so correct the first, and run it again. Exit codes: 0 nothing grave is wrong, 1 something is, 2 wrong option or
-    configuration: its faults come before all others.
+    The most urgent problem comes first. Problems that depend on it may be hidden, so correct it and run the command
+    again. Only reads (--latency stores its result). If an NC runs the bus, nothing is sent; with the NC off, the drives
+    are read as by fdhil check.
     """
     machine = machine_config.load(config)
     from fdhil.cli.doctor.latency import examine_latency, histogram_lines, latency_text
 
     latency = _measure(machine, seconds) if seconds is not None else None
     troubles = [*_in_order(machine, offline), *(examine_latency(latency) if latency is not None else ())]
-    found = sorted(troubles, key=lambda trouble: not trouble.grave)  # the order of causes stays, within each half
+    found = sorted(troubles, key=lambda trouble: not trouble.grave)  # stable: keeps the order of causes
     if as_json:
         grave = sum(trouble.grave for trouble in found)
         document = {"schema": SCHEMA, "healthy": not grave, "troubles": [asdict(t) for t in found]}
@@ -62,13 +59,13 @@ def doctor(config: Path, offline: bool, seconds: float | None, as_json: bool) ->
 def _measure(machine: MachineConfig, seconds: float) -> dict[str, Any]:
     from fdhil.cli.doctor.latency import keep_latency, measure_latency
 
-    print_progress(f"measuring for {seconds:g} s how late this PC wakes up")
+    print_progress(f"measuring the wake-up latency of this PC for {seconds:g} s")
     found = measure_latency(machine, seconds)
     return found | {"file": str(keep_latency(machine, found))}
 
 
 def _in_order(config: MachineConfig, offline: bool) -> Iterator[Trouble]:
-    """Examine from the cause to what depends on it: this PC, its interfaces, the devices behind them, the guard."""
+    # causes before their effects: this PC, its interfaces, the devices, the guard
     from fdhil.cli.doctor import computer, devices, offers, storage, uplink  # late: --help imports nothing heavy
 
     yield from _seen("store", lambda: storage.examine_store(config))
@@ -90,31 +87,25 @@ def _in_order(config: MachineConfig, offline: bool) -> Iterator[Trouble]:
 
 
 def _seen(place: str, examine: Callable[[], Iterator[Trouble]]) -> Iterator[Trouble]:
-    """Yield what an examination finds, and where this user may not look, that."""
     try:
         yield from examine()
     except PermissionError as error:
-        what = f"{error.filename or place} may not be looked at by this user"
-        means = f"what may be wrong with the {place} is not known"
+        what = f"this user has no permission to read {error.filename or place}"
+        means = f"problems of the {place} cannot be detected"
         yield Trouble("NotSeen", place, what, means, "run fdhil doctor as the user of the daemon, or with sudo")
 
 
 def _show(found: list[Trouble]) -> None:
+    from rich.text import Text
+
     from fdhil.cli.status_view import open_console
 
     out = open_console()
     for number, trouble in enumerate(found, 1):
-        out.print(_told(number, trouble), soft_wrap=True)
+        head = Text.assemble((f"{number}. {trouble.place}: ", "red" if trouble.grave else "yellow"), trouble.what)
+        out.print(head.append(f"\n   means: {trouble.means}\n   fix:   {trouble.mend}"), soft_wrap=True)
     grave = sum(trouble.grave for trouble in found)
     if found:
-        out.print(f"{grave} to mend, {len(found) - grave} that could be better; mend the first and run it again")
+        out.print(f"{grave} to fix, {len(found) - grave} to improve; fix the first and run it again")
     else:
-        out.print("nothing is wrong that could be seen")
-
-
-def _told(number: int, trouble: Trouble) -> Text:
-    from rich.text import Text
-
-    colour = "red" if trouble.grave else "yellow"
-    head = Text.assemble((f"{number}. {trouble.place}: ", colour), trouble.what)
-    return head.append(f"\n   means: {trouble.means}\n   mend:  {trouble.mend}")
+        out.print("no problem found")

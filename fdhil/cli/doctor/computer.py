@@ -1,4 +1,4 @@
-"""Examines the PC: its CAN interfaces and hubs, its clock, its processors."""
+"""Examines the PC: CAN interfaces and hubs, clock, processors."""
 
 import json
 import os
@@ -17,22 +17,22 @@ from fdhil.config import CanBus, MachineConfig
 INTERFACES = Path("/sys/class/net")
 LARGEST_RECEIVE_BUFFER = Path("/proc/sys/net/core/rmem_max")
 GOVERNOR = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
-ENOUGH_BUFFER_BYTES = 1 << 20  # the kernel's own limit holds some 300 frames: 35 ms of a full bus
+ENOUGH_BUFFER_BYTES = 1 << 20  # the kernel's default holds some 300 frames: 35 ms of a fully loaded bus
 HUB_S = 2.0
 TOOL_S = 5.0
 UP = 1  # IFF_UP
-RELEASED_S = 1_767_225_600.0  # 1 January 2026: this program is younger than any clock before it
-NO_CAN_ADDRESS = "its kernel knows no CAN (AF_CAN)"
+RELEASED_S = 1_767_225_600.0  # 1 January 2026, before this program was written
+NO_CAN_ADDRESS = "the kernel does not support CAN (AF_CAN)"
 BAD_STATES: Mapping[str, tuple[str, str]] = {
-    "BUS-OFF": ("is bus-off", "nothing is sent or heard there until it is started again"),
-    "ERROR-PASSIVE": ("is error-passive", "frames are lost, and it may fall off the bus"),
+    "BUS-OFF": ("is bus-off", "nothing is sent or received there until it is restarted"),
+    "ERROR-PASSIVE": ("is error-passive", "frames are lost, and it may go bus-off"),
 }
 
 
 def examine_buses(config: MachineConfig, offline: bool) -> dict[str, list[Trouble]]:
-    """Return what keeps each CAN bus that an axis uses from being heard, as far as this PC knows.
+    """Return, per CAN bus in use, the problems of this PC that prevent reception.
 
-    ``offline`` asks no hub of CAN frames whether it is there: a bus would have one more listener.
+    ``offline`` does not connect to a hub of CAN frames.
     """
     used = dict.fromkeys(axis.drive.bus for axis in config.axis.values())
     return {name: list(_bus(f"bus {name}", config.bus[name], offline)) for name in used}
@@ -46,9 +46,9 @@ def _bus(place: str, bus: CanBus, offline: bool) -> Iterator[Trouble]:
 
 
 def _hub(place: str, bus: CanBus, offline: bool) -> Iterator[Trouble]:
-    means = "no drive can be heard"
+    means = "no drive can be received"
     if bus.port == 0:
-        what = "the config gives no port of the CAN hub"
+        what = "the configuration has no port for the CAN hub"
         yield Trouble("NoPort", place, what, means, "write the port that the hub or `fdhil sim` prints")
         return
     if offline:
@@ -62,9 +62,9 @@ def _hub(place: str, bus: CanBus, offline: bool) -> Iterator[Trouble]:
 
 
 def _interface(place: str, bus: CanBus) -> Iterator[Trouble]:
-    means, there = "no drive can be heard", INTERFACES / bus.channel
+    means, there = "no drive can be received", INTERFACES / bus.channel
     if not hasattr(socket, "AF_CAN") or not _opens_can():
-        mend = "load the kernel's modules can, can_raw and that of the adapter, or use a kernel that has them"
+        mend = "load the kernel modules can, can_raw and that of the adapter, or use a kernel that has them"
         yield Trouble("NoKernelCan", place, NO_CAN_ADDRESS, means, mend)
     elif not there.exists():
         what = f"there is no CAN interface {bus.channel}"
@@ -91,7 +91,7 @@ def _bring_up(bus: CanBus) -> str:
 
 
 def link_details(channel: str) -> Mapping[str, Any]:
-    """Return what ``ip`` knows of a CAN controller: its state, bit timing, restart; nothing where it is not told."""
+    """Return state, bit timing and restart setting of a CAN controller from ``ip``; empty if unavailable."""
     tool = shutil.which("ip")
     if tool is None:
         return {}
@@ -104,19 +104,19 @@ def link_details(channel: str) -> Mapping[str, Any]:
 
 
 def _controller(place: str, bus: CanBus, details: Mapping[str, Any]) -> Iterator[Trouble]:
-    """What the adapter's controller says of itself; a virtual interface has none."""
+    # a virtual interface has no controller, and no details
     bitrate = details.get("bittiming", {}).get("bitrate")
     if bitrate and bitrate != bus.bitrate:
-        what = f"{bus.channel} runs at {bitrate} bit/s where the config has {bus.bitrate}"
+        what = f"{bus.channel} runs at {bitrate} bit/s, the configuration has {bus.bitrate}"
         mend = f"correct [{place}] bitrate, or: sudo ip link set {bus.channel} down, then {_bring_up(bus)}"
-        yield Trouble("BitrateDiffers", place, what, "nodes of another bit rate disturb each other's frames", mend)
+        yield Trouble("BitrateDiffers", place, what, "nodes with different bit rates corrupt each other's frames", mend)
     if (state := str(details.get("state"))) in BAD_STATES:
         what, means = BAD_STATES[state]
         mend = f"check plugs, wiring, the two terminating resistors and the bit rate, then: {_bring_up(bus)}"
         yield Trouble("BusOff" if state == "BUS-OFF" else "BusPassive", place, f"{bus.channel} {what}", means, mend)
     if details.get("restart_ms") == 0:
-        what = f"{bus.channel} does not come back by itself after a bus-off"
-        means = "one disturbance ends all listening until somebody starts it again"
+        what = f"{bus.channel} does not restart automatically after a bus-off"
+        means = "one disturbance stops all reception until it is restarted manually"
         yield Trouble("NoRestart", place, what, means, _bring_up(bus), grave=False)
 
 
@@ -125,33 +125,35 @@ def _receive_buffer(place: str) -> Iterator[Trouble]:
         largest = int(LARGEST_RECEIVE_BUFFER.read_text())
         if largest < ENOUGH_BUFFER_BYTES:
             what = f"the kernel's receive buffers are at most {largest} bytes"
-            means = "a busy computer loses frames, and windows are refused for that"
+            means = "a busy computer loses frames, and the windows concerned are refused"
             mend = f"sudo sysctl -w net.core.rmem_max={8 * ENOUGH_BUFFER_BYTES}"
             yield Trouble("SmallBuffer", place, what, means, mend, grave=False)
 
 
 def examine_clock(newest_record_s: float | None) -> Iterator[Trouble]:
-    """Compare the PC's clock with the program's age and with the newest record (s since 1970) of the history."""
+    """Compare the PC's clock with the release date and with the newest record (s since 1970) of the history."""
     now_s, shown = time.time(), time.strftime("%Y-%m-%d %H:%M", time.gmtime())
-    means = "what is recorded now would stand in the wrong place of the history"
-    mend = "set the clock, or let it be set: sudo timedatectl set-ntp true"
+    means = "new records would be sorted wrongly into the history"
+    mend = "set the clock, or enable its synchronisation: sudo timedatectl set-ntp true"
     if now_s < RELEASED_S:
-        yield Trouble("ClockNotSet", "clock", f"it is {shown} UTC by this PC, which cannot be", means, mend)
+        yield Trouble(
+            "ClockNotSet", "clock", f"this PC's clock shows {shown} UTC, before the release of fdhil", means, mend
+        )
     elif newest_record_s is not None and newest_record_s > now_s + 60.0:
         ahead = (newest_record_s - now_s) / 3600.0
-        what = f"it is {shown} UTC by this PC, and the newest record is from {ahead:.1f} h later"
+        what = f"this PC's clock shows {shown} UTC, {ahead:.1f} h before the newest record"
         yield Trouble("ClockBehind", "clock", what, means, mend)
 
 
 def examine_processors() -> Iterator[Trouble]:
-    """Tell whether others use the PC up, or whether it saves power while frames wait."""
+    """Detect overload and power saving of the processors."""
     cores, load = os.cpu_count() or 1, os.getloadavg()[1]
     if load > 1.5 * cores:
         what = f"{load:.1f} processes wait for {cores} processors (mean of five minutes)"
-        means = "fits take longer, and at the worst the guard is late and lands every correction"
-        yield Trouble("BusyHost", "processors", what, means, "end what need not run beside a machine", grave=False)
+        means = "identification takes longer, and the guard may be late and ramp every correction to zero"
+        yield Trouble("BusyHost", "processors", what, means, "end programs that the machine does not need", grave=False)
     with suppress(OSError):
         if GOVERNOR.read_text().strip() == "powersave":
-            means = "frames are read late after each pause"
+            means = "frames are read late after a pause"
             mend = "sudo cpupower frequency-set -g performance"
             yield Trouble("PowerSaving", "processors", "they run at their lowest speed", means, mend, grave=False)

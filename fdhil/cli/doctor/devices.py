@@ -1,4 +1,4 @@
-"""Examines what is wired to the PC, through the comparison of ``fdhil check``, and asks the guard how it is."""
+"""Examines the connected devices by the comparison of ``fdhil check``, and the daemon and the guard."""
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 
@@ -13,24 +13,24 @@ from fdhil.daemon.status import config_difference
 from fdhil.errors import DeviceError
 from fdhil.guard.protocol import SOCKET_NAME
 
-ORDER = ("NC", "SYNC", "drive")  # what must be right before anything else of a drive can be
+ORDER = ("NC", "SYNC", "drive")  # prerequisites of all other points of a drive
 MEANS = {
     "voltage": "resistance and inductance of this axis cannot be identified",
-    "temperature": "drift is told by time alone",
-    "heartbeat": "a drive that falls silent is noticed later",
-    "SYNC": "samples are placed at the wrong instants",
-    "loops": "the regulators of the config are not the drive's, and predictions are off",
+    "temperature": "drift can be related only to time",
+    "heartbeat": "the loss of a drive is detected later",
+    "SYNC": "samples get wrong times",
+    "loops": "the regulators of the configuration differ from the drive's, and predictions are wrong",
 }
-WITHOUT = "what this drive tells is misread or missing"
+WITHOUT = "signals of this drive are misread or missing"
 HARMLESS = frozenset({"heartbeat", "temperature", "loops"})
 
 
 def examine_devices(
     config: MachineConfig, buses: Collection[str], recorded: Collection[str], say: Callable[[str], None]
 ) -> Iterator[Trouble]:
-    """Compare the devices of the axes on ``buses`` with the config; they are only listened to, or read with no NC.
+    """Compare the devices of the axes on ``buses`` with the configuration, by listening, or reading if no NC is active.
 
-    Of the places in ``recorded`` it is known that their commissioning record is bad.
+    ``recorded`` are the places whose commissioning record is known to be bad.
     """
     axes = {name: axis for name, axis in config.axis.items() if axis.drive.bus in buses}
     if not axes:
@@ -38,14 +38,13 @@ def examine_devices(
     try:
         found = check_machine(config.model_copy(update={"axis": axes}), say)
     except DeviceError as error:
-        what, _, mend = str(error).partition("; ")
-        yield Trouble(type(error).__name__, error.device, what, "no drive can be heard", mend)
+        yield Trouble.create_from_error(type(error).__name__, error.device, error, "no drive can be received")
         return
     yield from troubles_of([each for each in found if each[0] not in recorded or each[1].point != POINT])
 
 
 def troubles_of(found: Sequence[Place]) -> list[Trouble]:
-    """Return what differs, in the order in which it must be mended: a drive that is away tells nothing of the rest."""
+    """Return the differences in the order in which to fix them; an absent drive hides its other differences."""
     differ = [(place, finding) for place, finding in found if finding.ok is False]
     rank = {point: k for k, point in enumerate(ORDER)}
     differ.sort(key=lambda item: (rank.get(item[1].point, len(ORDER)), item[1].point in HARMLESS))
@@ -65,33 +64,34 @@ def troubles_of(found: Sequence[Place]) -> list[Trouble]:
 
 
 def examine_daemon(config: MachineConfig) -> Iterator[Trouble]:
-    """Ask a running daemon whether the configuration is the one that it runs with."""
+    """Compare the configuration with that of a running daemon."""
     if not (config.run_directory / DAEMON_SOCKET).exists():
         return
     try:
         difference = config_difference(ask(config.run_directory / DAEMON_SOCKET, {"request": "status"}), config.digest)
     except DeviceError as error:
-        what, _, mend = str(error).partition("; ")
-        yield Trouble("DaemonSilent", "daemon", what, "nothing is identified, and nothing can be armed", mend)
+        yield Trouble.create_from_error(
+            "DaemonSilent", "daemon", error, "nothing is identified, and nothing can be armed"
+        )
         return
     if difference:
         what, _, mend = difference.partition("; ")
-        means = "what is shown or edited in the file is not what the machine is corrected by"
+        means = "the machine is corrected with values other than those in the file"
         yield Trouble("ConfigDiffers", "daemon", what, means, mend, False)
 
 
 def examine_guard(config: MachineConfig) -> Iterator[Trouble]:
-    """Ask a running guard; one that does not run is no trouble, since nothing starts to send by itself."""
+    """Examine a running guard; a guard that does not run is no problem, because nothing is sent without it."""
     if not (config.guard_directory / SOCKET_NAME).exists():
         return
     try:
         with GuardClient(config.guard_directory) as guard:
             state = str(guard.status().get("state"))
     except DeviceError as error:
-        what, _, mend = str(error).partition("; ")
-        yield Trouble("GuardSilent", "guard", what, "nothing can be armed, and what stands in the drives stays", mend)
+        means = "nothing can be armed, and applied offsets remain in the drives"
+        yield Trouble.create_from_error("GuardSilent", "guard", error, means)
         return
     if state == "FROZEN":
-        what = "it holds the offsets where they are (FROZEN), since it cannot know what the drives do"
-        means = "an offset of an earlier correction may stand in the drives"
+        what = "it holds the offsets (FROZEN), because the state of the drives is unknown"
+        means = "the drives may still apply an offset of an earlier correction"
         yield Trouble("GuardFrozen", "guard", what, means, "hold the feed, then run `fdhil adopt`")

@@ -1,4 +1,4 @@
-"""Measures how late this PC wakes a process that sleeps until each SYNC, as cyclictest and latency-test do."""
+"""Measures the wake-up latency of this PC at the SYNC period, like cyclictest and latency-test."""
 
 import gc
 import json
@@ -18,7 +18,7 @@ from fdhil.guard.turn_times import BINS_US, MOST_LATE
 from fdhil.store.atomic import make_folder, write_file
 
 FILE_NAME = "latency.json"
-MEND = "take load off this PC, use a real-time kernel (PREEMPT_RT), and start the guard with its systemd unit"
+MEND = "reduce the load of this PC, use a real-time kernel (PREEMPT_RT), and start the guard with its systemd unit"
 
 
 def measure_latency(
@@ -27,7 +27,7 @@ def measure_latency(
     now_s: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], object] = time.sleep,
 ) -> dict[str, Any]:
-    """Sleep until each SYNC period for ``seconds``, with the guard's priority where this user may; return how late."""
+    """Sleep until each SYNC period for ``seconds``, with the guard's priority if permitted; return the latencies."""
     period_s, measured, over = config.machine.sync_period_s, Lateness(), 0
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     scheduling = prioritise(CYCLE)
@@ -40,7 +40,7 @@ def measure_latency(
             late_s = now_s() - due_s
             measured.add(late_s)
             over += late_s > period_s
-            due_s += period_s * (1 + int(max(0.0, late_s) / period_s))  # what was slept through is not caught up with
+            due_s += period_s * (1 + int(max(0.0, late_s) / period_s))  # missed periods are skipped
     finally:
         gc.enable()
         os.sched_setscheduler(0, *before)
@@ -65,7 +65,7 @@ def measure_latency(
 
 
 def keep_latency(config: MachineConfig, found: Mapping[str, Any]) -> Path:
-    """Keep a measurement in the store, for the acceptance report; StoreError."""
+    """Write a measurement to the store, for the acceptance report. Raises StoreError."""
     path = config.store.directory / FILE_NAME
     make_folder(path.parent)
     write_file(path, json.dumps(found, indent=2).encode())
@@ -73,7 +73,7 @@ def keep_latency(config: MachineConfig, found: Mapping[str, Any]) -> Path:
 
 
 def read_latency(config: MachineConfig) -> dict[str, Any] | None:
-    """Return the measurement that was kept last; None where there is none that can be read."""
+    """Return the latest stored measurement, or None if there is no readable one."""
     try:
         found = json.loads((config.store.directory / FILE_NAME).read_text("utf-8"))
         return found if found["schema"] == "fdhil-latency-1" else None
@@ -82,16 +82,16 @@ def read_latency(config: MachineConfig) -> dict[str, Any] | None:
 
 
 def latency_text(found: Mapping[str, Any]) -> str:
-    """Return a measurement in one sentence."""
+    """Return a measurement as text."""
     return (
-        f"of {found['turns']} wake-ups every {found['period_us'] / 1e3:g} ms half were at most "
-        f"{found['p50_us']:.0f} us late, 99.9 % {found['p999_us']:.0f} us, the worst {found['worst_us']} us; "
-        f"{found['late']} by more than a period ({found['scheduling']})"
+        f"{found['turns']} wake-ups every {found['period_us'] / 1e3:g} ms: median latency {found['p50_us']:.0f} us, "
+        f"99.9 % {found['p999_us']:.0f} us, worst {found['worst_us']} us; "
+        f"{found['late']} later than a period ({found['scheduling']})"
     )
 
 
 def histogram_lines(histogram_us: list[list[int | None]]) -> Iterator[str]:
-    """Yield a line for each class that was met."""
+    """Yield one line per non-empty class."""
     most = max(count or 0 for _, count in histogram_us) or 1
     for top, count in histogram_us:
         if count:
@@ -100,8 +100,8 @@ def histogram_lines(histogram_us: list[list[int | None]]) -> Iterator[str]:
 
 
 def examine_latency(found: Mapping[str, Any]) -> Iterator[Trouble]:
-    """Yield that this PC is too late for a correction: by the share above which the guard refuses to be armed."""
+    """Yield a problem if the share of late wake-ups exceeds the limit above which the guard refuses arming."""
     if found["late"] > MOST_LATE * found["turns"]:
-        what = f"this PC is late: {latency_text(found)}"
-        means = f"offsets leave late; with more than {MOST_LATE:.1%} of them late the guard refuses to be armed"
+        what = f"this PC is too slow: {latency_text(found)}"
+        means = f"offsets are sent late; above {MOST_LATE:.1%} late offsets the guard refuses arming"
         yield Trouble("PcLate", "processors", what, means, MEND)

@@ -1,4 +1,4 @@
-"""Examines what the works offers: what waits for the operator, and what keeps it from being looked at."""
+"""Examines proposed configuration changes: pending ones, and unreadable ones."""
 
 import os
 from collections.abc import Iterator
@@ -9,29 +9,28 @@ from fdhil.errors import StoreError
 from fdhil.store.offers import lying, waiting
 
 PLACE = "offers"
-MEANS = "what the works offers cannot be looked at or accepted; the machine goes on as it is"
+MEANS = "proposed changes cannot be shown or accepted; the machine keeps its configuration"
 
 
 def examine_offers(config: MachineConfig) -> Iterator[Trouble]:
-    """Tell of offers that nobody answered, or can read; nothing where no works is trusted."""
+    """Report unanswered and unreadable proposed changes, if [offers] trusts a key."""
     if not config.offers.trust:
         return
     folder = config.offers_directory
     if folder.exists() and not os.access(folder, os.R_OK | os.X_OK):
-        mend = "give this user the right to read it, or correct [offers] directory"
+        mend = "give this user read permission, or correct [offers] directory"
         yield Trouble("OffersUnread", PLACE, f"{folder} cannot be read", MEANS, mend)
         return
     for path in lying(folder):
         if not os.access(path, os.R_OK):
-            mend = "give this user the right to read it"
+            mend = "give this user read permission"
             yield Trouble("OffersUnread", PLACE, f"{path} cannot be read", MEANS, mend)
     try:
         offers = waiting(folder, config.store.directory)
     except StoreError as error:
-        what, _, mend = str(error).partition("; ")
-        yield Trouble("OffersUnread", PLACE, what, MEANS, mend)
+        yield Trouble.create_from_error("OffersUnread", PLACE, error, MEANS)
         return
     for offer in offers:
-        means = "nothing is changed until somebody answers, and the works waits for it"
-        mend = "look with fdhil offers list, then accept or reject it"
-        yield Trouble("OfferWaits", PLACE, f"the works offers a change: {offer}", means, mend, False)
+        means = "nothing changes until an operator answers"
+        mend = "show it with fdhil offers list, then accept or reject it"
+        yield Trouble("OfferWaits", PLACE, f"a configuration change is proposed: {offer}", means, mend, False)

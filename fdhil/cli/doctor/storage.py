@@ -1,4 +1,4 @@
-"""Examines the store and what must be kept secret: folders, rights, free space, history, records, token."""
+"""Examines the store and its secrets: folders, permissions, free space, history, records, token."""
 
 import os
 import shutil
@@ -15,33 +15,35 @@ from fdhil.guard.protocol import SOCKET_NAME
 from fdhil.store.history import History
 
 LEAST_FREE_BYTES = 256 << 20
-WINDOW_BYTES = 100_000  # of one recorded rapid, about
+WINDOW_BYTES = 100_000  # approximate size of one recorded rapid
 LONGEST_SOCKET_PATH = 107  # sun_path without its closing zero
 RECORD_BAD = "RecordBad"
 COMMISSION = "run `fdhil commission`"
 
 
 def examine_store(config: MachineConfig) -> Iterator[Trouble]:
-    """Tell whether what is recorded can be kept: the folder, its rights, the disk, the history in it."""
+    """Examine folder, permissions, disk and history of the store."""
     folder = config.store.directory
     base = next(place for place in (folder, *folder.absolute().parents) if place.exists())
-    means = "nothing that is measured is kept, and nothing can be armed"
+    means = "measurements are not stored, and nothing can be armed"
     if not base.is_dir():
-        what, mend = f"{base} is a file where [store] wants a folder", "move it away or correct [store] directory"
+        what, mend = f"{base} is a file; [store] needs a folder", "move it away or correct [store] directory"
         yield Trouble("StoreNoFolder", "store", what, means, mend)
         return
     if not may_write(base):
-        mend = f"give this user ({_user()}) the right to write there, or correct [store] directory"
-        yield Trouble("StoreReadOnly", "store", f"{base} may not be written", means, mend)
+        mend = (
+            f"give this user ({os.environ.get('USER') or os.getuid()}) write permission, or correct [store] directory"
+        )
+        yield Trouble("StoreReadOnly", "store", f"{base} is not writable", means, mend)
     free = shutil.disk_usage(base).free
     if free < LEAST_FREE_BYTES:
-        what = f"{free / 1e6:.0f} MB are free on the disk of {base}, which is {free // WINDOW_BYTES} rapids"
+        what = f"{free / 1e6:.0f} MB are free on the disk of {base}, enough for {free // WINDOW_BYTES} rapids"
         yield Trouble("DiskFull", "store", what, means, "free space, or lower keep_windows in [store]")
     yield from _history(folder)
 
 
 def may_write(folder: Path) -> bool:
-    """Return whether this user may make files in a folder."""
+    """Return whether this user can create files in a folder."""
     return os.access(folder, os.W_OK | os.X_OK)
 
 
@@ -51,24 +53,18 @@ def _history(folder: Path) -> Iterator[Trouble]:
             pass
     except StoreError as error:
         if error.code != "NoHistory":
-            what, _, mend = str(error).partition("; ")
-            yield Trouble(error.code, "store", what, "no parameter of before is known", mend)
-
-
-def _user() -> str:
-    return os.environ.get("USER") or str(os.getuid())
+            yield Trouble.create_from_error(error.code, "store", error, "earlier parameters are unavailable")
 
 
 def examine_secrets(config: MachineConfig) -> Iterator[Trouble]:
-    """Tell whether sockets, token and records are there, and whether only those read them who may."""
+    """Examine sockets, token and records: presence and permissions."""
     for folder in dict.fromkeys((config.run_directory, config.guard_directory)):
         yield from _run_directory(folder)
     if (config.run_directory / TOKEN_NAME).is_symlink() or (config.run_directory / TOKEN_NAME).exists():
         try:
             read_token(config.run_directory)
         except DeviceError as error:
-            what, _, mend = str(error).partition("; ")
-            yield Trouble("TokenOpen", "token", what, "nothing can be armed", mend)
+            yield Trouble.create_from_error("TokenOpen", "token", error, "nothing can be armed")
     for name, axis in config.axis.items():
         if axis.correction is not None:
             yield from _record(config, name)
@@ -77,16 +73,15 @@ def examine_secrets(config: MachineConfig) -> Iterator[Trouble]:
 def _run_directory(folder: Path) -> Iterator[Trouble]:
     path = str((folder / SOCKET_NAME).absolute())
     if len(os.fsencode(path)) > LONGEST_SOCKET_PATH:
-        what = f"{path} is too long a name for a socket ({len(path)} letters, {LONGEST_SOCKET_PATH} are possible)"
-        mend = "give [store] run_directory a shorter one, such as /run/fdhil"
-        yield Trouble("SocketPathLong", "sockets", what, "neither daemon nor guard can be asked", mend)
+        what = f"{path} is too long for a socket ({len(path)} characters, at most {LONGEST_SOCKET_PATH})"
+        mend = "choose a shorter [store] run_directory, such as /run/fdhil"
+        yield Trouble("SocketPathLong", "sockets", what, "neither daemon nor guard can be contacted", mend)
     try:
         check_rights(folder)
     except DeviceError as error:
-        what, _, mend = str(error).partition("; ")
-        yield Trouble("RunDirectoryOpen", "sockets", what, "commands may reach another than fdhil", mend)
+        yield Trouble.create_from_error("RunDirectoryOpen", "sockets", error, "commands may reach a foreign program")
     except OSError:
-        pass  # it cannot be looked at: who wants to use it tells why
+        pass  # unreadable; programs that use it report the reason
 
 
 def _record(config: MachineConfig, axis: str) -> Iterator[Trouble]:
@@ -95,12 +90,11 @@ def _record(config: MachineConfig, axis: str) -> Iterator[Trouble]:
     try:
         record = load_record(directory, axis, config.store.commissioning_key, may_lack_key=True)
     except StoreError as error:
-        what, _, mend = str(error).partition("; ")
-        yield Trouble(RECORD_BAD, place, what, means, mend)
+        yield Trouble.create_from_error(RECORD_BAD, place, error, means)
         return
     if record is None:
         mend = f"{COMMISSION} with the NC off and the axis free to move"
-        yield Trouble("NotCommissioned", place, "it has [correction], and was not commissioned", means, mend, False)
+        yield Trouble("NotCommissioned", place, "it has [correction], but is not commissioned", means, mend, False)
     elif is_void(directory, axis):
-        what = "something was seen that speaks against its commissioning record"
-        yield Trouble("RecordVoid", place, what, means, "run `fdhil check` with the NC off: it compares the drive")
+        what = "its commissioning record became doubtful"
+        yield Trouble("RecordVoid", place, what, means, "run `fdhil check` with the NC off, which compares the drive")

@@ -1,13 +1,14 @@
-"""Names one thing that is wrong with a machine's PC, and what mends it."""
+"""A problem found by ``fdhil doctor``."""
 
 from dataclasses import dataclass
+from typing import Self
 
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
-    """What is wrong at ``place``, what it means for the machine, and what mends it; ``code`` is its class.
+    """A problem at ``place``: cause, effect on the machine, and fix; ``code`` is its class.
 
-    ``grave``: fdhil, or what was asked of it, does not work until it is mended; else it works worse than it could.
+    ``grave``: a function fails until it is fixed; otherwise it only works worse than possible.
     """
 
     code: str
@@ -16,3 +17,9 @@ class Trouble:
     means: str
     mend: str
     grave: bool = True
+
+    @classmethod
+    def create_from_error(cls, code: str, place: str, error: Exception, means: str, grave: bool = True) -> Self:
+        """Return the problem that an error states, whose sentence has cause and fix, separated by a semicolon."""
+        what, _, mend = str(error).partition("; ")
+        return cls(code, place, what, means, mend, grave)

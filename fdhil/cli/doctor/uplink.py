@@ -1,4 +1,4 @@
-"""Examines what goes to the works: how much waits, where it is noted how far it is, the server; nothing is sent."""
+"""Examines the uplink to the fleet server: outbox, position file, credentials, server. Sends nothing."""
 
 import json
 import os
@@ -17,13 +17,13 @@ from fdhil.errors import ConnectError, StoreError
 from fdhil.store.outbox import POSITION_FILE, OutboxReader, Position, read_position
 
 PLACE = "uplink"
-LONGEST_WAIT_S = 3600.0  # that is usual
+LONGEST_WAIT_S = 3600.0  # usual at most
 CALL_S = 3.0
 LARGEST_GREETING = 1 << 16  # bytes
 
 
 def examine_uplink(config: MachineConfig, offline: bool) -> Iterator[Trouble]:
-    """Tell what keeps the machine's records from the works; nothing where there is no [uplink]."""
+    """Report what prevents the transfer of records to the fleet server, if there is an [uplink]."""
     if config.uplink is None:
         return
     yield from _folder(config)
@@ -33,8 +33,7 @@ def examine_uplink(config: MachineConfig, offline: bool) -> Iterator[Trouble]:
         password_of(config.uplink, "NATS server", "uplink")
         secret_in(config.uplink.credentials_file, "NATS server", "[uplink] credentials_file")
     except ConnectError as error:
-        what, _, mend = str(error).partition("; ")
-        yield Trouble("UplinkCredentials", PLACE, what, "nothing is sent", mend)
+        yield Trouble.create_from_error("UplinkCredentials", PLACE, error, "nothing is sent")
     if not offline:
         yield from _server(config.uplink)
 
@@ -43,12 +42,12 @@ def _folder(config: MachineConfig) -> Iterator[Trouble]:
     folder = config.uplink_directory
     base = next(place for place in (folder, *folder.absolute().parents) if place.exists())
     if not base.is_dir() or (not may_write(base) and base.stat().st_uid == os.getuid()):
-        mend = "give the user of fdhil uplink the right to write there, or correct [uplink] directory"
-        yield Trouble("UplinkFolder", PLACE, f"{base} may not be written", "nothing is sent", mend)
+        mend = "give the user of fdhil uplink write permission, or correct [uplink] directory"
+        yield Trouble("UplinkFolder", PLACE, f"{base} is not writable", "nothing is sent", mend)
     elif (folder / POSITION_FILE).exists() and read_position(folder) == Position():
         what = f"{folder / POSITION_FILE} cannot be read, or is damaged"
-        means = "all that is still in the outbox is sent again, and known again; none is let go meanwhile"
-        yield Trouble("UplinkPosition", PLACE, what, means, "restart fdhil uplink, which writes it anew", False)
+        means = "the whole outbox is sent again; the server recognises duplicates; nothing is deleted meanwhile"
+        yield Trouble("UplinkPosition", PLACE, what, means, "restart fdhil uplink, which rewrites it", False)
 
 
 def _outbox(config: MachineConfig) -> Iterator[Trouble]:
@@ -58,31 +57,31 @@ def _outbox(config: MachineConfig) -> Iterator[Trouble]:
             waiting, first = reader.waiting(position.entry), reader.entries(position.entry, 1)
             dropped = reader.dropped
     except StoreError as error:
-        if error.code in ("SchemaVersion", "OlderCopy"):  # of a damaged one the store's own trouble tells
+        if error.code in ("SchemaVersion", "OlderCopy"):  # a damaged one is reported for the store
             what, _, mend = str(error).partition(": ")
             yield Trouble("UplinkOutbox", PLACE, what, "nothing is sent", mend)
         return
     since_s = first[0].row.get("wall_s", 0.0) if first else time.time()
     if time.time() - since_s > LONGEST_WAIT_S:
-        what = f"{waiting} records wait, the oldest since {datetime.fromtimestamp(since_s):%Y-%m-%d %H:%M}"
-        mend = "look whether fdhil uplink runs (systemctl status fdhil-uplink), and at its log"
-        yield Trouble("UplinkWaits", PLACE, what, "the works does not see them; the machine keeps them", mend)
+        what = f"{waiting} records are unsent, the oldest since {datetime.fromtimestamp(since_s):%Y-%m-%d %H:%M}"
+        mend = "check that fdhil uplink runs (systemctl status fdhil-uplink), and its log"
+        yield Trouble("UplinkWaits", PLACE, what, "the fleet server does not have them; the machine keeps them", mend)
     if dropped:
-        means = "the works will not see them, and counts them as missing; the machine's history has them"
-        mend = "raise keep_unsent in [uplink] where the server is away for longer"
-        what = f"{dropped} records were let go unsent, as more than keep_unsent waited"
+        means = "the fleet server will never get them and counts them as missing; the machine's history has them"
+        mend = "raise keep_unsent in [uplink] if the server is often unreachable for long"
+        what = f"{dropped} records were deleted unsent, because the outbox exceeded keep_unsent"
         yield Trouble("UplinkDropped", PLACE, what, means, mend, False)
 
 
 def _server(settings: Uplink) -> Iterator[Trouble]:
-    """Tell where nobody answers as a NATS server with JetStream does; it speaks first, and nothing is sent."""
+    # a NATS server speaks first, so nothing is sent
     for server in settings.servers:
-        means = "nothing is sent by it" + ("; what is recorded waits" if len(settings.servers) == 1 else "")
+        means = "nothing is sent through it" + ("; records stay in the outbox" if len(settings.servers) == 1 else "")
         try:
             greeting = _greeting(server)
         except (OSError, ValueError) as error:
             what = f"{server} does not answer as a NATS server: {error}"
-            mend = "check server in [uplink], the network, and whether it runs"
+            mend = "check server in [uplink], the network, and that the server runs"
             yield Trouble("UplinkServer", PLACE, what, means, mend)
             continue
         if not greeting.get("jetstream"):
@@ -91,12 +90,11 @@ def _server(settings: Uplink) -> Iterator[Trouble]:
 
 
 def _greeting(server: str) -> dict[str, object]:
-    """Return what a server says of itself to whoever comes; OSError, ValueError."""
     place = urlsplit(server)
     address = (place.hostname or "", place.port or 4222)
     with socket.create_connection(address, CALL_S) as caller, caller.makefile("rb") as words:
         line = words.readline(LARGEST_GREETING)
     if not line.startswith(b"INFO "):
-        raise ValueError("it says nothing of the kind")
-    told = json.loads(line[5:])
-    return told if isinstance(told, dict) else {}
+        raise ValueError("it does not send a NATS greeting")
+    greeting = json.loads(line[5:])
+    return greeting if isinstance(greeting, dict) else {}

@@ -1,4 +1,4 @@
-"""fdhil paper: every equation, figure and claim of the paper, put to trials on simulated machines."""
+"""``fdhil paper``: test every equation, figure and claim of the reference paper on simulated machines."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ RUNS = 50
 
 @click.command()
 @click.option("--out", type=FOLDER, required=True,
-              help="Folder for paper.html, paper.json and the pictures.")  # fmt: skip
+              help="Folder for paper.html, paper.json and pictures.")  # fmt: skip
 @click.option("--runs", type=click.IntRange(2, 10_000), default=RUNS, show_default=True,
-              help="Noisy recordings behind each error of an estimator.")  # fmt: skip
-@click.option("--pdf", is_flag=True, help="Print the page as paper.pdf, too (needs chromium).")
+              help="Number of noisy recordings per estimator and noise level.")  # fmt: skip
+@click.option("--pdf", is_flag=True, help="Write the page as paper.pdf as well (needs chromium).")
 @AS_JSON
 def paper(out: Path, runs: int, pdf: bool, as_json: bool) -> None:
-    """Reproduce the paper that fdhil goes back to, claim by claim.
+    """Test the claims of the paper behind fdhil on simulated machines.
 
-    Each claim is put to trials in simulated scenarios, which are configs/paper.toml with a few keys changed: it holds,
-    holds with a condition, or is not reproduced. Nothing is sent anywhere. It takes about half a minute.
+    Each claim is tested in several scenarios, variations of configs/paper.toml. It holds, holds with a condition, or is
+    not reproduced. Runs only simulations, for about half a minute.
     """
     from importlib.metadata import version
 
@@ -42,32 +42,32 @@ def paper(out: Path, runs: int, pdf: bool, as_json: bool) -> None:
 
     require()
     if pdf:
-        find_browser()  # before the work
+        find_browser()  # before the computation
     _make(out)
     with stopping_in_order():
         claims = gather(runs, lambda text: click.echo(text, err=True) if sys.stderr.isatty() or not as_json else None)
         files = write_pictures(claims, out)
-        told = document(claims, runs, version("fdhil"), files)
+        result = document(claims, runs, version("fdhil"), files)
         deliver(page(claims), out / "paper.html", out / "paper.pdf" if pdf else None)
     with open_output(out / "paper.json") as file:
-        file.write(json.dumps(told, indent=1, ensure_ascii=False).encode())
+        file.write(json.dumps(result, indent=1, ensure_ascii=False).encode())
     if as_json:
-        click.echo(json.dumps(told))
+        click.echo(json.dumps(result))
     else:
         _table(claims, out / "paper.html")
 
 
 def gather(runs: int, say: Callable[[str], object]) -> list[Claim]:
-    """Put all claims to their trials, in the order of the paper; ``say`` hears what is being done."""
+    """Evaluate all claims in the order of the paper; ``say`` receives the progress."""
     from fdhil.cli.paper import concluding, correcting, estimating, measuring, predicting
 
     say(f"identifying one rapid {runs} times by every method")
     found = estimating.claims(runs)
     say("measuring the machine, cold and warm")
     found += measuring.claims()
-    say("cutting the path in every scenario")
+    say("simulating the path in every scenario")
     structure, *predicted = predicting.claims()
-    say("correcting it")
+    say("simulating the corrected path")
     corrected = correcting.claims()
     return [structure, *found, *predicted, *corrected, *concluding.claims([*predicted, *corrected])]
 
@@ -76,7 +76,7 @@ def _make(out: Path) -> None:
     try:
         (out / "pictures").mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"the folder {out} cannot be made: {error.strerror}; choose another --out") from None
+        raise OutputError(f"the folder {out} cannot be created: {error.strerror}; choose another --out") from None
 
 
 def _table(claims: list[Claim], report: Path) -> None:
@@ -92,6 +92,6 @@ def _table(claims: list[Claim], report: Path) -> None:
     for row in summary_rows(claims):
         table.add_row(*row)
     console.print(table)
-    told = ", ".join(f"{number} {verdict}" for verdict, number in counts(claims).items())
-    console.print(f"{told}.")
+    summary = ", ".join(f"{number} {verdict}" for verdict, number in counts(claims).items())
+    console.print(f"{summary}.")
     console.print(f"wrote {report}", soft_wrap=True)

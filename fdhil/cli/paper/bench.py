@@ -1,4 +1,4 @@
-"""The machine that is measured: the twin's physics, which shares no numerics with the model that predicts it."""
+"""The measured machine: physics of the simulator, which shares no numerics with the prediction model."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SMOOTHED_ROWS = 20
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
-    """What a drive may have that the paper's model has not: a load, a ripple of it (N.m), a dead band (um)."""
+    """Effects outside the paper's model: load and load ripple (N.m), dead band (um)."""
 
     load_nm: float = 0.0
     ripple_nm: float = 0.0
@@ -32,7 +32,7 @@ class Trouble:
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """A rapid: how far, how fast, and how hard it accelerates."""
+    """A rapid move: distance, speed and acceleration."""
 
     distance_mm: float
     speed_mm_s: float
@@ -40,18 +40,18 @@ class Move:
 
     @staticmethod
     def measured(speed_share: float = 1.0) -> Move:
-        """Return that of figure 4, or a slower one."""
+        """Return the rapid of figure 4, or a slower one."""
         axis = machine().axis["X"]
         return Move(STROKE_MM, speed_share * axis.rapid_speed_mm_s, axis.max_acceleration_mm_s2)
 
 
 QUICK = Move(400.0, 500.0, 4000.0)
-"""The rapid of a quicker machine: more than twice as fast, and ten times the acceleration."""
+"""Rapid of a faster machine: more than twice the speed and ten times the acceleration."""
 
 
 @dataclass(frozen=True, slots=True)
 class Signals:
-    """What is recorded, (n,) each: mean voltage of each cycle; current, speed and table at its begin."""
+    """Recorded signals, (n,) each: mean voltage of each cycle; current, speed and table position at its start."""
 
     voltage_v: Float
     current_a: Float
@@ -60,12 +60,14 @@ class Signals:
 
 
 def plant(axis: str = "X", celsius: float = COLD_C) -> Parameters:
-    """Return the measured machine's parameters at a temperature of its slide-ways."""
+    """Return the true parameters of the measured machine at a slide-way temperature."""
     config = machine()
-    told = config.sim.axis[axis]
+    settings = config.sim.axis[axis]
     rise = celsius - config.sim.thermal.ambient_c
-    base = true_parameters(config.axis[axis].nominal, told)
-    return base.changed(ft=base.ft * (1 + told.ft_per_kelvin * rise), Cd=base.Cd * (1 + told.Cd_per_kelvin * rise))
+    base = true_parameters(config.axis[axis].nominal, settings)
+    return base.changed(
+        ft=base.ft * (1 + settings.ft_per_kelvin * rise), Cd=base.Cd * (1 + settings.Cd_per_kelvin * rise)
+    )
 
 
 def run(
@@ -76,7 +78,7 @@ def run(
     load_nm: Float | None = None,
     trouble: Trouble = Trouble(),
 ) -> Signals:
-    """Run a drive along a demand (n,), which it gets in whole increments as over a bus, under a load (n,) or none."""
+    """Simulate a drive on a demand (n,) in whole increments, as on a bus, with an optional load (n,)."""
     mm_per_rad = axis.screw_pitch_mm / (2 * math.pi)
     per_rev = axis.drive.increments_per_rev
     counts = np.rint(demand_mm * per_rev / axis.screw_pitch_mm)
@@ -97,7 +99,7 @@ def run(
 
 
 def stroke(move: Move, period_s: float, strokes: int = 1) -> Float:
-    """Return the demand (n,) mm of rapids to and fro: trapezoids of speed, rounded over 20 ms."""
+    """Return the demand (n,), mm, of rapids back and forward: speed trapezoids, smoothed over 20 ms."""
     ramp_s = move.speed_mm_s / move.acceleration_mm_s2
     duration_s = move.distance_mm / move.speed_mm_s + ramp_s
     t = np.arange(0.0, duration_s + REST_S, period_s)
@@ -116,7 +118,7 @@ def rapid(
     strokes: int = 1,
     move: Move | None = None,
 ) -> Recording:
-    """Record rapids of the measured machine's X axis, without noise; ``move`` is left out for those of figure 4."""
+    """Record rapids of the measured machine's X axis without noise (default: those of figure 4)."""
     config = machine()
     move = move or Move.measured()
     axis, period_s = config.axis["X"], config.machine.sync_period_s
@@ -139,7 +141,7 @@ def rapid(
 
 
 def noisy(recording: Recording, share: float, seed: int) -> list[Window]:
-    """Return the rapids of a recording with white noise, a ``share`` of the full scale on each signal."""
+    """Return the rapids of a recording with white noise of ``share`` times the full scale on each signal."""
     assert recording.voltage_v is not None
     scatter = share * FULL_SCALE * np.random.default_rng(seed).standard_normal((3, recording.time_s.size))
     return find_windows(

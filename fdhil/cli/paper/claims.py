@@ -1,20 +1,24 @@
-"""States the paper's claims as trials, and judges them by one rule.
+"""Claims of the paper as trials, with the rule of their verdicts.
 
-A trial is a number that has to lie within bounds in a scenario. A scenario shows a claim when all its trials lie
-within theirs. A claim that all its scenarios show holds; one that some show holds with a condition; the rest is not
-reproduced. Nothing else decides, and no verdict is written down anywhere.
+A trial is a number that must lie within bounds in a scenario. A scenario shows a claim if all its trials do. A claim
+holds if all its scenarios show it, holds with a condition if some do, and is otherwise not reproduced. Nothing else
+decides, and no verdict is stored. ``claims.toml`` has the texts of the claims.
 """
 
 import math
-from collections.abc import Sequence
+import tomllib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from functools import cache
+from importlib.resources import files
+from typing import Any
 
 from fdhil.report import Table
 
 
 class Verdict(Enum):
-    """What became of a claim."""
+    """Verdict on a claim."""
 
     HOLDS = "holds"
     CONDITION = "holds with a condition"
@@ -23,7 +27,7 @@ class Verdict(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A measured ``value`` that has to lie from ``least`` to ``most`` in a scenario; a nan lies nowhere."""
+    """A measured ``value`` that must lie between ``least`` and ``most`` in a scenario; nan never does."""
 
     scenario: str
     what: str
@@ -39,7 +43,7 @@ class Trial:
 
     @property
     def bounds(self) -> str:
-        """The bounds in words."""
+        """The bounds as text."""
         if math.isinf(self.most):
             return f"at least {self.least:g}"
         if math.isinf(self.least):
@@ -49,7 +53,7 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A drawing as inline SVG with a caption that stands alone."""
+    """A drawing as inline SVG with a self-contained caption."""
 
     caption: str
     svg: str
@@ -57,9 +61,9 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """What the paper says in one place, what it measured there, and the trials that it is put to.
+    """A statement of the paper, the paper's own value, and the trials that test it.
 
-    ``kind`` is equation, figure or claim; ``source`` is the place in the paper; ``note`` says what the trials cannot.
+    ``kind`` is equation, figure or claim; ``source`` is the place in the paper; ``note`` explains limits of the trials.
     """
 
     key: str
@@ -76,11 +80,11 @@ class Claim:
 
     @property
     def scenarios(self) -> tuple[str, ...]:
-        """The scenarios of the trials, each once."""
+        """The distinct scenarios of the trials."""
         return tuple(dict.fromkeys(trial.scenario for trial in self.trials))
 
     def shown_by(self, scenario: str) -> bool:
-        """Whether all trials of a scenario hold."""
+        """Return whether all trials of a scenario hold."""
         return all(trial.holds for trial in self.trials if trial.scenario == scenario)
 
     @property
@@ -99,3 +103,20 @@ class Claim:
         where = [scenario for scenario in self.scenarios if self.shown_by(scenario)]
         rest = [scenario for scenario in self.scenarios if scenario not in where]
         return f"in {', '.join(where)}; not in {', '.join(rest)}"
+
+
+@cache
+def _read_texts() -> Mapping[str, Mapping[str, str]]:
+    return tomllib.loads(files("fdhil.cli.paper").joinpath("claims.toml").read_text("utf-8"))
+
+
+def make_claim(
+    key: str,
+    trials: Sequence[Trial],
+    pictures: Sequence[Picture] = (),
+    tables: Sequence[Table] = (),
+    **values: Any,
+) -> Claim:
+    """Return a claim with its texts from ``claims.toml``, in which ``values`` replace the placeholders."""
+    texts = {name: text.format(**values) for name, text in _read_texts()[key].items()}
+    return Claim(key=key, trials=trials, pictures=pictures, tables=tables, **texts)

@@ -1,4 +1,4 @@
-"""The paper's conclusion: what it left to study, what the calculus takes, and whether one machine shows it all."""
+"""Claims of the conclusion: open questions, computing time, and all effects on one machine."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from fdhil.cli.paper import paths
-from fdhil.cli.paper.claims import Claim, Trial
+from fdhil.cli.paper.claims import Claim, Trial, make_claim
 from fdhil.cli.paper.scenarios import DEMANDED, machine
 from fdhil.correction import flatness
 from fdhil.prediction import predict
@@ -17,11 +17,11 @@ from fdhil.report import Table
 
 SEEN = ("figure-11", "figure-11-size", "figure-12", "figure-13", "figure-14", "figure-15", "figure-17",
         "figure-17-worse", "figure-18", "claim-d", "claim-f", "figure-20", "figure-20-oscillation")  # fmt: skip
-"""What the paper saw on its path."""
+"""Claims about the path."""
 
 
 def claims(others: Sequence[Claim]) -> list[Claim]:
-    """Return the claims of the conclusion; those of ``others`` that are on the path are counted."""
+    """Evaluate the claims of the conclusion; the last one counts those of ``others`` about the path."""
     return [_flat(), _stop(), _on_line(), _all_at_once(others)]
 
 
@@ -30,15 +30,7 @@ def _flat() -> Claim:
     for name in DEMANDED:
         mirror, flat = (paths.rms_um(name, paths.corrected(name, method)) for method in ("mirror", "flatness"))
         trials.append(Trial(name, "RMS error of the mirror over that of flatness", mirror / flat, "x", least=2.0))
-    return Claim(
-        key="conclusion-flat", title="flatness corrects better",
-        kind="claim", source="Conclusion, after [ROT 99]",
-        says="Flat systems could provide interesting performances; the oscillations are to be reduced.",
-        paper="not tried",
-        rule="a feed-forward by flatness leaves at most half of what the mirror leaves (RMS)",
-        trials=trials,
-        note="After a sharp corner the drive is at its limits, and nothing helps but a lower feed or a smoother NC.",
-    )  # fmt: skip
+    return make_claim("conclusion-flat", trials)
 
 
 def _stop() -> Claim:
@@ -49,15 +41,7 @@ def _stop() -> Claim:
         seconds = min(_seconds(partial(predict, reference, models, config)) for _ in range(3))
         share = 100.0 * seconds / float(reference.time_s[-1])
         trials.append(Trial(name, "time to predict, of the time to cut", share, "%", least=100.0))
-    return Claim(
-        key="conclusion-stop", title="the calculus takes a stop",
-        kind="claim", source="Conclusion",
-        says="The calculus of the predicted errors requires to stop the operation for a while.",
-        paper="no figures are given (1999)",
-        rule="to predict takes longer than to cut",
-        trials=trials,
-        note="Measured on this computer. The claim was true of its time.",
-    )  # fmt: skip
+    return make_claim("conclusion-stop", trials)
 
 
 def _seconds(work: Callable[[], Prediction]) -> float:
@@ -78,14 +62,7 @@ def _on_line() -> Claim:
         first = min((int(rows[0]) for rows in same if rows.size), default=middle)
         seconds = (middle - first) * reference.dt_s
         trials.append(Trial(name, "look-ahead of the feed-forward", 1e3 * seconds, "ms", most=100.0))
-    return Claim(
-        key="conclusion-on-line", title="an on-line technique",
-        kind="claim", source="Conclusion",
-        says="To avoid the stop, an on-line technique is to be studied.",
-        paper="not tried",
-        rule="a correction by flatness knows at most 0.1 s of the path ahead",
-        trials=trials,
-    )  # fmt: skip
+    return make_claim("conclusion-on-line", trials)
 
 
 def _all_at_once(found: Sequence[Claim]) -> Claim:
@@ -100,14 +77,4 @@ def _all_at_once(found: Sequence[Claim]) -> Claim:
         [name, *("yes" if claim.shown_by(name) else "no" for claim in saw), str(sum(c.shown_by(name) for c in saw))]
         for name in DEMANDED
     ]
-    return Claim(
-        key="all-at-once",
-        title="one machine shows it all",
-        kind="claim",
-        source="Sections 5.3 and 6 together",
-        says="One machine showed all of the path's figures.",
-        paper="one simulator",
-        rule="one scenario shows them all",
-        trials=trials,
-        tables=[Table(("scenario", *(claim.key for claim in saw), "shown"), rows)],
-    )
+    return make_claim("all-at-once", trials, tables=[Table(("scenario", *(claim.key for claim in saw), "shown"), rows)])

@@ -1,9 +1,9 @@
-"""Section 6 of the paper: equations [9] and [11], the mirror, and figures 16 to 20."""
+"""Claims of section 6: equations [9] and [11], the mirror correction, figures 16 to 20."""
 
 import numpy as np
 
 from fdhil.cli.paper import drawings, paths
-from fdhil.cli.paper.claims import Claim, Picture, Trial
+from fdhil.cli.paper.claims import Claim, Picture, Trial, make_claim
 from fdhil.cli.paper.drawings import Traced, View
 from fdhil.cli.paper.paths import CORNERS, PLACES
 from fdhil.cli.paper.predicting import FEW_UM, linear_response
@@ -18,15 +18,15 @@ AROUND_MM = 20.0
 
 
 def claims() -> list[Claim]:
-    """Return the claims of section 6."""
+    """Evaluate the claims of section 6."""
     return [
         _linear(),
         _ideal(),
         _mirror(),
         _oscillates(),
         _worse(),
-        _straight("B", "figure-18", "Figure 18, section 6"),
-        _straight("F", "claim-f", "Section 6"),
+        _straight("B", "figure-18"),
+        _straight("F", "claim-f"),
         _arc(),
         _cutter_path(),
         _rounded(oscillation=False),
@@ -43,16 +43,7 @@ def _linear() -> Claim:
         half = linear_response(name, answer, {axis: 0.5 * values for axis, values in whole.items()})
         missed = max(100.0 * rms(2.0 * half[axis] - full[axis]) / rms(full[axis]) for axis in whole)
         trials.append(Trial(name, "twice the answer to half an offset, less that to all of it", missed, "%", most=5.0))
-    return Claim(
-        key="equation-9", title="the drive is a transfer function",
-        kind="equation", source="Equation [9], section 6",
-        says="The predicted positions follow from the reference by a transfer function: pp = Hr pr.",
-        paper="no figures are given",
-        rule="half an offset moves the table half as far, to 5 % (RMS)",
-        trials=trials,
-        note="Dry friction and the limits of current and voltage are in no transfer function; after a sharp corner the "
-             "limits rule.",
-    )  # fmt: skip
+    return make_claim("equation-9", trials)
 
 
 def _ideal() -> Claim:
@@ -60,18 +51,7 @@ def _ideal() -> Claim:
     for name in DEMANDED:
         before, after = (paths.rms_um(name, a) for a in (paths.predicted(name), paths.corrected(name, "inverse")))
         trials.append(Trial(name, "RMS left of the error", 100.0 * after / before, "%", most=10.0))
-    return Claim(
-        key="equation-11", title="the ideal correction",
-        kind="equation", source="Equation [11], section 6",
-        says="pr = Hr (pr - Hr^-1 e): with the inverse of Hr the table would follow the reference; it cannot be easily "
-             "calculated.",
-        paper="not tried",
-        rule="the inverse of the simulated loop, applied once, leaves at most 10 % (RMS) of the contour error",
-        trials=trials,
-        tables=[_methods_table()],
-        note="The inverse is that of the loop's answer to an impulse, regularised, without delay, up to 120 Hz. What "
-             "fdhil sends on a machine goes on from there, with friction and within limits.",
-    )  # fmt: skip
+    return make_claim("equation-11", trials, tables=[_methods_table()])
 
 
 def _methods_table() -> Table:
@@ -99,15 +79,7 @@ def _mirror() -> Claim:
                     "with the mirror": mirrored.error_um["Y"][rows],
                 }, "Y less reference (um)"),
             ))  # fmt: skip
-    return Claim(
-        key="figure-16", title="the mirror makes the error smaller",
-        kind="figure", source="Figure 16, section 6",
-        says="With Hr^-1 ~ 1 the correction becomes a mirror: the predicted errors are subtracted from the reference.",
-        paper="a scheme; \"quite good results for smooth trajectories\"",
-        rule="the mirror makes the contour error of the whole path smaller (RMS)",
-        trials=trials, pictures=pictures,
-        tables=[_places_table()],
-    )  # fmt: skip
+    return make_claim("figure-16", trials, pictures=pictures, tables=[_places_table()])
 
 
 def _rows_after_a(answer: Prediction) -> tuple[int, int]:
@@ -127,7 +99,7 @@ def _places_table() -> Table:
 
 
 def turns(values: Float, least: float) -> int:
-    """Return how often a signal goes from above ``least`` to below ``-least`` or back."""
+    """Return the number of changes between above ``least`` and below ``-least``."""
     sides = np.sign(values) * (np.abs(values) > least)
     sides = sides[sides != 0]
     return int(np.count_nonzero(np.diff(sides)))
@@ -160,15 +132,7 @@ def _oscillates() -> Claim:
                 "stretched, as the paper's; below, the contour errors.",
                 _three(name, View((0.0, 25.0), 55.0, 4.0)),
             ))  # fmt: skip
-    return Claim(
-        key="figure-17", title="the mirror oscillates at A",
-        kind="figure", source="Figure 17, section 6",
-        says="With the mirror the position oscillates around the desired path in A.",
-        paper="Y 54.4 to 55.4 mm behind A: 0.6 mm at most",
-        rule="behind A the error in Y changes sides twice or more with the mirror, and more often than without",
-        trials=trials, pictures=pictures,
-        note="P, PI and PI with the bench's gains are damped too well to swing; a double PI is not.",
-    )  # fmt: skip
+    return make_claim("figure-17", trials, pictures=pictures)
 
 
 def _worse() -> Claim:
@@ -178,17 +142,10 @@ def _worse() -> Claim:
         for place in CORNERS:
             ratio = paths.largest_um(name, after, place) / paths.largest_um(name, before, place)
             trials.append(Trial(name, f"largest error at {place}, with over without", ratio, "x", least=1.0))
-    return Claim(
-        key="figure-17-worse", title="the mirror is worse in corners",
-        kind="figure", source="Figure 17, section 6",
-        says="In the areas A, C, E and G the correction generates more inaccuracy on the followed shape.",
-        paper="0.6 mm at most with, 0.15 to 0.2 mm without (Figure 11)",
-        rule="the largest error near each of the four is larger with the mirror than without",
-        trials=trials,
-    )  # fmt: skip
+    return make_claim("figure-17-worse", trials)
 
 
-def _straight(place: str, key: str, source: str) -> Claim:
+def _straight(place: str, key: str) -> Claim:
     trials, pictures = [], []
     for name in PATHS:
         after = paths.corrected(name, "mirror")
@@ -199,14 +156,7 @@ def _straight(place: str, key: str, source: str) -> Claim:
                 f"Path in area B without and with the mirror correction, 10 m/min, {PATHS[name].title}.",
                 _three(name, View((30.0, 75.0), 55.0, 1.0, fine=True)),
             ))  # fmt: skip
-    return Claim(
-        key=key, title=f"the mirror on the straight at {place}",
-        kind="figure" if place == "B" else "claim", source=source,
-        says=f"With the mirror the obtained path is only few micrometres from the desired one in {place}.",
-        paper="a few um" + ("; Y 54.996 to 55.001 mm" if place == "B" else ""),
-        rule=f"at most {FEW_UM:g} um within 10 mm of {place}",
-        trials=trials, pictures=pictures,
-    )  # fmt: skip
+    return make_claim(key, trials, pictures, limit_um=FEW_UM)
 
 
 def _arc() -> Claim:
@@ -220,14 +170,7 @@ def _arc() -> Claim:
             Trial(name, "largest error at D, with the mirror", after, "um", 50.0, 90.0),
             Trial(name, "with over without", after / before, "x", most=1.0),
         ]
-    return Claim(
-        key="claim-d", title="the mirror in the arc at D",
-        kind="claim", source="Section 6",
-        says="In D the difference between obtained and desired path is 0.07 mm, compared to 0.08 mm and 0.13 mm.",
-        paper="80 and 130 um without, 70 um with the mirror",
-        rule="60 to 150 um without, 50 to 90 um with, and less with than without, 10 m/min",
-        trials=trials,
-    )  # fmt: skip
+    return make_claim("claim-d", trials)
 
 
 def _cutter_path() -> Claim:
@@ -239,22 +182,20 @@ def _cutter_path() -> Claim:
         gaps = [float(np.hypot(*(shape - point).T).min()) for point in centre[inside][::20]]
         worst = float(np.abs(np.array(gaps) - CUTTER_MM).max())
         trials.append(Trial(name, "farthest from 20 mm beside the shape", worst, "mm", most=0.1))
-    return Claim(
-        key="figure-19", title="the path of the cutter",
-        kind="figure", source="Figure 19, section 6",
-        says="The path of the centre of a 40 mm cutter round the shape, with arcs of 20 mm at A, C and E.",
-        paper="a figure",
-        rule="the demand runs 20 mm beside the shape, to 0.1 mm",
-        trials=trials,
-        pictures=[Picture(
-            "The path of the cutter's centre, 20 mm beside the shape that it cuts.",
-            drawings.shape(paths.reference("sharp-lag", "rounded").path_mm - [CUTTER_MM, 0.0], shape),
-        )],
-    )  # fmt: skip
+    return make_claim(
+        "figure-19",
+        trials,
+        pictures=[
+            Picture(
+                "The path of the cutter's centre, 20 mm beside the shape that it cuts.",
+                drawings.shape(paths.reference("sharp-lag", "rounded").path_mm - [CUTTER_MM, 0.0], shape),
+            )
+        ],
+    )
 
 
 def _beside(answer: Prediction) -> Float:
-    """Return how far the path is beside the reference around the end of the first arc, um, positive to the left."""
+    # lateral distance of the path from the reference at the end of the first arc, positive to the left
     reference = answer.reference.path_mm
     rows = np.flatnonzero(np.hypot(*(reference - ROUNDED_END).T) < AROUND_MM)
     error = paths.path_mm(answer) - reference
@@ -280,14 +221,4 @@ def _rounded(oscillation: bool) -> Claim:
                 f"{PATHS[name].title}.",
                 _three(name, View((5.0, 45.0), 75.0, 4.0), "rounded"),
             ))  # fmt: skip
-    return Claim(
-        key="figure-20-oscillation" if oscillation else "figure-20",
-        title="oscillation on the rounded path" if oscillation else "mean error on the rounded path",
-        kind="figure", source="Figure 20, section 6",
-        says="On the rounded path the oscillations with the correction are more important." if oscillation else
-             "On the rounded path the mean trajectory with the correction is far better than without.",
-        paper="Y 74.6 to 75.3 mm, on both sides of 75 with the correction",
-        rule="within 20 mm of the arc's end the error's standard deviation is larger with the mirror" if oscillation
-             else "within 20 mm of the arc's end the mean error is at least halved",
-        trials=trials, pictures=pictures,
-    )  # fmt: skip
+    return make_claim("figure-20-oscillation" if oscillation else "figure-20", trials, pictures)

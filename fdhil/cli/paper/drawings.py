@@ -1,4 +1,4 @@
-"""Draws what the report's figures do not have, in the same style: most of it as charts that the page makes live."""
+"""Figures of ``fdhil paper`` beyond those of the report, in the same style; most are interactive charts."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ BELOW_SHARE = 0.8  # of the panel above
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What is drawn of a place: from where to where in X (mm), and what is within ``band_mm`` of a level in Y (mm).
+    """Drawn range: an interval in X (mm) and ``band_mm`` around a level in Y (mm).
 
-    ``fine``: Y is shown in um from its level on.
+    ``fine``: Y is shown in um relative to the level.
     """
 
     x_mm: tuple[float, float]
@@ -28,23 +28,23 @@ class View:
     fine: bool = False
 
     def holds(self, path_mm: Float) -> Bool:
-        """Return the rows (n,) of a path that are drawn."""
+        """Return the drawn rows (n,) of a path."""
         x, y = path_mm.T
         return np.asarray((np.abs(y - self.level_mm) < self.band_mm) & (x >= self.x_mm[0]) & (x <= self.x_mm[1]))
 
     @property
     def y_label(self) -> str:
-        """What Y is."""
+        """Label of the Y axis."""
         return f"Y from {self.level_mm:g} mm on (um)" if self.fine else "Y (mm)"
 
     def shown(self, y_mm: Float) -> Float:
-        """Return Y (n,) as it is shown."""
+        """Return Y (n,) in the shown unit."""
         return 1e3 * (y_mm - self.level_mm) if self.fine else y_mm
 
 
 @dataclass(frozen=True, slots=True)
 class Traced:
-    """A path (n, 2) in mm and, where there is one, its distance (n,) in um from what it is compared with."""
+    """A path (n, 2), mm, with its optional distance (n,), um, from a reference path."""
 
     label: str
     path_mm: Float
@@ -52,9 +52,9 @@ class Traced:
 
 
 def place(traced: Sequence[Traced], view: View, below: str = "error (um)") -> str:
-    """A place of the path, axes stretched to what is there, and below it the distances, which no path would show.
+    """Draw paths at one location with stretched axes, and their distances from the reference below.
 
-    The first path is grey, the others are in colour. The caption says what is shown.
+    The first path is grey, the others are coloured.
     """
     paths, distances = [], []
     for k, (one, colour) in enumerate(zip(traced, (REFERENCE, *COLOURS), strict=False)):
@@ -68,7 +68,7 @@ def place(traced: Sequence[Traced], view: View, below: str = "error (um)") -> st
 
 
 def operators() -> str:
-    """Each derivative operator's response to a sine over that of the exact derivative, against frequency."""
+    """Draw the sine response of each derivative operator, relative to the exact derivative, over frequency."""
     share = np.linspace(1e-3, 0.5, 300)
     turned = 2j * np.pi * share
     traces = []
@@ -82,7 +82,7 @@ def operators() -> str:
 
 
 def over_bound(ratios: Float, labels: Sequence[str]) -> str:
-    """RMS error over the bound (methods, 6), a line of marks a method, on a logarithmic axis."""
+    """Draw the ratio of RMS error and bound (methods, 6), one line per method, on a logarithmic axis."""
     columns, rows = legend_rows(list(labels), WIDTH - 1.0)
     with drawing(WIDTH, 3.9, 0.2 * rows + 0.15) as made:
         for row, label, colour in zip(ratios, labels, COLOURS, strict=False):
@@ -99,7 +99,7 @@ def over_bound(ratios: Float, labels: Sequence[str]) -> str:
 
 
 def correlations(curves: Mapping[str, Float], bound: float) -> str:
-    """Normalised autocorrelations over the lags 1, 2, ... with the bounds within which they count as none."""
+    """Draw normalised autocorrelations over the lags 1, 2, ... with the bounds of whiteness."""
     traces = [
         Trace(label, np.arange(1.0, values.size + 1), values, colour)
         for (label, values), colour in zip(curves.items(), COLOURS, strict=False)
@@ -112,7 +112,7 @@ def correlations(curves: Mapping[str, Float], bound: float) -> str:
 def drift(
     symbol: str, unit: str, series: Mapping[str, tuple[Float, Float, Float]], printed: tuple[float, float]
 ) -> str:
-    """A parameter against temperature with 95 % bars, a panel a scenario, and the paper's course of it in grey."""
+    """Draw a parameter over temperature with 95 % bars, one panel per scenario, and the paper's values in grey."""
     panels = []
     for (label, (celsius, value, std)), colour in zip(series.items(), COLOURS, strict=False):
         half = INTERVAL_95 * std
@@ -124,7 +124,7 @@ def drift(
 
 
 def overlay(x: Float, x_label: str, y_label: str, both: Sequence[tuple[str, Float]]) -> str:
-    """Two curves above, the second less the first below."""
+    """Draw two curves and their difference below."""
     (first, one), (second, other) = both
     above = [Trace(first, x, one, REFERENCE, "wide"), Trace(second, x, other, COLOURS[1])]
     apart = Trace(f"{second} less {first}", x, other - one)
@@ -134,7 +134,7 @@ def overlay(x: Float, x_label: str, y_label: str, both: Sequence[tuple[str, Floa
 
 
 def axis_errors(time_s: Float, curves: Mapping[str, Float], label: str) -> str:
-    """Errors of one axis over time."""
+    """Draw the errors of one axis over time."""
     traces = [
         Trace(name, time_s, values, colour, "dashed" if name == "offset" else "line")
         for (name, values), colour in zip(curves.items(), COLOURS, strict=False)
@@ -144,7 +144,7 @@ def axis_errors(time_s: Float, curves: Mapping[str, Float], label: str) -> str:
 
 
 def shape(centre_mm: Float, shape_mm: Float) -> str:
-    """The path of a cutter's centre beside the shape that it cuts, both (n, 2) mm."""
+    """Draw the path of a cutter's centre and the cut shape, both (n, 2), mm."""
     with drawing(WIDTH, 3.2) as made:
         made.axes.plot(*shape_mm.T, color=REFERENCE, lw=1.2, label="shape")
         made.axes.plot(*centre_mm.T, color=COLOURS[0], label="centre of the cutter")

@@ -1,4 +1,4 @@
-"""Sections 2.1, 3 and 4 of the paper: figures 2 and 4 to 8, whiteness, backlash, and how fast the parameters move."""
+"""Claims of sections 2.1, 3 and 4: figures 2 and 4 to 8, whiteness, backlash, drift of the parameters."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import numpy as np
 
 from fdhil.cli.paper import bench, drawings
 from fdhil.cli.paper.bench import COLD_C, WARM_C, Move, Trouble
-from fdhil.cli.paper.claims import Claim, Picture, Trial
+from fdhil.cli.paper.claims import Claim, Picture, Trial, make_claim
 from fdhil.cli.paper.methods import vector
 from fdhil.cli.paper.scenarios import machine
 from fdhil.config import Identification
@@ -33,23 +33,23 @@ RIPPLE = Trouble(ripple_nm=1.0)
 
 @dataclass(frozen=True, slots=True)
 class Drift:
-    """What was identified at each of ``TEMPERATURES_C`` in one scenario."""
+    """Estimates at each of ``TEMPERATURES_C`` in one scenario."""
 
     estimates: Sequence[Estimate]
 
     def series(self, name: str) -> tuple[Float, Float, Float]:
-        """Return temperature, value and standard deviation (n,) each."""
+        """Return temperature, value and standard deviation, (n,) each."""
         values = np.array([estimate.value(name) for estimate in self.estimates])
         return np.array(TEMPERATURES_C), values, np.array([estimate.std(name) for estimate in self.estimates])
 
     def drop(self, name: str) -> tuple[float, float]:
-        """Return the fall from the coldest to the warmest, and its standard deviation."""
+        """Return the decrease from the coldest to the warmest, and its standard deviation."""
         _, values, std = self.series(name)
         return float(values[0] - values[-1]), float(np.hypot(std[0], std[-1]))
 
 
 def claims() -> list[Claim]:
-    """Return the claims of sections 2.1, 3.2 and 4."""
+    """Evaluate the claims of sections 2.1, 3.2 and 4."""
     drifts = _drifts()
     return [
         _constant(),
@@ -58,7 +58,7 @@ def claims() -> list[Claim]:
         _backlash(),
         _signals(),
         _torques(),
-        _drifted("ft", 6, (1.2e-3, 0.8e-3), drifts, "One rapid at one speed parts ft and Cd badly."),
+        _drifted("ft", 6, (1.2e-3, 0.8e-3), drifts),
         _drifted("Cd", 7, (2.4, 1.9), drifts),
         _behaviour(),
     ]
@@ -94,15 +94,7 @@ def _constant() -> Claim:
         celsius = COLD_C + (WARM_C - COLD_C) * (1.0 - np.exp(-seconds / time_constant_s))
         last = vector(bench.plant(celsius=float(celsius)))[4:] @ [RAPID_RAD_S, 1.0]
         trials.append(Trial(name, "change of the friction at 60 rad/s", 100.0 * float(1 - last / first), "%", most=5.0))
-    return Claim(
-        key="claim-constant", title="parameters are constant during a cut",
-        kind="claim", source="Section 2.1",
-        says="The drifts are not significant at the time scale of a machining operation: the parameters are constant "
-             "during a whole cutting operation.",
-        paper="2 K of the slide-ways; the time they took is not given",
-        rule="the friction torque at rapid speed changes by at most 5 % during the cut",
-        trials=trials,
-    )  # fmt: skip
+    return make_claim("claim-constant", trials)
 
 
 def _architecture() -> Claim:
@@ -112,22 +104,13 @@ def _architecture() -> Claim:
         Trial(name, "sound rapids accepted", float(_outcome(noise).verdict.accepted), "of 1", least=1.0)
         for name, noise in sound
     ]
-    told = [(name, _outcome(0.001, trouble)) for name, trouble in wrong]
+    outcomes = [(name, _outcome(0.001, trouble)) for name, trouble in wrong]
     trials += [
         Trial(name, "rapids of another structure refused", float(not outcome.verdict.accepted), "of 1", least=1.0)
-        for name, outcome in told
+        for name, outcome in outcomes
     ]
-    reasons = [[name, outcome.verdict.reasons[0].text] for name, outcome in told if outcome.verdict.reasons]
-    return Claim(
-        key="figure-2", title="the architecture tells sound from unsound",
-        kind="figure", source="Figure 2 and section 3.2",
-        says="Measurements are filtered and stored, the parameters estimated, the model simulated with the measured "
-             "input and compared; a mismatch (backlash) means that the parameters are not validated.",
-        paper="a scheme",
-        rule="the chain of figure 2 accepts rapids of the paper's model and refuses rapids with backlash",
-        trials=trials,
-        tables=[Table(("scenario", "reason of the refusal"), reasons)],
-    )  # fmt: skip
+    reasons = [[name, outcome.verdict.reasons[0].text] for name, outcome in outcomes if outcome.verdict.reasons]
+    return make_claim("figure-2", trials, tables=[Table(("scenario", "reason of the refusal"), reasons)])
 
 
 def correlations(residual: Float) -> Float:
@@ -137,7 +120,7 @@ def correlations(residual: Float) -> Float:
 
 
 def _left(window: Window) -> dict[str, Float]:
-    """Return what least squares leaves of the torque by [6], and the speed's innovations by maximum likelihood."""
+    # torque residuals of [6] by least squares, and innovations of the speed by maximum likelihood
     signals = least_squares.align(window, Identification())
     rows = least_squares.regressors(signals, window.dt_s)
     theta, _ = least_squares.solve_two_steps(*rows)
@@ -159,21 +142,9 @@ def _whiteness() -> Claim:
             bounds = {"least": WHITE} if trouble.ripple_nm else {"most": WHITE}
             trials.append(Trial(name, what, worst, "", **bounds))
             curves[f"{name}, {label}"] = found
-    return Claim(
-        key="claim-whiteness", title="the whiteness test tells a wrong model",
-        kind="claim", source="Section 3.2",
-        says="Statistical tests like the whiteness test, used for the least square estimator, can be adopted to detect "
-             "whether the model behaves like the system.",
-        paper="no figures are given",
-        rule=f"correlations over {LAGS} lags below {WHITE:g} for the right model, above for one without the ripple",
-        trials=trials,
-        pictures=[Picture(
-            f"Normalised autocorrelation of what is left, lags 1 to {LAGS} of 1 ms, with the bounds of [LAN 93].",
-            drawings.correlations(curves, WHITE),
-        )],
-        note="The low-pass that least squares needs colours its residuals, so the test refuses the right model too; "
-             "the innovations of maximum likelihood are white by construction where the model is right.",
-    )  # fmt: skip
+    caption = f"Normalised autocorrelation of the residuals, lags 1 to {LAGS} of 1 ms, with the bounds of [LAN 93]."
+    pictures = [Picture(caption, drawings.correlations(curves, WHITE))]
+    return make_claim("claim-whiteness", trials, pictures, lags=LAGS, limit=WHITE)
 
 
 def _backlash() -> Claim:
@@ -183,15 +154,7 @@ def _backlash() -> Claim:
         found, std = (float("nan"), float("nan")) if band is None else (band.um, band.std_um)
         trials.append(Trial(name, "dead band found over the true one", found / true, "x", least=0.8, most=1.2))
         rows.append([f"{true:g}", f"{found:.1f}", f"{std:.1f}"])
-    return Claim(
-        key="claim-backlash", title="backlash from speed and table position",
-        kind="claim", source="Section 3.2",
-        says="Backlash is easily detected by measuring the motor's speed and the position of the table.",
-        paper="after [POD 97]; no figures are given",
-        rule="the dead band is found to 20 %, from the integral of the speed before the table follows",
-        trials=trials,
-        tables=[Table(("true um", "found um", "standard deviation um"), rows)],
-    )  # fmt: skip
+    return make_claim("claim-backlash", trials, tables=[Table(("true um", "found um", "standard deviation um"), rows)])
 
 
 def _signals() -> Claim:
@@ -206,18 +169,16 @@ def _signals() -> Claim:
             Trial(name, "largest voltage", float(np.abs(window.voltage_v).max()), "V", 30.0, 70.0),
             Trial(name, "largest current", float(np.abs(window.current_a).max()), "A", 10.0, 25.0),
         ]
-    return Claim(
-        key="figure-4", title="signals of a rapid",
-        kind="figure", source="Figure 4, section 4",
-        says="Speed, current and tension of a rapid as the NC measured them.",
-        paper="60 rad/s; the axis ends at 70, speed on top, then tension, then current; 3.5 s",
-        rule="60 rad/s within 5, voltage and current of that order",
-        trials=trials,
-        pictures=[Picture(
-            "Voltage, current and speed of one rapid of the measured machine, noise of 0.1 % of 70 V, A and rad/s.",
-            figures.signals(bench.noisy(bench.rapid(bench.plant()), 0.001, 0)[0]),
-        )],
-    )  # fmt: skip
+    return make_claim(
+        "figure-4",
+        trials,
+        pictures=[
+            Picture(
+                "Voltage, current and speed of one rapid of the measured machine, noise of 0.1 % of 70 V, A and rad/s.",
+                figures.signals(bench.noisy(bench.rapid(bench.plant()), 0.001, 0)[0]),
+            )
+        ],
+    )
 
 
 def _torques() -> Claim:
@@ -231,23 +192,19 @@ def _torques() -> Claim:
         peak = float(np.max(found.Jt * np.gradient(speed, window.dt_s) + found.ft * speed + found.Cd))
         trials.append(Trial("noise-0.1", f"largest torque at {celsius:g} degC", peak, "N.m", 10.0, 14.0))
     trials.append(Trial("noise-0.1", "torque of the cruise, cold less warm", cruise[0] - cruise[1], "N.m", 0.3, 0.8))
-    return Claim(
-        key="figure-5", title="estimated torque, cold and warm",
-        kind="figure", source="Figure 5, section 4",
-        says="The estimated torque of a rapid at 20 degC is above that at 22 degC.",
-        paper="12 to 13 N.m while it accelerates; the axis ends at 14; about half a N.m apart",
-        rule="10 to 14 N.m at most; 0.3 to 0.8 N.m less in the cruise when warm",
-        trials=trials,
-        pictures=[Picture(
-            "Torque Jt dw/dt + ft w + Cd sign(w) of one rapid by the parameters identified cold and warm.",
-            figures.torque(cases),
-        )],
-    )  # fmt: skip
+    return make_claim(
+        "figure-5",
+        trials,
+        pictures=[
+            Picture(
+                "Torque Jt dw/dt + ft w + Cd sign(w) of one rapid by the parameters identified cold and warm.",
+                figures.torque(cases),
+            )
+        ],
+    )
 
 
-def _drifted(
-    symbol: str, number: int, printed: tuple[float, float], drifts: Mapping[str, Drift], note: str = ""
-) -> Claim:
+def _drifted(symbol: str, number: int, printed: tuple[float, float], drifts: Mapping[str, Drift]) -> Claim:
     trials = []
     true = printed[0] - printed[1]
     for name, drift in drifts.items():
@@ -261,23 +218,16 @@ def _drifted(
         for name, drift in drifts.items()
         for celsius, value, std in zip(*drift.series(symbol), strict=True)
     ]
-    return Claim(
-        key=f"figure-{number}", title=f"{symbol} falls as the slide-ways warm",
-        kind="figure", source=f"Figure {number}, section 4",
-        says=f"{symbol} falls as the slide-ways warm from 20 to 22 degC.",
-        paper=f"{printed[0]:g} to {printed[1]:g} {UNITS[symbol]}",
-        rule="a fall as printed is beyond chance (1.96 standard deviations); the one that is found is it within three",
-        trials=trials,
-        tables=[Table(("scenario", "°C", f"{symbol} {UNITS[symbol]}", "± 95 %"), rows, folded="The values")],
-        pictures=[
-            Picture(
-                f"{symbol} against the slide-ways' temperature, maximum likelihood, bars of 95 %; the line is the "
-                "machine's own course.",
-                _drift_picture(symbol, printed, drifts),
-            )
-        ],
-        note=note,
-    )  # fmt: skip
+    caption = (
+        f"{symbol} against the slide-ways' temperature, maximum likelihood, bars of 95 %; the line is that of the "
+        "machine."
+    )
+    return make_claim(
+        f"figure-{number}",
+        trials,
+        [Picture(caption, _drift_picture(symbol, printed, drifts))],
+        [Table(("scenario", "°C", f"{symbol} {UNITS[symbol]}", "± 95 %"), rows, folded="The values")],
+    )
 
 
 def _drift_picture(symbol: str, printed: tuple[float, float], drifts: Mapping[str, Drift]) -> str:
@@ -310,13 +260,4 @@ def _behaviour() -> Claim:
                     [("drive", window.direction * window.speed_rad_s), ("model", window.direction * simulated)],
                 ),
             ))  # fmt: skip
-    return Claim(
-        key="figure-8", title="the model answers as the drive does",
-        kind="figure", source="Figure 8, section 4",
-        says="No difference between the behaviours of the feed-drive and of its model has been observed: the model is "
-             "valid.",
-        paper="no difference to be seen",
-        rule="at most 1 % of the rapid speed, RMS, between the measured speed and the model's answer to the voltage",
-        trials=trials,
-        pictures=pictures,
-    )  # fmt: skip
+    return make_claim("figure-8", trials, pictures=pictures)

@@ -1,4 +1,4 @@
-"""Runs operators and methods over many noisy recordings of one rapid, and tells their errors and the bound."""
+"""Compares operators and estimators on many noisy recordings of one rapid, with the Cramer-Rao bound."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ METHODS = (*OPERATORS, "partial_moments", "maximum_likelihood")
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """Relative errors (runs, low-passes, methods, 6) at a noise, those with a raw voltage (runs, 6), and the bound."""
+    """Relative errors at one noise: all (runs, low-passes, methods, 6), with raw voltage (runs, 6), and the bound."""
 
     noise: float
     of: Float
@@ -35,12 +35,12 @@ class Errors:
         return np.asarray(np.sqrt((self.of[:, lowpass] ** 2).mean(axis=0)))
 
     def over_bound(self, lowpass: int) -> Float:
-        """Return each method's RMS error over the bound, the geometric mean of the six, (methods,)."""
+        """Return the ratio of RMS error and bound per method, geometric mean of the six parameters, (methods,)."""
         return np.asarray(np.exp(np.log(self.rms(lowpass) / self.bound).mean(axis=1)))
 
 
 def compare(parameters: Parameters, recording: Recording, runs: int) -> list[Errors]:
-    """Return the errors of all methods at each of ``NOISES``, each over ``runs`` recordings."""
+    """Return the errors of all methods at each of ``NOISES`` over ``runs`` recordings."""
     true = vector(parameters)
     found = []
     for noise in NOISES:
@@ -61,7 +61,6 @@ def vector(parameters: Parameters) -> Float:
 
 
 def _two_steps(windows: Sequence[Window], lowpass_hz: float) -> list[Float]:
-    """Return [R, L, K, Jt, ft, Cd] by least squares with each operator, then by partial moments."""
     found = [least_squares_of(windows, lowpass_hz, operator) for operator in OPERATORS.values()]
     steps = partial_moments.horizon_steps(Identification(lowpass_hz=lowpass_hz), windows[0].dt_s)
     return [*found, _solved([partial_moments.moments(window, steps) for window in windows])]
@@ -73,7 +72,7 @@ def least_squares_of(
     operator: Operator = ZERO_FORCING_1,
     rows: Sequence[Bool] | None = None,
 ) -> Float:
-    """Return [R, L, K, Jt, ft, Cd] (6,) by least squares, of all or some ``rows`` (n,) of each window."""
+    """Return [R, L, K, Jt, ft, Cd] (6,) by least squares, from all or selected ``rows`` (n,) of each window."""
     parts = []
     for k, window in enumerate(windows):
         signals = least_squares.align(window, Identification(lowpass_hz=lowpass_hz))
@@ -90,7 +89,6 @@ def _solved(parts: Sequence[tuple[Float, Float]]) -> Float:
 
 
 def _voltage_left_raw(windows: Sequence[Window]) -> list[Window]:
-    """Return the windows with the low-pass on current and speed alone."""
     hz = Identification().lowpass_hz
     return [
         replace(
@@ -103,16 +101,16 @@ def _voltage_left_raw(windows: Sequence[Window]) -> list[Window]:
 
 
 def left_raw_of(parameters: Parameters, recording: Recording, noise: float) -> tuple[Float, Float]:
-    """Return the relative error of L (1,) with the low-pass on every signal, and with none on the voltage."""
+    """Return the relative error of L (1,) with the low-pass on every signal, and without it on the voltage."""
     windows, true = noisy(recording, noise, 0), vector(parameters)
-    alike = least_squares_of(windows, Identification().lowpass_hz) / true - 1.0
-    apart = least_squares_of(_voltage_left_raw(windows), NO_LOWPASS_HZ) / true - 1.0
+    filtered = least_squares_of(windows, Identification().lowpass_hz) / true - 1.0
+    unfiltered = least_squares_of(_voltage_left_raw(windows), NO_LOWPASS_HZ) / true - 1.0
     place = PARAMETERS.index("L")
-    return alike[[place]], apart[[place]]
+    return filtered[[place]], unfiltered[[place]]
 
 
 def bound(parameters: Parameters, recording: Recording, noise: float) -> Float:
-    """Return the standard deviations (6,) of Cramer and Rao that the rows in which the drive surely moves allow."""
+    """Return the Cramer-Rao standard deviations (6,) for the samples in which the drive is certainly moving."""
     theta = np.append(vector(parameters), 0.0)
     motion = prepare(find_windows(recording)[0])
     problem = maximum_likelihood.pose([motion], theta, [Noise(*np.full(3, noise * FULL_SCALE).tolist())])

@@ -1,4 +1,4 @@
-"""The derivative operators that the paper may have compared: its own, [4], and three rivals; it names none of them."""
+"""Derivative operators: the paper's own, [4], and three rivals, which the paper does not name."""
 
 import math
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""Lays the claims out as one page and as one document for machines."""
+"""HTML page and JSON document of the claims."""
 
 import math
 import re
@@ -22,33 +22,31 @@ SUMMARY_HEAD = ("claim", "verdict", "shown by", "place in the paper")
 
 
 def counts(claims: Sequence[Claim]) -> dict[str, int]:
-    """Return how many claims have each verdict."""
+    """Return the number of claims per verdict."""
     found = Counter(claim.verdict for claim in claims)
     return {verdict.value: found[verdict] for verdict in Verdict}
 
 
 def summary_rows(claims: Sequence[Claim]) -> list[list[str]]:
-    """Return one row per claim for ``SUMMARY_HEAD``."""
-    return [[claim.title, claim.verdict.value, _shown(claim), claim.source] for claim in claims]
-
-
-def _shown(claim: Claim) -> str:
-    shown = sum(claim.shown_by(scenario) for scenario in claim.scenarios)
-    return f"{shown} of {len(claim.scenarios)} scenarios"
+    """Return one row per claim, with the columns of ``SUMMARY_HEAD``."""
+    shown = [sum(map(claim.shown_by, claim.scenarios)) for claim in claims]
+    return [
+        [claim.title, claim.verdict.value, f"{count} of {len(claim.scenarios)} scenarios", claim.source]
+        for claim, count in zip(claims, shown, strict=True)
+    ]
 
 
 def page(claims: Sequence[Claim]) -> Page:
-    """Return the page: the verdicts first, the scenarios, then claim by claim."""
+    """Return the page: verdicts, claims by section of the paper, scenarios."""
     return Page(
         title="The paper, claim by claim",
-        subtitle=f"{CITATION}: every equation, figure and claim put to trials on simulated machines.",
+        subtitle=f"{CITATION}: every equation, figure and claim tested on simulated machines.",
         headline=[(verdict, str(number)) for verdict, number in counts(claims).items()],
         sections=[_verdicts(claims), *map(_section, sorted(claims, key=_chapter)), _scenarios(claims)],
     )
 
 
 def _chapter(claim: Claim) -> str:
-    """Return the chapter of the page that a claim belongs to: the section of the paper that has it."""
     found = _SECTION.search(claim.source)
     return f"Section {found[1]} of the paper" if found else "The paper's conclusion"
 
@@ -56,9 +54,9 @@ def _chapter(claim: Claim) -> str:
 def _verdicts(claims: Sequence[Claim]) -> Section:
     return Section(
         "Verdicts",
-        "A trial is a number that has to lie within bounds in a scenario. A claim holds where all its scenarios show "
-        "it, with a condition where some do, and is not reproduced where none does. Nothing but this rule decides. "
-        "The safety ceiling of offsets on a machine does not apply: nothing here moves. Figures 1 and 2 are schemes "
+        "A trial is a number that must lie within bounds in a scenario. A claim holds if all its scenarios show it, "
+        "holds with a condition if some do, and is not reproduced if none does. Only this rule decides. "
+        "The safety limit of offsets does not apply, because no machine moves. Figures 1 and 2 are schemes "
         "and Figure 3 is a photograph; the paper has no tables.",
         tables=[Table(SUMMARY_HEAD, summary_rows(claims))],
     )
@@ -93,11 +91,11 @@ def _trials(claim: Claim) -> Table:
             [f"{what}{f', {unit}' * bool(unit)} ({bounds})", *(cells.get((s, what), "") for s in claim.scenarios)]
             for what, unit, bounds in columns
         ]
-    return Table(head, rows, f"{SHOWN} lies within its bounds, {NOT_SHOWN} does not")
+    return Table(head, rows, f"{SHOWN} within its bounds, {NOT_SHOWN} outside")
 
 
 def cell(trial: Trial) -> str:
-    """Return a trial's value with its mark."""
+    """Return the value of a trial with its mark."""
     return f"{trial.value:.4g} {SHOWN if trial.holds else NOT_SHOWN}"
 
 
@@ -110,7 +108,7 @@ def _scenarios(claims: Sequence[Claim]) -> Section:
     ]
     return Section(
         "Scenarios",
-        "All are configs/paper.toml with the keys named here changed, the same for each axis.",
+        "All are configs/paper.toml with the listed keys changed, the same for each axis.",
         tables=[Table(("scenario", "what it is", "changed keys"), rows)],
     )
 
@@ -120,7 +118,7 @@ def _once(changes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def document(claims: Sequence[Claim], runs: int, version: str, files: Mapping[str, Sequence[str]]) -> dict[str, Any]:
-    """Return what ``paper.json`` holds; ``files`` are the names of each claim's pictures."""
+    """Return the content of ``paper.json``; ``files`` has the picture names of each claim."""
     return {
         "schema": SCHEMA,
         "fdhil": version,
@@ -158,14 +156,14 @@ def _claim(claim: Claim, files: Sequence[str]) -> dict[str, Any]:
 
 
 def _trial(trial: Trial) -> dict[str, Any]:
-    """Return a trial as JSON has it, where no number is infinite."""
+    # JSON has no infinite numbers
     numbers = {"value": trial.value, "least": trial.least, "most": trial.most}
-    told = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
-    return {"scenario": trial.scenario, "what": trial.what, "unit": trial.unit, **told, "holds": trial.holds}
+    finite = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+    return {"scenario": trial.scenario, "what": trial.what, "unit": trial.unit, **finite, "holds": trial.holds}
 
 
 def write_pictures(claims: Sequence[Claim], folder: Path) -> dict[str, list[str]]:
-    """Write each picture below ``folder`` as an SVG file; return the names of each claim's, from that folder."""
+    """Write each picture below ``folder`` as SVG; return the relative file names per claim."""
     names: dict[str, list[str]] = {}
     for claim in claims:
         names[claim.key] = [f"pictures/{claim.key}-{k}.svg" for k in range(1, len(claim.pictures) + 1)]

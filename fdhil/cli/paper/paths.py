@@ -1,7 +1,6 @@
-"""Cuts the paper's path in every scenario: predicted, and with what a correction adds, without any ceiling.
+"""Predictions of the paper's path in every scenario, without and with a correction of unlimited offsets.
 
-In a simulation no drive can be harmed, so the offsets are not limited here as the guard limits them on a machine: the
-figures are drawn as the paper drew them.
+The guard's limits do not apply to a simulation, so that the figures correspond to those of the paper.
 """
 
 from collections.abc import Mapping
@@ -29,7 +28,7 @@ PROGRAMS: Mapping[str, str] = {
 }
 PLACES = POINTS
 CORNERS, SMOOTH = ("A", "C", "E", "G"), ("B", "D", "F")
-NEAR_MM = 10.0  # what belongs to a place, either way
+NEAR_MM = 10.0  # radius around a named place
 AXES = ("X", "Y")
 SLOW, FAST = "10 m/min", "20 m/min"
 METHODS = ("mirror", "inverse", "flatness")
@@ -44,13 +43,13 @@ def _planned(program: str, smoothing_s: tuple[float, ...]) -> Trajectory:
 
 
 def reference(scenario: str, program: str = SLOW) -> Trajectory:
-    """Return the demand that the scenario's NC makes of a program."""
+    """Return the demand that the NC of a scenario generates from a program."""
     return _planned(program, tuple(machine(scenario).nc.smoothing_s))
 
 
 @cache
 def desired_mm(scenario: str, program: str = SLOW) -> Float:
-    """Return the path (n, 2) against which errors are told: the demand, or the programmed path on as many rows."""
+    """Return the reference path (n, 2) of the errors, mm: the demand, or the programmed path padded to its length."""
     demand = reference(scenario, program).path_mm
     if not PATHS[scenario].programmed:
         return demand
@@ -65,15 +64,15 @@ def _models(changes: tuple[tuple[str, float], ...], config: MachineConfig) -> di
 
 @cache
 def predicted(scenario: str, program: str = SLOW, changes: tuple[tuple[str, float], ...] = ()) -> Prediction:
-    """Predict a program without correction; ``changes`` are parameters of X that are not the nominal ones."""
+    """Predict a program without correction; ``changes`` replace nominal parameters of X."""
     config = machine(scenario)
-    # nothing is added: what is predicted of the corrected path, without the zones that are not asked for here
+    # no offsets; unlike predict() this skips the zones, which are not needed
     return predict_corrected(reference(scenario, program), _models(changes, config), config, None)
 
 
 @cache
 def corrected(scenario: str, method: str, program: str = SLOW) -> Prediction:
-    """Predict a program with a correction by one of ``METHODS``, unlimited."""
+    """Predict a program with an unlimited correction by one of ``METHODS``."""
     before, config = predicted(scenario, program), machine(scenario)
     models = nominal_models(config)
     if method == "flatness":
@@ -87,7 +86,7 @@ def corrected(scenario: str, method: str, program: str = SLOW) -> Prediction:
 
 
 def offset_um(scenario: str, method: str, program: str = SLOW) -> dict[str, Float]:
-    """Return the offsets (n,) of each axis: the mirror's -e, or the -Hr^-1 e of equation [11]."""
+    """Return the offsets (n,) of each axis, um: -e for the mirror, else -Hr^-1 e of equation [11]."""
     before, config = predicted(scenario, program), machine(scenario)
     if method == "mirror":
         return {axis: -error for axis, error in before.error_um.items()}
@@ -100,7 +99,7 @@ def offset_um(scenario: str, method: str, program: str = SLOW) -> dict[str, Floa
 
 @cache
 def measured_mm(scenario: str, program: str = SLOW) -> Float:
-    """Return where the table of the simulated machine goes (n, 2), mm: the twin's physics, not the model's."""
+    """Return the table path (n, 2), mm, of the simulator's physics, independent of the model."""
     config, demand = machine(scenario), reference(scenario, program).position_mm
     models, period_s = nominal_models(config), config.machine.sync_period_s
     tables = [bench.run(config.axis[axis], period_s, models[axis], np.asarray(demand[axis])).table_mm for axis in AXES]
@@ -108,38 +107,38 @@ def measured_mm(scenario: str, program: str = SLOW) -> Float:
 
 
 def path_mm(answer: Prediction) -> Float:
-    """Return the path (n, 2) that a prediction has the table take."""
+    """Return the predicted table path (n, 2), mm."""
     return np.column_stack([answer.predicted_mm[axis] for axis in AXES])
 
 
 def contour_um(scenario: str, answer: Prediction, program: str = SLOW) -> Float:
-    """Return the contour error (n,) against what the scenario tells errors against."""
+    """Return the contour error (n,), um, relative to the scenario's reference path."""
     if not PATHS[scenario].programmed:
         return answer.contour_um
     return contour_error_um(desired_mm(scenario, program), path_mm(answer), answer.reference.dt_s)
 
 
 def traced(label: str, scenario: str, answer: Prediction, program: str = SLOW) -> Traced:
-    """Return a predicted path with its contour error, to be drawn."""
+    """Return a predicted path with its contour error, for a drawing."""
     return Traced(label, path_mm(answer), contour_um(scenario, answer, program))
 
 
 def near(answer: Prediction, place: str, within_mm: float = NEAR_MM) -> Bool:
-    """Return the rows (n,) in which the table is near to a place; where it should be then may be far on."""
+    """Return the samples (n,) in which the table, not the demand, is near a place."""
     away = np.hypot(*(path_mm(answer) - PLACES[place]).T)
     return np.asarray(away < within_mm)
 
 
 def largest_um(scenario: str, answer: Prediction, place: str, program: str = SLOW) -> float:
-    """Return the largest contour error near a place."""
+    """Return the largest contour error near a place, um."""
     return float(contour_um(scenario, answer, program)[near(answer, place)].max())
 
 
 def rms_um(scenario: str, answer: Prediction, program: str = SLOW) -> float:
-    """Return the RMS of the contour error along the whole path."""
+    """Return the RMS contour error of the whole path, um."""
     return rms(contour_um(scenario, answer, program))
 
 
 def corner_missed_mm(scenario: str, place: str = "A", program: str = SLOW) -> float:
-    """Return how near the demand itself comes to a programmed corner."""
+    """Return the smallest distance of the demand from a programmed corner, mm."""
     return float(np.hypot(*(reference(scenario, program).path_mm - PLACES[place]).T).min())
