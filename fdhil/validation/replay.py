@@ -174,14 +174,12 @@ def _parted(p: Parameters, direction: int, current_a: float, share: float) -> tu
 
 
 def _begins_at_rest(window: Window) -> bool:
-    """Return whether the axis has stood for ``REST_S`` before it moves, but for steps and noise of its position."""
-    begin, rows = moving_range(window)[0], math.ceil(REST_S / window.dt_s)
-    if begin < rows:
-        return False
-    position = window.position_mm[begin - rows : begin]
+    """Return whether the axis stands for ``REST_S`` or longer before it moves, but for steps and noise."""
+    begin = moving_range(window)[0]
+    position = window.position_mm[:begin]
     position = position[np.isfinite(position)]
     limit_mm = max(REST_MM, REST_STEPS * resolution(window.position_mm))
-    return position.size > 0 and float(np.ptp(position)) <= limit_mm
+    return begin * window.dt_s >= REST_S and position.size > 0 and float(np.ptp(position)) <= limit_mm
 
 
 def _standstill_rows(window: Window) -> int:
