@@ -125,10 +125,17 @@ def replay_setpoints(window: Window, parameters: Parameters, axis: Axis, sync_pe
 
     None too where the axis had not come to rest before: what its regulators held then is not recorded.
     """
-    if not _rows_are_setpoints(window, sync_period_s) or not _begins_at_rest(window):
+    begin = moving_range(window)[0]
+    rest = slice(begin - math.ceil(REST_S / window.dt_s), begin)
+    if not _rows_are_setpoints(window, sync_period_s) or not _stands(window, rest):
         return None
     parameters = completed(parameters, Parameters(**axis.nominal.model_dump()))
-    signals, held_a = (window.demand_mm, window.position_mm), _standstill_a(window)
+    # before the rest the axis may still settle from the move before
+    signals = [
+        np.concatenate([np.full(rest.start, np.nan), values[rest.start :]])
+        for values in (window.demand_mm, window.position_mm)
+    ]
+    held_a = _mean(window.current_a[rest][: round(STANDSTILL_S / window.dt_s)])
     try:
         told = replay(*signals, parameters, axis, sync_period_s, window.offset_mm, standstill_a=held_a)
     except ValueError:  # too few whole rows, or no drive
@@ -173,24 +180,23 @@ def _parted(p: Parameters, direction: int, current_a: float, share: float) -> tu
     return p.changed(Cd=p.Cd + helping, load=p.term("load") - direction * helping), current
 
 
-def _begins_at_rest(window: Window) -> bool:
-    """Return whether the axis stands for ``REST_S`` or longer before it moves, but for steps and noise."""
-    begin = moving_range(window)[0]
-    position = window.position_mm[:begin]
+def _stands(window: Window, rest: slice) -> bool:
+    """Return whether the axis stands in these rows, but for steps and noise of its position."""
+    position = window.position_mm[max(rest.start, 0) : rest.stop]
     position = position[np.isfinite(position)]
     limit_mm = max(REST_MM, REST_STEPS * resolution(window.position_mm))
-    return begin * window.dt_s >= REST_S and position.size > 0 and float(np.ptp(position)) <= limit_mm
-
-
-def _standstill_rows(window: Window) -> int:
-    return min(max(1, round(STANDSTILL_S / window.dt_s)), moving_range(window)[0])
+    return rest.start >= 0 and position.size > 0 and float(np.ptp(position)) <= limit_mm
 
 
 def _standstill_a(window: Window) -> float:
     """Return the current that the drive holds in the first rows of a window, which begins at rest."""
-    held = window.current_a[: _standstill_rows(window)]
-    held = held[np.isfinite(held)]
-    return float(held.mean()) if held.size else 0.0
+    rows = min(max(1, round(STANDSTILL_S / window.dt_s)), moving_range(window)[0])
+    return _mean(window.current_a[:rows])
+
+
+def _mean(values: Float) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if known.size else 0.0
 
 
 def _moves(values: Float) -> bool:

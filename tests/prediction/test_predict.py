@@ -158,9 +158,9 @@ def test_skill_leaves_out_lost_rows_and_is_not_known_without_a_position() -> Non
 
 def test_skill_is_not_known_of_a_move_that_begins_while_the_axis_still_settles() -> None:
     window = rapid()
-    settling = 20e-3 * np.exp(-np.arange(window.n) / 20.0)
+    settling = 0.2 * np.exp(-np.arange(window.n) / 20.0)
     assert skill_of(rapid(position_mm=window.position_mm + settling)) is None
-    assert skill_of(rapid(position_mm=window.position_mm + 0.01 * settling)) is not None
+    assert skill_of(rapid(position_mm=window.position_mm + 1e-3 * settling)) is not None
     moves = np.flatnonzero(np.abs(window.speed_rad_s) > 0.5)[0]
     rest = slice(max(0, moves - 5), None)
     cut = {name: getattr(window, name)[rest] for name in ("demand_mm", "position_mm", "speed_rad_s", "current_a")}
