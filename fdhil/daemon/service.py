@@ -1,10 +1,8 @@
 """Runs the daemon: one task group that carries records from the machine to the pipelines, and outcomes to the store.
 
-Sources restart with back-off; a pipeline never does. An unexpected exception in any task ramps the correction down
-(the guard is told to disarm) and ends the process: there is no half-alive daemon. Nothing is ever sent from here.
+Sources restart with increasing delay; a pipeline never does. An unexpected exception in any task ramps the correction
+to zero (the guard is disarmed) and ends the process: a daemon is never half alive. It sends nothing to the machine.
 """
-
-from __future__ import annotations
 
 import asyncio
 import os
@@ -50,7 +48,7 @@ STUCK_S = 60.0  # a batch that is digested for so long hangs
 
 
 class InternalError(FdhilError):
-    """A fault of fdhil itself ended the daemon."""
+    """An internal error of fdhil ended the daemon."""
 
 
 class Service:
@@ -77,10 +75,10 @@ class Service:
         self._queues = {axis: RecordQueue() for axis in config.axis}
         self._busy_since_s: dict[str, float] = {}
         self._notices = asyncio.Queue[Notice](NOTICE_QUEUE)
-        self._void_axes = asyncio.Queue[str]()  # each once at most: ``_void_by`` has the newest that speaks against it
+        self._void_axes = asyncio.Queue[str]()  # each once at most; ``_void_by`` has the newest reason
         self._void_by: dict[str, str] = {}
         self._gate = journal.FloodGate()
-        self._held: dict[alarms.Key, Notice] = {}  # by condition the newest notice, while a flood holds it back
+        self._held: dict[alarms.Key, Notice] = {}  # newest suppressed notice of each condition
         self._audit = Audited(self._handle, config.store.directory, clock)
         desk, access = self._desk, config.access
         self._control = ControlServer(
@@ -94,7 +92,7 @@ class Service:
         self._frames_seen = -1
 
     async def run(self) -> Standing:
-        """Serve until a signal asks to stop; return what may still be applied. BusLocked when another one serves it."""
+        """Serve until a signal requests a stop; return what may still be applied. BusLocked: another serves it."""
         loop = asyncio.get_running_loop()
         with sole_owner(self._run_directory, self._config.store.directory), journal.lines_dated_by(self._clock):
             stopping = [number for number in STOPPING if signal.getsignal(number) is not signal.SIG_IGN]  # as by nohup
@@ -114,7 +112,7 @@ class Service:
                     loop.remove_signal_handler(number)
                 if (
                     self._acquisition.opened.is_set() or not stands.nothing
-                ):  # else it never ran, and the error alone is told
+                ):  # else it never ran, and only the error is reported
                     self._say_stopped(stands)
         return stands
 
@@ -127,7 +125,7 @@ class Service:
 
     @property
     def standing(self) -> Standing:
-        """What may still be applied, as far as the daemon knows."""
+        """The offset that may still be applied, as far as the daemon knows."""
         return self._desk.guard.standing
 
     async def _serve(self) -> None:
@@ -137,7 +135,7 @@ class Service:
         await asyncio.to_thread(self._prepare)
         async with self._control.serving(self._run_directory / SOCKET_NAME), asyncio.TaskGroup() as tasks:
             stop, budgets = self.shutdown, self._budgets
-            closing_s = budgets.source_s + 1.0  # reported before it is given up
+            closing_s = budgets.source_s + 1.0  # reported before it is abandoned
             acquiring = tasks.create_task(self._acquisition.run(self._take, closing_s), name="acquire")
             others = [tasks.create_task(self._work(axis), name=f"axis {axis}") for axis in self._config.axis]
             others.append(tasks.create_task(self._keep_notices(), name="notices"))
@@ -172,7 +170,7 @@ class Service:
         await asyncio.gather(*axes, self._notices.join(), self._void_axes.join())
 
     def _prepare(self) -> None:
-        """Begin each axis with what the history knows, and compile the kernels."""
+        """Load each axis from the history, and compile the kernels."""
         self._desk.begin(self._store.newest(), self._store.skills())
         for axis in self._config.axis:
             known = self._store.known(axis)
@@ -209,7 +207,7 @@ class Service:
                 self._queues[axis].put(record)
 
     async def _work(self, axis: str) -> None:
-        """Feed one axis' pipeline, in order, in a worker thread; a batch takes all that waits."""
+        """Feed one axis' pipeline in order, in a worker thread; a batch takes all waiting records."""
         queue = self._queues[axis]
         while True:
             batch = await queue.batch()
@@ -221,16 +219,15 @@ class Service:
             queue.digested(len(batch))
 
     def _digest(self, axis: str, batch: Sequence[Record]) -> tuple[list[Outcome], list[Notice]]:
-        """In the worker thread: records through the pipeline, outcomes into the store."""
         outcomes = [outcome for record in batch for outcome in self._pipelines[axis].feed(record)]
         return outcomes, self._store.keep(outcomes) if outcomes else []
 
-    # what is said and kept -------------------------------------------------------------------------------------
+    # logging and storing ----------------------------------------------------------------------------------------
 
     def _tell(self, notices: Sequence[Notice]) -> None:
-        """Show notices and have them stored; what a flood held back is not stored either.
+        """Log notices and queue them for the store; those that a flood suppressed are not stored either.
 
-        What voids a record does so whatever a flood holds back.
+        A notice that voids a commissioning record does so even when suppressed.
         """
         now_s = self._clock.now_s()
         for notice in notices:
@@ -257,7 +254,7 @@ class Service:
             self._notices.task_done()
 
     async def _void_records(self) -> None:
-        """Mark commissioning records that are void: the guard that is started next must know of it."""
+        """Mark void commissioning records in the store, for the next guard that starts."""
         while True:
             axis = await self._void_axes.get()
             try:
@@ -267,7 +264,7 @@ class Service:
             self._void_axes.task_done()
 
     def _say(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
-        """Show outcomes: one log line each (a flood becomes a count), the newest in the status. Return those shown."""
+        """Log outcomes, one line each (a flood becomes a count), update the status; return those that were logged."""
         now_s, shown = self._clock.now_s(), []
         for outcome in outcomes:
             text, severity = journal.line_of(outcome)
@@ -280,7 +277,7 @@ class Service:
         return shown
 
     async def _feed_watchdog(self) -> None:
-        """Feed systemd's watchdog while blocks arrive, or it is known why none can: a restart mends neither."""
+        """Feed systemd's watchdog while blocks arrive or their absence is explained: a restart fixes neither."""
         period_s = int(os.environ.get("WATCHDOG_USEC", WATCHDOG_S * 2e6)) / 1e6 / 2
         while True:
             if self._alive(period_s):
@@ -297,7 +294,7 @@ class Service:
         return moved or self._watch.hearing.alive(now_s, period_s)
 
     async def _listen(self) -> None:
-        """Look a few times a second whether the machine is heard, and tell what is not as the config says."""
+        """Check reception a few times per second and report deviations from the config."""
         while True:
             await asyncio.sleep(LISTEN_S)
             now_s = self._clock.now_s()
@@ -311,14 +308,14 @@ class Service:
                 await self._desk.disarm()
 
     async def _watch_resources(self, clock: ClockWatch) -> None:
-        """Look now and then: is memory, are descriptors nearly used up, was the clock set, does an offer wait."""
+        """Check memory, descriptors, the clock, waiting proposals and the store periodically."""
         watch, offers = ResourceWatch(), OfferWatch(self._config)
         while True:
             await asyncio.to_thread(heap.give_back)
             self._resources = uses()
             self._tell([*watch.look(self._resources), *clock.look(self._clock.wall_s(), self._clock.now_s())])
             self._tell(await asyncio.to_thread(offers.look))
-            self._tell(await asyncio.to_thread(self._store.keep, ()))  # tells whether the history still stands there
+            self._tell(await asyncio.to_thread(self._store.keep, ()))  # reports a replaced history
             await asyncio.sleep(RESOURCES_S)
 
     # control ---------------------------------------------------------------------------------------------------
@@ -379,16 +376,16 @@ class Service:
 
 
 def _told(answer: Answer) -> Notice:
-    """Return what the log and the history say of a request to arm: an audit needs the refused ones too."""
+    """Return the notice of an arm request for log and history, refused ones included."""
     if answer["ok"]:
         return Notice("Armed", "info", str(answer["text"]))
     return Notice("ArmRefused", "minor", f"{answer['code']}: {answer['text']}")
 
 
 def run(config: MachineConfig, open_source: OpenSource, method: str | None = None) -> Standing:
-    """Run the daemon until it is told to stop; return what may still be applied.
+    """Run the daemon until it is stopped; return the offset that may still be applied.
 
-    FdhilError when it cannot start or meets what it must not survive.
+    FdhilError when it cannot start or meets a fatal error.
     """
     heap.keep_small()
     service = Service(config, open_source, method, leave=os._exit)

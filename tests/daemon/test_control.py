@@ -50,7 +50,9 @@ def test_a_socket_that_may_not_be_used_is_no_daemon_that_is_away(code: int) -> N
     """Who was told to start it would start a second one."""
     denied = OSError(code, os.strerror(code))
     told = str(ConnectError.of_socket("daemon", denied, "is not running; start it"))
-    assert told.startswith(f"daemon: may not be asked by this user ({os.strerror(code)}), so that whether it runs")
+    assert told.startswith(
+        f"daemon: does not accept this user ({os.strerror(code)}), so that it is unknown whether it runs"
+    )
     assert "start it" not in told
 
 
@@ -82,7 +84,7 @@ def test_a_daemon_that_hangs_up_or_talks_nonsense_is_told(tmp_path: Path, listen
 
         thread = threading.Thread(target=serve)
         thread.start()
-        with pytest.raises(ConnectError, match=r"without an answer|no answer of a daemon"):
+        with pytest.raises(ConnectError, match=r"without an answer|an invalid answer"):
             ask(tmp_path / "s", {"request": "status"})
         thread.join()
 
@@ -159,7 +161,7 @@ def test_who_has_no_descriptor_left_is_told_so(tmp_path: Path, listener: socket.
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (1, hard))
     try:
-        with pytest.raises(ConnectError, match=r"was not asked \(Too many open files\); close"):
+        with pytest.raises(ConnectError, match=r"could not be reached \(Too many open files\); close"):
             ask(tmp_path / "s", {"request": "status"})
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))

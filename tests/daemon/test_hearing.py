@@ -119,15 +119,13 @@ async def test_a_wrong_period_a_node_never_heard_and_a_dead_bus_are_told(
         assert told["source"]["state"] == "listening"
         assert told["sync"]["rate_hz"] == pytest.approx(500.0, rel=0.01)
         troubles = {(each["code"], each["axis"]): each["text"] for each in told["troubles"]}
-        expected = (
-            r"SYNC comes at (499\.\d|500(\.\d)?) Hz where the config says 1000: .* set sync_period_s = 0\.00(2|1999)"
-        )
+        expected = r"SYNC runs at (499\.\d|500(\.\d)?) Hz instead of 1000 Hz as configured: .* set sync_period_s = 0\.00(2|1999)"
         assert re.search(expected, troubles["SyncPeriodSuspect", ""])
-        assert "the drive (node 2 on can0) was never heard" in troubles["NodeNeverHeard", "Y"]
+        assert "the drive (node 2 on can0) has never sent a frame" in troubles["NodeNeverHeard", "Y"]
         assert {notice["code"] for notice in told["notices"]} >= WRONG
         text = shown(told, capsys)
         assert re.search(r"listening, SYNC (499|500)\.\d Hz of 1000", text)
-        assert "Y: NodeNeverHeard: the drive (node 2 on can0) was never heard" in text
+        assert "Y: NodeNeverHeard: the drive (node 2 on can0) has never sent a frame" in text
         line.cut()
         told = await status_when(path, lambda s: s["source"]["state"] == "silent" and s["sync"]["rate_hz"] is None)
         assert told["source"]["heard_s_ago"] > 1.0
@@ -162,7 +160,7 @@ def test_the_rate_is_of_what_is_heard_now(tmp_path: Path) -> None:
         ((1200,), "set sync_period_s = 0.0012"),
         (
             (1059, 1307, 1509),
-            "comes unevenly, at 663 to 944 Hz where the config says 1000: no period can be determined",
+            "is uneven, 663 to 944 Hz instead of the configured 1000 Hz: no period can be determined",
         ),
     ],
 )
@@ -217,7 +215,7 @@ def test_a_drive_that_answers_but_does_not_sample_is_told_once_and_its_end_too(t
 
 
 @pytest.mark.parametrize(
-    ("synced", "words"), [(True, "axis; check node_id"), (False, "no heartbeat (0x1017), else check")]
+    ("synced", "words"), [(True, "monitored; check node_id"), (False, "no heartbeat (0x1017), else check")]
 )
 def test_a_drive_that_is_never_heard_may_be_one_without_a_heartbeat(synced: bool, words: str, tmp_path: Path) -> None:
     hearing = Hearing(config_of(tmp_path), 0.0)
@@ -255,7 +253,7 @@ def test_moves_that_are_seen_and_not_used_have_their_reason(tmp_path: Path) -> N
     assert fed(true, records, windows=4) == {}
     ((key, text),) = fed(other(tmp_path, rapid_speed_mm_s=1000.0), records).items()
     assert key == ("MovesNotUsed", "X")
-    assert "4 moves seen, none used: 4 stay below 90% of the rapid speed of 1000 mm/s, the fastest at 5" in text
+    assert "4 moves recorded, none used: 4 stay below 90% of the rapid speed of 1000 mm/s, the fastest at 5" in text
     assert "correct rapid_speed_mm_s or screw_pitch_mm" in text
     ((key, text),) = fed(true, records).items()
     assert key == ("MovesNotUsed", "X")
@@ -265,7 +263,7 @@ def test_moves_that_are_seen_and_not_used_have_their_reason(tmp_path: Path) -> N
     assert "times the rapid speed" in text
     ((key, text),) = fed(other(tmp_path, screw_pitch_mm=10.0), records, windows=4).items()
     assert key == ("ScaleSuspect", "X")
-    assert "the position goes 2 times as far as the speed says" in text
+    assert "the position travels 2 times the integral of the speed" in text
 
 
 def test_moves_without_a_plateau_are_told_as_such(tmp_path: Path) -> None:
@@ -286,7 +284,7 @@ def test_moves_without_a_plateau_are_told_as_such(tmp_path: Path) -> None:
         moves.append(AxisSamples("X", tick, position, position, turning, zeros, None, zeros, frozen_ints(zeros)))
     ((key, text),) = fed(config, moves).items()
     assert key == ("MovesNotUsed", "X")
-    assert "no plateau of 0.1 s; make longer rapids" in text
+    assert "no plateau of 0.1 s; run longer rapids" in text
 
 
 async def test_the_daemon_tells_moves_it_cannot_use_instead_of_0_accepted_0_refused(
@@ -298,7 +296,7 @@ async def test_the_daemon_tells_moves_it_cannot_use_instead_of_0_accepted_0_refu
         text = shown(told, capsys)
     assert [notice["code"] for notice in told["notices"]].count("MovesNotUsed") == 1
     assert "X 0/0" in text
-    assert "X: MovesNotUsed: 3 moves seen, none used" in text
+    assert "X: MovesNotUsed: 3 moves recorded, none used" in text
     assert "X: 3 moves seen; not used: 3 slower than a rapid (the fastest of all reached 5" in text
 
 

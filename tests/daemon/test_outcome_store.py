@@ -75,7 +75,7 @@ def test_a_disk_that_refuses_is_told_once_and_recovers(
         patch.setattr("fdhil.store.atomic.os.write", refuse)
         said = store.keep([outcome()])
         assert [notice.code for notice in said] == [code]
-        assert "goes on in shadow" in said[0].text
+        assert "continues in shadow" in said[0].text
         assert store.fault == code
         assert store.keep([outcome()]) == []
     assert [notice.code for notice in store.keep([outcome()])] == ["StoreRecovered"]

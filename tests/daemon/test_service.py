@@ -107,7 +107,7 @@ async def test_a_configuration_that_was_edited_while_the_daemon_runs_is_reported
         (trouble,) = await asyncio.to_thread(lambda: list(examine_daemon(load(file))))
     assert trouble.code == "ConfigDiffers"
     said = [" ".join((out + err).split()) for _, out, err in answers]
-    assert [("another configuration than the file" in text, "X 250 um" in text) for text in said] == [(True, True)] * 4
+    assert [("configuration file has changed" in text, "X 250 um" in text) for text in said] == [(True, True)] * 4
     assert json.loads(answers[1][1])["limits"]["X"]["max_offset_um"] == 250.0
 
 

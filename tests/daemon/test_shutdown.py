@@ -92,7 +92,7 @@ async def test_device_that_does_not_close_is_reported_and_left(
     await stopped(service, machine.running)
     service.shutdown.leave_overrun()
     service.shutdown.end()
-    assert "closing buses and sensors is not done after 0.01 s and is left" in capsys.readouterr().err
+    assert "closing buses and sensors is not finished after 0.01 s and is abandoned" in capsys.readouterr().err
     assert left == [3]
     machine.released.set()
 
@@ -106,7 +106,7 @@ async def test_disk_that_does_not_answer_is_reported_and_left(
     monkeypatch.setattr(service._store, "close", lambda: (disk_answers.wait(), close()))
     try:
         await stopped(service, machine.running)
-        assert "closing the store is not done after 0.01 s and is left" in capsys.readouterr().err
+        assert "closing the store is not finished after 0.01 s and is abandoned" in capsys.readouterr().err
     finally:
         disk_answers.set()
 

@@ -413,7 +413,7 @@ def test_a_drive_that_was_touched_after_it_was_compared_stays_void(touched: Mapp
     restart(machine)
     machine.settle()
     asked = Request("compared", True, compared={"X": RECORD}, touched=touched)
-    told = Alarm("RecordVoid", "X", "that was after it was compared")
+    told = Alarm("RecordVoid", "X", "after it was compared")
     assert machine.sync(asked).refused == (told,)
     assert codes(machine.arm()) == {"RecordVoid"}
     restart(machine)  # in the very cycle in which the guard is told

@@ -285,13 +285,13 @@ def test_what_cannot_be_ramped_freezes_what_may_pass_is_held_and_all_else_that_g
 
 def test_an_alarm_says_axis_cause_detail_effect_and_next_action() -> None:
     bare, full = Alarm("SyncLost"), Alarm("SyncLost", "X", "for 4 ms")
-    assert bare.cause == "no SYNC is heard"
-    assert full.cause == "axis X: no SYNC is heard (for 4 ms)"
+    assert bare.cause == "no SYNC is received"
+    assert full.cause == "axis X: no SYNC is received (for 4 ms)"
     action = "hold the feed, restore the NC's SYNC, then adopt"
     frozen = "nothing can be sent: the last offset may still be applied"
-    assert bare.sentence() == f"no SYNC is heard; {frozen}; {action}"
+    assert bare.sentence() == f"no SYNC is received; {frozen}; {action}"
     off = "the correction is off and nothing is applied"
-    assert bare.sentence(off=True) == f"no SYNC is heard; {off}; {action}"
+    assert bare.sentence(off=True) == f"no SYNC is received; {off}; {action}"
     assert Alarm("NotOff", detail="FROZEN").action == "hold the feed, then run fdhil adopt"
     assert Alarm("NotOff", detail="ACTIVE").action == "disarm it first"
     assert Alarm("SyncLost", detail="FROZEN").action == action

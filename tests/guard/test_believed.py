@@ -91,7 +91,7 @@ def test_doubt_lasts_six_readings_in_a_row_and_then_freezes_for_good() -> None:
     assert started(unheard, "StaleData").unknown_for == 0
     state = started(state, "StaleData")
     assert (state.mode, state.adopt_checked) == (Mode.FROZEN, True)
-    told = "axis X: what the drive holds as offset may not be believed (152.6 um may still be applied: the drive's"
+    told = "axis X: the offset that the drive reports cannot be trusted (152.6 um may still be applied: the drive's"
     assert state.cause is not None
     assert state.cause.sentence().startswith(told)
 
@@ -115,10 +115,10 @@ def test_after_a_foreign_offset_the_drives_have_six_readings_to_agree() -> None:
     ("axis", "told"),
     [
         ({"off_demand": 2.0}, ""),
-        ({"off_demand": 2.5}, "152.6 um may still be applied: its demand (0x6062) says otherwise"),
-        ({"off_demand": float("nan")}, "152.6 um may still be applied: its demand (0x6062) says otherwise"),
-        ({"readings": 2}, "three TPDOs in a row do not agree on it"),
-        ({"read_back": None}, "three TPDOs in a row do not agree on it"),
+        ({"off_demand": 2.5}, "152.6 um may still be applied: its demand (0x6062) contradicts it"),
+        ({"off_demand": float("nan")}, "152.6 um may still be applied: its demand (0x6062) contradicts it"),
+        ({"readings": 2}, "no three TPDOs in a row agree on it"),
+        ({"read_back": None}, "no three TPDOs in a row agree on it"),
         ({"read_back": 819}, ""),
         ({"read_back": -820}, "-250.2 um may still be applied: beyond the ceiling of 250 um"),
     ],
@@ -144,7 +144,7 @@ def test_a_value_is_believed_of_a_drive_that_is_as_it_was_commissioned() -> None
 def test_who_is_told_of_a_doubt_is_told_the_axis_the_offset_and_the_reason() -> None:
     """The axis that shows an offset; where none does (a torque is held), the first."""
     doubtful: Alarms = (Alarm("RecordVoid", "Y"),)
-    reason = "axis Y: the drive has rebooted or was set up anew since it was commissioned"
+    reason = "axis Y: the drive has rebooted or its settings have changed since it was commissioned"
     for shown, axis, um in (((500, 0), "X", "152.6"), ((0, -500), "Y", "-152.6"), ((0, 0), "X", "0.0")):
         told = Alarm("OffsetDoubtful", axis, f"{um} um may still be applied: {reason}")
         assert in_doubt(views(held(*shown)), doubtful) == told
@@ -230,7 +230,7 @@ def test_adopting_and_comparing_are_refused_while_it_sends(mode: Mode) -> None:
 
 
 def test_a_drive_that_is_another_is_told_by_its_axis() -> None:
-    told = Alarm("RecordVoid", "Y", "it differs from the record that this guard knows")
+    told = Alarm("RecordVoid", "Y", "it differs from the guard's record")
     for found, refused in (({"X": RECORD, "Y": "another"}, (told,)), ({"X": RECORD}, ())):
         state, answer = compared(
             held(0, 0), Request("compared", True, compared=found, touched=dict.fromkeys("XY", 0)), MADE

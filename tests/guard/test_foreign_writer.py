@@ -203,5 +203,5 @@ def test_writers_are_heard_and_none_of_ours() -> None:
     assert from_json(to_json(made)) == made
     for ours in (0x301, 0x201, 0x181):
         axes = (replace(made.axes[0], writers=(ours,)), *made.axes[1:])
-        with pytest.raises(ConfigError, match="counts as a foreign writer's"):
+        with pytest.raises(ConfigError, match="is listed as a foreign writer's"):
             from_json(to_json(replace(made, axes=axes)))

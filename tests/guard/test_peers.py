@@ -109,7 +109,7 @@ def test_a_stranger_is_told_and_let_go_and_takes_nobodys_place(shop: Shop, monke
     become(monkeypatch, STRANGER)
     client = shop.connect()
     told = shop.answer(client)
-    assert (told["code"], "may not talk to the guard" in told["text"]) == ("AuthRequired", True)
+    assert (told["code"], "has no access to the guard" in told["text"]) == ("AuthRequired", True)
     assert shop.guard.control.clients == []
     assert [(e["request"], e["uid"]) for e in shop.events() if e["event"] == "refused"] == [("to talk", STRANGER)]
 
@@ -169,4 +169,4 @@ def test_another_user_of_this_computer_is_known_by_the_kernel() -> None:
         asked.stdout.close()
         shop.close()
     assert [answer["ok"] for answer in answers] == [True, True, False]
-    assert answers[2]["text"] == "user 65534 may not ask the guard for 'adopt'"
+    assert answers[2]["text"] == "user 65534 may not request 'adopt' from the guard"

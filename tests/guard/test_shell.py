@@ -791,7 +791,7 @@ def test_one_full_queue_does_not_silence_the_watchdog(tmp_path: Path) -> None:
     systemd.setblocking(False)
     notifier = Notifier(address)
     sent = 0
-    while not notifier._untold:
+    while not notifier._pending:
         notifier.tell(f"STATUS={sent}")
         sent += 1
     notifier.tell("READY=1")

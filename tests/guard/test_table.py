@@ -272,7 +272,7 @@ def test_a_piece_that_does_not_belong_is_refused(changed: dict[str, object], axe
     limits = (LIMITS,) * 2
     path = table.begin(body(final=False), 1, "XY", limits, None, 0).joined
     piece = table.encode("XY", ROWS, OFFSETS, str(changed.get("program", "p")), int(str(changed.get("first", 0))))
-    told = f"^row {changed.get('first')} does not continue the loaded table; load it anew$"
+    told = f"^row {changed.get('first')} does not continue the loaded table; load it again$"
     if not changed:
         told = f"^the table is for axes X, Y, not {', '.join(axes)}$"
     with pytest.raises(TableRefused, match=told) as refusal:
@@ -296,7 +296,7 @@ def test_first_rows_take_the_place_of_those_of_the_same_table_alone(what: dict[s
     rows = {axis: [*values, *values[:1]][: int(str(what.get("rows", 4)))] for axis, values in ROWS.items()}
     zeros = {axis: [0] * len(rows["X"]) for axis in "XY"}
     piece = table.encode("XY", rows, zeros, str(what.get("program", "p")), int(str(what.get("first", 0))))
-    told = "^the rows are not the first ones of the loaded table; load it anew$"
+    told = "^the rows are not the first ones of the loaded table; load it again$"
     with pytest.raises(TableRefused, match=told) as refusal:
         table.renew(piece, 2, str(what.get("axes", "XY")), limits, loaded)
     assert refusal.value.code == "ProgramMismatch"
@@ -305,7 +305,7 @@ def test_first_rows_take_the_place_of_those_of_the_same_table_alone(what: dict[s
 def test_first_rows_of_another_way_are_those_of_another_path() -> None:
     loaded = table.begin(body(), 1, "XY", (LIMITS,) * 2, None, 0).joined
     other = table.encode("XY", ROWS | {"Y": [5, 5, 5, 6]}, OFFSETS, "p")
-    told = "^the rows are those of another path than the loaded one; load it anew$"
+    told = "^the rows are those of another path than the loaded one; load it again$"
     with pytest.raises(TableRefused, match=told) as refusal:
         table.renew(other, 2, "XY", (LIMITS,) * 2, loaded)
     assert refusal.value.code == "ProgramMismatch"
@@ -416,7 +416,9 @@ def test_a_path_that_comes_nearer_is_no_table(demand: list[int]) -> None:
 @pytest.mark.parametrize("end", [2**31 - 1 - 9, 2**31 - 1, -(2**31) + 9, -(2**31)])
 def test_no_offset_on_a_path_leaves_32_bits(end: int) -> None:
     """The largest offset is 10 here: one increment nearer to the end and the drive would wrap around."""
-    with pytest.raises(TableRefused, match="path comes nearer to the end of 32 bits than the largest") as caught:
+    with pytest.raises(
+        TableRefused, match="path comes nearer to the end of the 32-bit range than the largest"
+    ) as caught:
         loaded_within(None, [0] * 5 + [end])
     assert caught.value.code == "PositionRange"
 

@@ -328,21 +328,21 @@ def test_an_offset_under_another_senders_id_is_refused(taken: tuple[str | int, .
     for key in taken:
         inner = inner[key]
     document["axes"][0]["offset"]["cob_id"] = inner["cob_id"]
-    with pytest.raises(ConfigError, match="is another sender's"):
+    with pytest.raises(ConfigError, match="is also used by"):
         from_json(json.dumps(document))
 
 
 def test_a_heartbeat_of_ours_in_a_drives_name_is_refused() -> None:
     document = json.loads(to_json(settings()))
     document["node_id"] = document["axes"][1]["node_id"]
-    with pytest.raises(ConfigError, match="is another sender's"):
+    with pytest.raises(ConfigError, match="is also used by"):
         from_json(json.dumps(document))
 
 
 def test_two_axes_that_are_one_are_refused() -> None:
     document = json.loads(to_json(settings()))
     document["axes"][1]["tpdos"] = document["axes"][0]["tpdos"]
-    with pytest.raises(ConfigError, match="two axes are one"):
+    with pytest.raises(ConfigError, match="two axes share a name"):
         from_json(json.dumps(document))
 
 

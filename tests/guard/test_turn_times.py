@@ -54,7 +54,7 @@ def test_late_offsets_explain_what_a_drive_shows_soon_after_them_and_nothing_els
     turns.begin()
     assert turns.blame("LimitActive", 5.5) == ""
     alarm = Alarm("LimitActive", "X", late=told)
-    assert alarm.cause == f"{told}: that is why axis X: an internal limit is active (statusword bit 11)"
+    assert alarm.cause == f"{told}, therefore axis X: an internal limit is active (statusword bit 11)"
     assert "take load off this PC" in alarm.action
     assert "adopt" in Alarm("SyncLost", late=told).action  # what was frozen needs what it always needs
 
@@ -111,6 +111,6 @@ def test_guard_says_that_the_pc_was_late_where_that_ended_the_correction(make: C
     cause = shop.ask(client, {"request": "status"})["cause"]
     assert cause["code"] == "LimitActive"
     assert cause["late"] == "this PC was late (1 offset, worst 9.0 ms)"
-    assert cause["text"].startswith("this PC was late (1 offset, worst 9.0 ms): that is why axis X: an internal limit")
+    assert cause["text"].startswith("this PC was late (1 offset, worst 9.0 ms), therefore axis X: an internal limit")
     assert "take load off this PC" in cause["advice"]
     assert any("this PC was late" in event.get("text", "") for event in shop.events())

@@ -227,7 +227,7 @@ def test_no_other_computer_is_served_unless_the_config_says_so(keys: dict[str, A
     ("keys", "words"),
     [
         ({"port": 0, "tls_certificate_file": "none.crt", "tls_key_file": "none.key"}, "TLS files cannot be used"),
-        ({"host": "203.0.113.1", "unprotected": True}, "cannot be opened"),  # TEST-NET-3: no computer has it
+        ({"host": "203.0.113.1", "unprotected": True}, "cannot listen"),  # TEST-NET-3: no computer has it
     ],
 )
 async def test_what_cannot_be_served_is_one_sentence(keys: dict[str, Any], words: str, tmp_path: Path) -> None:

@@ -88,7 +88,7 @@ def test_a_step_off_by_two_percent_is_a_gap() -> None:
         (_text(sample_rate_hz="9" * 5000), "sample_rate_hz = '9999"),
         (_text().replace(",2.50000,", "," + "9" * 5000 + ","), "non-finite value '9999"),
         (_text().replace(",2.50000,", "," + "x" * 5000 + ","), "'xxxxx"),
-        (_text() + "0," * 50_000 + "0\n", "has 100001 characters, which no row has"),
+        (_text() + "0," * 50_000 + "0\n", "has 100001 characters, which no valid row has"),
         (_text().replace("time_s,", "time_s," + "x," * 50_000), "which no row has"),
         (
             _text(voltage_begin_s="0", voltage_period_s="0.005", voltage_samples_V="0 " * 9_000_000),
