@@ -10,7 +10,6 @@ all wait for answers, four more clients may send ``status`` and ``disarm``.
 
 import asyncio
 import contextlib
-import json
 import select
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
@@ -172,11 +171,10 @@ class ControlServer:
 
     async def _attended(self, line: bytes, peer: Peer, writer: asyncio.StreamWriter) -> Answer:
         """Answer a request; during an arm request report progress and check that the client still waits."""
-        try:
-            request = json.loads(line)
-        except (ValueError, RecursionError):
-            return refusal("BadRequest", "the request is not valid JSON", "send one JSON object per line")
-        if not isinstance(request, dict) or request.get("request") != "arm" or not peer.may("arm"):
+        request = decode_line(line)
+        if request is None:
+            return refusal("BadRequest", "the request is not a JSON object", "send one JSON object per line")
+        if request.get("request") != "arm" or not peer.may("arm"):
             return await self._answer(request, peer)
         if _hung_up(writer):
             return ABANDONED  # the client left while this process was suspended
@@ -198,8 +196,8 @@ class ControlServer:
         elif wanted and (progress := self._progress()):
             writer.write(encode_line({"progress": progress}))
 
-    async def _answer(self, request: Any, peer: Peer) -> Answer:
-        if not isinstance(request, dict) or not isinstance(request.get("request"), str):
+    async def _answer(self, request: Mapping[str, Any], peer: Peer) -> Answer:
+        if not isinstance(request.get("request"), str):
             return refusal(
                 "BadRequest", "the request has no text under the key 'request'", "status, arm, disarm or stop"
             )
@@ -255,8 +253,8 @@ def ask(
             client.sendall(encode_line({**request, **wanted}))
             with client.makefile("rb") as lines:
                 line = lines.readline()
-                while progress and line.startswith(b'{"progress"'):
-                    progress(json.loads(line)["progress"])
+                while progress and line.startswith(b'{"progress"') and (report := decode_line(line)):
+                    progress(report["progress"])
                     line = lines.readline()
     except TimeoutError:
         text = f"did not answer within {timeout_s:.0f} s; see its log"

@@ -1,6 +1,5 @@
 """Writes one readable log line per outcome; under systemd with the priority that the journal understands."""
 
-import json
 import os
 import select
 import sys
@@ -10,6 +9,7 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import Literal, TextIO
 
+from fdhil.json_lines import encode_line
 from fdhil.records import (
     PARAMETERS,
     UNITS,
@@ -77,7 +77,7 @@ def _line(text: str, severity: Severity) -> tuple[TextIO, str]:
     now = datetime.fromtimestamp(_clocks[-1].wall_s(), UTC)
     if _for_programs.is_set():
         line = {"time": now.isoformat(timespec="milliseconds"), "severity": severity, "text": text}
-        return sys.stdout, json.dumps(line) + "\n"
+        return sys.stdout, encode_line(line).decode()
     stamp = f"{now:%Y-%m-%d %H:%M:%S}.{now.microsecond // 1000:03d} UTC "
     prefix = f"<{_PRIORITY[severity]}>" if os.environ.get("JOURNAL_STREAM") else stamp
     return sys.stderr, f"{prefix}{printable(text)}\n"

@@ -119,7 +119,7 @@ async def test_a_wrong_period_a_node_never_heard_and_a_dead_bus_are_told(
         assert told["source"]["state"] == "listening"
         assert told["sync"]["rate_hz"] == pytest.approx(500.0, rel=0.01)
         troubles = {(each["code"], each["axis"]): each["text"] for each in told["troubles"]}
-        expected = r"SYNC runs at (499\.\d|500(\.\d)?) Hz instead of 1000 Hz as configured: .* set sync_period_s = 0\.00(2|1999)"
+        expected = r"SYNC runs at (499\.\d|500(\.\d)?) Hz instead of 1000 Hz .* set sync_period_s = 0\.00(2|1999)"
         assert re.search(expected, troubles["SyncPeriodSuspect", ""])
         assert "the drive (node 2 on can0) has never sent a frame" in troubles["NodeNeverHeard", "Y"]
         assert {notice["code"] for notice in told["notices"]} >= WRONG
