@@ -285,7 +285,7 @@ NOTICE = {"number": 41, "time": "2026-11-22T13:47:00+00:00", "axis": "X", "code"
 def test_notices_are_acknowledged_by_their_numbers(machine: Path, capsys: Any) -> None:
     with answering(machine, {"ok": True, "text": "notice 41 acknowledged by me; 0 more are open"}) as asked:
         code, out, _ = fdhil("acknowledge", machine, "41", "--note", "seen", capsys=capsys)
-    assert (code, out) == (0, "notice 41 acknowledged by me; 0 more wait\n")
+    assert (code, out) == (0, "notice 41 acknowledged by me; 0 more are open\n")
     (request,) = asked
     assert (request["request"], request["notices"], request["note"]) == ("acknowledge", [41], "seen")
     assert request["by"]
