@@ -298,7 +298,7 @@ def test_a_rapid_whose_recording_the_disk_refused_says_so(tmp_path: Path) -> Non
         history.add_window(outcome(), "", STAMP)
     fault = json.loads(Replays(config, config.digest).answer({"axis": "X", "number": 1})[1:])
     assert (fault["status"], fault["code"]) == (404, "NotKept")
-    assert "were not stored" in fault["text"]
+    assert "was not kept" in fault["text"]
 
 
 async def test_a_row_that_is_damaged_is_left_out(tmp_path: Path) -> None:
