@@ -10,7 +10,7 @@ import errno
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-MOST_TOLD, MOST_CHARACTERS = 51, 2000  # bounds of a message, whatever the file
+MOST_FAULTS, MOST_CHARACTERS = 51, 2000  # bounds of a message, whatever the file
 LONGEST_WORD = 60  # of a program, in a message
 
 
@@ -41,10 +41,10 @@ class ConfigError(FdhilError):
     def __init__(self, source: str, faults: Sequence[ConfigFault]) -> None:
         self.source = source
         self.faults = tuple(faults)
-        told = [str(fault)[:MOST_CHARACTERS] for fault in self.faults[:MOST_TOLD]]
-        if len(self.faults) > MOST_TOLD:
-            told.append(f"and {len(self.faults) - MOST_TOLD} more faults; fix these first")
-        super().__init__(f"{source}: " + "; ".join(told))
+        shown_faults = [str(fault)[:MOST_CHARACTERS] for fault in self.faults[:MOST_FAULTS]]
+        if len(self.faults) > MOST_FAULTS:
+            shown_faults.append(f"and {len(self.faults) - MOST_FAULTS} more faults; fix these first")
+        super().__init__(f"{source}: " + "; ".join(shown_faults))
 
 
 class DeviceError(FdhilError):

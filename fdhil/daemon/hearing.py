@@ -49,7 +49,7 @@ class Hearing:
     def _forget(self, now_s: float) -> None:
         """Reset everything: earlier counts belong to another source."""
         self._frames: dict[str, int] = {}
-        self._heard_s = dict.fromkeys(("", *self._buses), now_s)
+        self._received_s = dict.fromkeys(("", *self._buses), now_s)
         self._counters: Mapping[str, Any] = {}
         self._loads: tuple[float, dict[str, int]] = (now_s, {})
         self.load_percent: dict[str, float] = {}
@@ -97,10 +97,10 @@ class Hearing:
     def counted(self, counters: Mapping[str, Any], now_s: float) -> None:
         """Take the source's counters: a growing one shows reception."""
         self._counters = counters
-        frames = {bus: int(counters.get(f"{bus}.frames" if bus else "frames", 0)) for bus in self._heard_s}
+        frames = {bus: int(counters.get(f"{bus}.frames" if bus else "frames", 0)) for bus in self._received_s}
         for bus, count in frames.items():
             if count != self._frames.get(bus, 0):
-                self._heard_s[bus] = now_s
+                self._received_s[bus] = now_s
         self._frames = frames
         then_s, before = self._loads
         if before and now_s - then_s < LOAD_S:
@@ -123,8 +123,8 @@ class Hearing:
     def status(self, now_s: float) -> dict[str, Any]:
         """Return the reception part of the status document, with ages."""
         rate = self.sync_rate_hz(now_s)
-        heard = {bus: round(now_s - at_s, 3) for bus, at_s in self._heard_s.items()}
-        heard_s_ago = heard.pop("")
+        ages = {bus: round(now_s - at_s, 3) for bus, at_s in self._received_s.items()}
+        heard_s_ago = ages.pop("")
         state = "reconnecting" if not self.open else "listening" if heard_s_ago <= LIVE_S else "silent"
         return {
             "source": {
@@ -132,7 +132,7 @@ class Hearing:
                 "since_s": round(now_s - self.opened_s, 3),
                 "lost_times": self.lost_times,
                 "heard_s_ago": heard_s_ago,
-                "buses": heard if self.open else {},
+                "buses": ages if self.open else {},
                 "last_record_age_s": None if self._last_record_s is None else round(now_s - self._last_record_s, 3),
             },
             "sync": {
@@ -197,7 +197,7 @@ class Hearing:
 
     def _missing(self, axis: str, bus: str, synced: bool, now_s: float) -> tuple[str, str] | None:
         """Return the problem of a drive from which no data arrive while its bus is active."""
-        if now_s - self._heard_s[bus] > LIVE_S:
+        if now_s - self._received_s[bus] > LIVE_S:
             return None
         node = f"node {self._config.node_id(axis)} on {bus}"
         if self._counters.get(f"{bus}.{axis}.heard") == 0:

@@ -25,12 +25,12 @@ class NcWatch:
 
     def __init__(self) -> None:
         self._state: NcState | None = None
-        self._heard_s = 0.0
+        self._received_s = 0.0
         self._unusual: dict[str, str] = {}
 
     def note(self, state: NcState, now_s: float) -> list[Notice]:
         """Take a state; return notices for what becomes unusual, and for what is normal again."""
-        self._state, self._heard_s = state, now_s
+        self._state, self._received_s = state, now_s
         if state.motion is MoveKind.UNKNOWN:
             return []
         found = dict(_unusual(state))
@@ -47,7 +47,7 @@ class NcWatch:
         state = self._state
         if state is None or notice.severity == "info" or state.line is None or state.motion not in WORKING:
             return ""
-        if now_s - self._heard_s > FRESH_S:
+        if now_s - self._received_s > FRESH_S:
             return ""
         program = "" if state.program is None else f" of {state.program.rpartition('/')[2]}"
         return f" (the NC is at line {state.line}{program})"
@@ -67,7 +67,7 @@ class NcWatch:
             "rapid_override": state.rapid_override,
             "feed_hold": state.feed_hold,
             "tool": state.tool,
-            "heard_s_ago": round(now_s - self._heard_s, 3),
+            "heard_s_ago": round(now_s - self._received_s, 3),
         }
 
 

@@ -33,7 +33,7 @@ class NoticeBook:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._known: dict[int, StoredNotice | Acknowledgement] = {}
+        self._by_number: dict[int, StoredNotice | Acknowledgement] = {}
         self._last: deque[tuple[Notice, int]] = deque(maxlen=LAST_STORED)
         self._alarms = AlarmTable()
 
@@ -43,7 +43,7 @@ class NoticeBook:
             self._last.clear()
             self._alarms = AlarmTable(notices)
             asking = [notice for notice in notices if notice.notice.severity != "info"]
-            self._known = {notice.number: notice.acknowledged or notice for notice in asking}
+            self._by_number = {notice.number: notice.acknowledged or notice for notice in asking}
 
     def stored(self, notice: Notice, number: int, stamp: Stamp) -> None:
         """Add a stored notice."""
@@ -52,9 +52,9 @@ class NoticeBook:
             kept = StoredNotice(number, notice, stamp)
             self._alarms.take(kept)
             if notice.severity != "info":
-                self._known[number] = kept
-                for old in list(self._known)[:-NEWEST]:
-                    del self._known[old]
+                self._by_number[number] = kept
+                for old in list(self._by_number)[:-NEWEST]:
+                    del self._by_number[old]
                     self._alarms.forget(old)
 
     def chosen(self, request: Mapping[str, Any]) -> list[int]:
@@ -67,7 +67,7 @@ class NoticeBook:
             if not (isinstance(numbers, list) and numbers and all(map(_is_number, numbers)) and up_to is None):
                 text = "the request selects no notices"
                 raise NotAcknowledged("BadRequest", text, "give 'notices' (a list of numbers) or 'up_to' (a number)")
-            if unknown := [number for number in numbers if number not in self._known]:
+            if unknown := [number for number in numbers if number not in self._by_number]:
                 text = f"there is no notice {', '.join(map(str, unknown[:5]))} that can be acknowledged"
                 raise NotAcknowledged("NoSuchNotice", text, "fdhil status shows the numbers of open notices")
         named = set(numbers)
@@ -78,15 +78,15 @@ class NoticeBook:
         with self._lock:
             self._alarms.acknowledge(given)
             for number in given.notices:
-                if number in self._known:
-                    self._known[number] = given
+                if number in self._by_number:
+                    self._by_number[number] = given
 
     def told(self, notice: Notice) -> dict[str, Any]:
         """Return the number of a notice in the history (None: not stored yet) and its acknowledgement."""
         with self._lock:
-            number = next((number for known, number in reversed(self._last) if known is notice), None)
-            known = self._known.get(number) if number is not None else None
-        given = known if isinstance(known, Acknowledgement) else None
+            number = next((number for stored, number in reversed(self._last) if stored is notice), None)
+            entry = self._by_number.get(number) if number is not None else None
+        given = entry if isinstance(entry, Acknowledgement) else None
         return {"number": number, "acknowledged": acknowledgement_document(given)}
 
     def status(self) -> dict[str, Any]:
@@ -111,7 +111,7 @@ class NoticeBook:
             return self._alarms.left_active()
 
     def _open(self) -> list[StoredNotice]:
-        return [known for known in self._known.values() if isinstance(known, StoredNotice)]
+        return [each for each in self._by_number.values() if isinstance(each, StoredNotice)]
 
 
 def _is_number(value: object) -> bool:

@@ -14,7 +14,7 @@ class OfferWatch:
     def __init__(self, config: MachineConfig) -> None:
         self._folder = config.offers_directory if config.offers.trust else None
         self._store = config.store.directory
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
 
     def look(self) -> list[Notice]:
         """Return a notice for each proposal that has arrived since the last call."""
@@ -22,6 +22,6 @@ class OfferWatch:
             found = waiting(self._folder, self._store) if self._folder is not None else []
         except StoreError as error:
             found = [str(error)]
-        before, self._told = self._told, set(found[:MOST])
+        before, self._reported = self._reported, set(found[:MOST])
         new = [offer for offer in found[:MOST] if offer not in before]
         return [Notice("OfferWaits", "minor", f"a configuration change is proposed: {offer}") for offer in new]

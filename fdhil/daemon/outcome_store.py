@@ -64,16 +64,16 @@ def _point(window: StoredWindow) -> Point:
 
 def _numbers(window: StoredWindow, key: str) -> Float:
     """Return a figure (6,) of each parameter of a stored window, NaN where it is missing."""
-    told = window.parameters or {}
-    return frozen([math.nan if (number := told.get(name, {}).get(key)) is None else number for name in PARAMETERS])
+    figures = window.parameters or {}
+    return frozen([math.nan if (number := figures.get(name, {}).get(key)) is None else number for name in PARAMETERS])
 
 
 def _members(windows: Sequence[StoredWindow]) -> tuple[Member, ...]:
     members = []
     for place, window in enumerate(windows, start=1 - len(windows)):
-        if (told := window.told) is not None:
-            values, own, shared = (frozen(told[key]) for key in ("values", "own", "shared"))
-            members.append(Member(tuple(told["names"]), values, own, shared, place, window.direction))
+        if (pooled := window.told) is not None:
+            values, own, shared = (frozen(pooled[key]) for key in ("values", "own", "shared"))
+            members.append(Member(tuple(pooled["names"]), values, own, shared, place, window.direction))
     return tuple(members)
 
 
@@ -95,7 +95,7 @@ class OutcomeStore:
         self._accepted = {axis: deque[tuple[int, int]](maxlen=HISTORY) for axis in config.axis}  # start tick and row
         self.notices = NoticeBook()
         self.fault: str | None = None
-        self._told_left = False
+        self._file_reported = False
         self.strays: tuple[str, ...] = ()
 
     def open(self) -> list[Notice]:
@@ -202,34 +202,34 @@ class OutcomeStore:
     def keep(self, outcomes: Sequence[Outcome]) -> list[Notice]:
         """Store outcomes durably in order; return a notice when that fails, and one when it works again."""
         with self._lock:
-            told = []
+            notices = []
             try:
-                told += self._leave_replaced()
-                told += self._write(outcomes)
+                notices += self._leave_replaced()
+                notices += self._write(outcomes)
                 if replaced := self._leave_replaced():  # replaced during the write
-                    told += [*replaced, *self._write(outcomes)]
+                    notices += [*replaced, *self._write(outcomes)]
             except StoreError as error:
-                return told + self._refused(error)
-            told += self._left_files()
+                return notices + self._refused(error)
+            notices += self._left_files()
             if self.fault is not None and any(isinstance(outcome, WindowOutcome) for outcome in outcomes):
                 self.fault = None
                 text = "The store can be written again; records in between were not stored, arm again when needed."
-                told.append(Notice("StoreRecovered", "info", text))
-        return told
+                notices.append(Notice("StoreRecovered", "info", text))
+        return notices
 
     def _write(self, outcomes: Sequence[Outcome]) -> list[Notice]:
-        told = self._open() if self._history is None or self._windows is None else []
+        notices = self._open() if self._history is None or self._windows is None else []
         assert self._history is not None
         for outcome in outcomes:
             self._keep(outcome)
         self._history.checkpoint()
-        return told
+        return notices
 
     def _left_files(self) -> list[Notice]:
         left = self._windows.left if self._windows is not None else None
-        if left is None or self._told_left:
+        if left is None or self._file_reported:
             return []
-        self._told_left = True
+        self._file_reported = True
         return [Notice("StrayFiles", "minor", str(left))]
 
     def acknowledge(self, request: Mapping[str, Any]) -> Answer:

@@ -9,14 +9,14 @@ from fdhil.records import Notice
 CODE = "SocketLost"
 
 
-async def reach_again(desk: ArmingDesk, trouble: str) -> Notice:
+async def reach_again(arming: ArmingDesk, trouble: str) -> Notice:
     """Write the token again after the socket; ramp to zero where ``trouble`` or an error prevents either."""
     try:
-        await asyncio.to_thread(desk.restore_token)
+        await asyncio.to_thread(arming.restore_token)
     except DeviceError as error:
         trouble = trouble or str(error)
     if trouble:
-        await desk.disarm()
+        await arming.disarm()
         text = f"The control socket or the token is gone and cannot be created again ({trouble}): disarmed."
         return Notice(CODE, "MAJOR", text)
     text = "The run directory was removed: the control socket and the token were created again; operation continues."

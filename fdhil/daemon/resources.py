@@ -77,15 +77,15 @@ class ResourceWatch:
 
     def look(self, found: tuple[Use, ...]) -> list[Notice]:
         """Return notices about the measured use."""
-        told: list[Notice] = []
+        notices: list[Notice] = []
         for use in found:
             if use.share >= HIGH and use.name not in self._high:
                 self._high.add(use.name)
-                told.append(Notice("ResourceHigh", "minor", f"the daemon uses {_said(use)}"))
+                notices.append(Notice("ResourceHigh", "minor", f"the daemon uses {_said(use)}"))
             elif use.share < LOW and use.name in self._high:
                 self._high.discard(use.name)
-                told.append(Notice("ResourceHigh", "info", f"the daemon uses {_said(use)} again"))
-        return told
+                notices.append(Notice("ResourceHigh", "info", f"the daemon uses {_said(use)} again"))
+        return notices
 
 
 def _said(use: Use) -> str:

@@ -67,7 +67,7 @@ class Service:
         self._method = method
         self._run_directory = config.run_directory
         self._store = OutcomeStore(config, clock)
-        self._desk = ArmingDesk(config, self._store, self._run_directory, clock)
+        self._arming = ArmingDesk(config, self._store, self._run_directory, clock)
         self._watch = Watch(config, self._clock.now_s())
         self._live = LiveStream(config)
         self._gantry = GantryWatch(config)
@@ -80,9 +80,9 @@ class Service:
         self._gate = journal.FloodGate()
         self._held: dict[alarms.Key, Notice] = {}  # newest suppressed notice of each condition
         self._audit = Audited(self._handle, config.store.directory, clock)
-        desk, access = self._desk, config.access
+        arming, access = self._arming, config.access
         self._control = ControlServer(
-            self._audit.of, lambda: desk.checking, desk.abandon, access, self._live.serve, self._socket_lost
+            self._audit.of, lambda: arming.checking, arming.abandon, access, self._live.serve, self._socket_lost
         )
         self._acquisition = Acquisition(config, open_source, self._watch.hearing, self._tell)
         self._stop = asyncio.Event()
@@ -104,7 +104,7 @@ class Service:
                 notify("STOPPING=1")
                 self.shutdown.begin()
                 await self._ramp_to_zero()
-                stop, budgets, stands = self.shutdown, self._budgets, self._desk.guard.standing
+                stop, budgets, stands = self.shutdown, self._budgets, self._arming.guard.standing
                 await stop.step("the audit log", self._audit.written(), budgets.audit_s, "its last lines are lost")
                 closing = asyncio.to_thread(self._store.close)
                 await stop.step("closing the store", closing, budgets.store_s, "its last records may be lost")
@@ -120,13 +120,13 @@ class Service:
         if stands.nothing:
             journal.write_line(f"stopped, {stands}")
         else:
-            advice = START_AND_ADOPT if self._desk.guard.state == "lost" else ADOPT
+            advice = START_AND_ADOPT if self._arming.guard.state == "lost" else ADOPT
             journal.write_line(f"stopped, {stands}; {advice}", "MAJOR")
 
     @property
     def standing(self) -> Standing:
         """The offset that may still be applied, as far as the daemon knows."""
-        return self._desk.guard.standing
+        return self._arming.guard.standing
 
     async def _serve(self) -> None:
         clock = ClockWatch(await asyncio.to_thread(newest_record_s, self._config.store.directory))
@@ -140,8 +140,8 @@ class Service:
             others = [tasks.create_task(self._work(axis), name=f"axis {axis}") for axis in self._config.axis]
             others.append(tasks.create_task(self._keep_notices(), name="notices"))
             others.append(tasks.create_task(self._void_records(), name="void"))
-            others.append(tasks.create_task(self._desk.attend(self._tell), name="guard"))
-            others.append(tasks.create_task(self._desk.stream(self._tell), name="stream"))
+            others.append(tasks.create_task(self._arming.attend(self._tell), name="guard"))
+            others.append(tasks.create_task(self._arming.stream(self._tell), name="stream"))
             others.append(tasks.create_task(self._feed_watchdog(), name="watchdog"))
             others.append(tasks.create_task(self._listen(), name="listen"))
             others.append(tasks.create_task(self._watch_resources(clock), name="resources"))
@@ -163,7 +163,7 @@ class Service:
 
     async def _ramp_to_zero(self) -> None:
         effect = "the guard ramps to zero when this process has ended; see fdhil-guard's journal"
-        await self.shutdown.step("the ramp to zero", self._desk.stand_down(), self._budgets.zero_s, effect)
+        await self.shutdown.step("the ramp to zero", self._arming.stand_down(), self._budgets.zero_s, effect)
 
     async def _analysed(self) -> None:
         axes = (queue.join() for queue in self._queues.values())
@@ -171,11 +171,11 @@ class Service:
 
     def _prepare(self) -> None:
         """Load each axis from the history, and compile the kernels."""
-        self._desk.begin(self._store.newest(), self._store.skills())
+        self._arming.begin(self._store.newest(), self._store.skills())
         for axis in self._config.axis:
-            known = self._store.known(axis)
-            self._pipelines[axis] = AxisPipeline(axis, self._config, self._method, known)
-            self._watch.begin(axis, known.newest, self._store.counts(axis), known.loops)
+            history = self._store.known(axis)
+            self._pipelines[axis] = AxisPipeline(axis, self._config, self._method, history)
+            self._watch.begin(axis, history.newest, self._store.counts(axis), history.loops)
         warm(self._config, self._method)
 
     async def _say_ready(self) -> None:
@@ -189,7 +189,7 @@ class Service:
     def _take(self, record: Record | NcState | Notice) -> None:
         self._acquisition.received()
         if isinstance(record, NcState):
-            self._desk.hear_nc(record)
+            self._arming.hear_nc(record)
             self._tell(self._watch.nc.note(record, self._clock.now_s()))
             return
         self._watch.hearing.record_came(record, self._clock.now_s())
@@ -198,10 +198,10 @@ class Service:
             return
         self._live.take(record)
         if isinstance(record, Temperature):
-            self._desk.knowledge.note_temperature(record)
+            self._arming.knowledge.note_temperature(record)
         elif isinstance(record, AxisSamples):
             self._gantry.feed(record)
-            self._desk.hear(record)
+            self._arming.hear(record)
         for axis in self._config.axis if isinstance(record, TickTimes) else (record.axis,):
             if axis in self._queues:
                 self._queues[axis].put(record)
@@ -214,7 +214,7 @@ class Service:
             self._busy_since_s[axis] = self._clock.now_s()
             outcomes, notices = await asyncio.to_thread(self._digest, axis, batch)
             del self._busy_since_s[axis]
-            self._desk.knowledge.note(outcomes)
+            self._arming.knowledge.note(outcomes)
             self._say([*outcomes, *notices])
             queue.digested(len(batch))
 
@@ -305,7 +305,7 @@ class Service:
             skewed, notices = self._gantry.look()
             self._tell(notices)
             if skewed:
-                await self._desk.disarm()
+                await self._arming.disarm()
 
     async def _watch_resources(self, clock: ClockWatch) -> None:
         """Check memory, descriptors, the clock, waiting proposals and the store periodically."""
@@ -326,12 +326,12 @@ class Service:
         if request["request"] == "live":
             return self._live.begin()
         if request["request"] == "arm":
-            answer = await self._desk.arm(request, lambda: self._control.hung_up)
-            self._tell([*await asyncio.to_thread(self._desk.guard.take_changes), _told(answer)])
+            answer = await self._arming.arm(request, lambda: self._control.hung_up)
+            self._tell([*await asyncio.to_thread(self._arming.guard.take_changes), _told(answer)])
             difference = self._watch.config_difference(request.get("config_digest", self._config.digest))
             return {**answer, "config_difference": difference} if difference else answer
         if request["request"] == "disarm":
-            return await self._desk.disarm()
+            return await self._arming.disarm()
         if request["request"] == "acknowledge":
             return await asyncio.to_thread(self._store.acknowledge, request)
         if request["request"] == "stop":
@@ -341,7 +341,7 @@ class Service:
         return refusal("BadRequest", text, "send status, live, arm, disarm, acknowledge or stop")
 
     async def _socket_lost(self, trouble: str) -> None:
-        self._tell([await reach_again(self._desk, trouble)])
+        self._tell([await reach_again(self._arming, trouble)])
 
     def _status(self) -> Answer:
         counters = dict(self._acquisition.source.counters()) if self._acquisition.source is not None else {}
@@ -353,8 +353,8 @@ class Service:
             "strays": list(self._store.strays),
         }
         status = self._watch.status(self._clock.now_s(), self._store.notices.told)
-        guard = self._desk.guard
-        for axis, celsius in self._desk.knowledge.temperatures.items():
+        guard = self._arming.guard
+        for axis, celsius in self._arming.knowledge.temperatures.items():
             status["axes"][axis]["slideway_c"] = celsius
         return {
             "ok": True,
@@ -366,9 +366,9 @@ class Service:
             "resources": {use.name: {"used": use.used, "allowed": use.allowed} for use in self._resources},
             "guard": dict(guard.status),
             "may_stand": {"nothing": guard.standing.nothing, "text": str(guard.standing)},
-            "armed": self._desk.armed,
-            "checking": self._desk.checking,
-            "passes": self._desk.passes,
+            "armed": self._arming.armed,
+            "checking": self._arming.checking,
+            "passes": self._arming.passes,
             "store": store,
             "unacknowledged": self._store.notices.status(),
             "alarms": self._store.notices.alarms(),

@@ -102,8 +102,8 @@ class RawCan(CanSocket):
             self._socket.bind((self._channel,))
             # an interface that was removed has taken the filters with it
             self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, self._filters)
-            asked = _IFREQ.pack(self._channel.encode(), 0)
-            up = _IFREQ.unpack(fcntl.ioctl(self._socket.fileno(), SIOCGIFFLAGS, asked))[1] & IFF_UP
+            query = _IFREQ.pack(self._channel.encode(), 0)
+            up = _IFREQ.unpack(fcntl.ioctl(self._socket.fileno(), SIOCGIFFLAGS, query))[1] & IFF_UP
             self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)  # clears the old error
             return bool(up) and any(not self.receive() for _ in range(MOST_TURNS))
         except (OSError, BusDown):

@@ -147,13 +147,13 @@ def react(feed: Feed, alarms: Sequence[Alarm]) -> Feed:
 
 def hear(feed: Feed, targets: Sequence[int | None]) -> Feed:
     """Take the targets that a SYNC latched; extrapolate a missing one from the two before it."""
-    heard = []
+    latched = []
     for law, past, target in zip(feed.laws, feed.targets, targets, strict=True):
         newest = target
         if newest is None:
             newest = 2 * past[0] - past[1] if len(past) > 1 else None
-        heard.append(past if newest is None else (newest, *past)[: law.depth])
-    return feed._replace(targets=tuple(heard))
+        latched.append(past if newest is None else (newest, *past)[: law.depth])
+    return feed._replace(targets=tuple(latched))
 
 
 def move(feed: Feed, limits: Sequence[FeedforwardLimits], fade_cycles: int, confirmed: bool = True) -> Feed:
@@ -163,12 +163,12 @@ def move(feed: Feed, limits: Sequence[FeedforwardLimits], fade_cycles: int, conf
     """
     if feed.mode is FeedMode.ZEROING:
         return zeroed(feed, confirmed)
-    known = all(len(past) == law.depth for law, past in zip(feed.laws, feed.targets, strict=True))
+    complete = all(len(past) == law.depth for law, past in zip(feed.laws, feed.targets, strict=True))
     share = feed.share + 1 if feed.mode is FeedMode.ON else feed.share - 1
-    feed = feed._replace(share=clamp(share, 0, fade_cycles) if known else 0)
+    feed = feed._replace(share=clamp(share, 0, fade_cycles) if complete else 0)
     applied, limited = [], False
     for k, (law, past, own) in enumerate(zip(feed.laws, feed.targets, limits, strict=True)):
-        speed, torque = law.offsets(past) if known else (0, 0)
+        speed, torque = law.offsets(past) if complete else (0, 0)
         limited = limited or abs(speed) > own.speed or abs(torque) > own.torque
         applied.append(_inside(feed.applied[k], (speed, torque), feed.share, fade_cycles, own))
     feed = feed.send(tuple(applied))._replace(limited=feed.limited + limited)

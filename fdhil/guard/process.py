@@ -272,8 +272,8 @@ class Guard:
             self._turns.begin()
         if output.refused is not None and client is not None:
             self._answer(client, document, output.refused)
-        asked = client.peer if client is not None and request is not None and request.kind == "disarm" else None
-        by = {"uid": asked.uid, "pid": asked.pid} if asked is not None else {}
+        disarmed_by = client.peer if client is not None and request is not None and request.kind == "disarm" else None
+        by = {"uid": disarmed_by.uid, "pid": disarmed_by.pid} if disarmed_by is not None else {}
         if output.transition is not None and not {*output.transition[:2]} <= {Mode.RAMPING, Mode.ACTIVE}:
             self._explain(now_s)
             self._tell(*output.transition[:2], self.state.cause, by)
@@ -347,11 +347,11 @@ class Guard:
 
     # --- the clients ---
 
-    def _serve(self, asked: set[int]) -> None:
+    def _serve(self, ready: set[int]) -> None:
         """Serve one client and check some rows of a table; then pause both, and wait for the bus alone."""
-        if not (asked or self.control.pending or self.intake.busy):
+        if not (ready or self.control.pending or self.intake.busy):
             return
-        served = self.control.serve(asked, self._now_s())
+        served = self.control.serve(ready, self._now_s())
         if served is not None:
             self._request(*served)
             served[0].settle()

@@ -86,7 +86,7 @@ async def publish(config: MachineConfig) -> None:
 
 def _configured(settings: PrometheusMetrics, page: Page) -> uvicorn.Config:
     """Return the server's settings; ConnectError with the TLS file that cannot be used."""
-    asked = settings.tls_client_ca_file
+    client_ca = settings.tls_client_ca_file
     configured = uvicorn.Config(
         page,
         lifespan="off",
@@ -101,8 +101,8 @@ def _configured(settings: PrometheusMetrics, page: Page) -> uvicorn.Config:
         timeout_graceful_shutdown=2,
         ssl_certfile=settings.tls_certificate_file,
         ssl_keyfile=settings.tls_key_file,
-        ssl_ca_certs=str(asked) if asked else None,
-        ssl_cert_reqs=ssl.CERT_REQUIRED if asked else ssl.CERT_NONE,
+        ssl_ca_certs=str(client_ca) if client_ca else None,
+        ssl_cert_reqs=ssl.CERT_REQUIRED if client_ca else ssl.CERT_NONE,
     )
     try:
         configured.load()

@@ -242,12 +242,12 @@ def events(status: Mapping[str, Any], now_ms: int) -> tuple[Event, ...]:
     """Return the newest notices of the daemon, oldest first."""
     return tuple(
         Event(
-            told["code"],
-            told["severity"],
-            told["text"],
-            told["axis"],
-            now_ms - round(1000 * told["age_s"]),
-            status["uptime_s"] - told["age_s"],
+            notice["code"],
+            notice["severity"],
+            notice["text"],
+            notice["axis"],
+            now_ms - round(1000 * notice["age_s"]),
+            status["uptime_s"] - notice["age_s"],
         )
-        for told in status.get("notices", [])
+        for notice in status.get("notices", [])
     )

@@ -303,7 +303,7 @@ def test_no_frame_is_beyond_the_compiled_ceiling(monkeypatch: pytest.MonkeyPatch
         machine.settings, axes=tuple(replace(axis, limits=limits) for axis in machine.settings.axes)
     )
     count = len(machine.frames)
-    monkeypatch.setattr(core, "follow", lambda *_: 820)
+    monkeypatch.setattr(core, core.follow.__name__, lambda *_: 820)
     machine.sync(Request("disarm"))
     assert machine.mode is Mode.FROZEN
     assert machine.alarms[-1].code == "InternalError"

@@ -24,6 +24,8 @@ from tests.guard.machine import settings as guard_settings
 from tests.proof.symbolic import Integer, assume, for_every_path, integers, prove
 from tests.proof.test_motion import Axis
 
+CEILING, NEXT_OFFSETS = core.ceiling.__name__, core._next_offsets.__name__
+
 pytestmark = pytest.mark.usefixtures("long_computation")
 
 MODES = sorted(SENDING)
@@ -46,7 +48,7 @@ class Core:
         self.axis = Axis(monkeypatch)
         (self.ceiling,) = integers("ceiling")
         assume(self.axis.limits.offset <= self.ceiling)
-        monkeypatch.setattr(core, "ceiling", lambda _increments_per_mm: self.ceiling)
+        monkeypatch.setattr(core, CEILING, lambda _increments_per_mm: self.ceiling)
         monkeypatch.setattr(core, "type", lambda value: int if isinstance(value, Integer) else type(value), False)
         made = guard_settings(axes=("X",))
         self.settings: Settings = replace(made, axes=(replace(made.axes[0], limits=self.axis.limits),))
@@ -68,7 +70,7 @@ def frames_keep_limits(mode: Mode, monkeypatch: pytest.MonkeyPatch) -> None:
             return (), Alarm("OffsetRate")
         return (wanted,), None
 
-    monkeypatch.setattr(core, "_next_offsets", computed)
+    monkeypatch.setattr(core, NEXT_OFFSETS, computed)
     state, output = made.move()
     after = state.axes[0]
     if output.offsets is None:

@@ -16,6 +16,8 @@ from fdhil.guard.limits import OffsetLimits
 from tests.proof.contracts import Contracts
 from tests.proof.symbolic import Claim, Integer, assume, choose, for_every_path, integers, lemma, prove
 
+STOPPING, APPROACH, CLAMP = (each.__name__ for each in (limits.stopping, limits.approach, limits.clamp))
+
 pytestmark = pytest.mark.usefixtures("long_computation")
 
 Stopping = Callable[[Integer, Integer], Integer]
@@ -148,9 +150,9 @@ class Axis:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.contracts = Contracts()
-        for name in ("stopping", "approach"):
-            monkeypatch.setattr(limits, name, getattr(self.contracts, name))
-        monkeypatch.setattr(limits, "clamp", clamp)
+        monkeypatch.setattr(limits, STOPPING, self.contracts.stopping)
+        monkeypatch.setattr(limits, APPROACH, self.contracts.approach)
+        monkeypatch.setattr(limits, CLAMP, clamp)
         monkeypatch.setattr(limits, "max", larger, raising=False)
         self.offset, self.rate, most, rate, self.acceleration = integers("offset rate L S A")
         assume(most >= 1, rate >= 1, self.acceleration >= 1)
