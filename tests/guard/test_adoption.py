@@ -12,6 +12,7 @@ import pytest
 from fdhil.guard import core
 from fdhil.guard.adoption import may_stand
 from fdhil.guard.interlocks import Alarm
+from fdhil.guard.limits import follow
 from fdhil.guard.protocol import Mode
 from fdhil.guard.state import Request
 from tests.guard.machine import RECORD, Bench, arm_request, bench
@@ -303,7 +304,7 @@ def test_no_frame_is_beyond_the_compiled_ceiling(monkeypatch: pytest.MonkeyPatch
         machine.settings, axes=tuple(replace(axis, limits=limits) for axis in machine.settings.axes)
     )
     count = len(machine.frames)
-    monkeypatch.setattr(core, core.follow.__name__, lambda *_: 820)
+    monkeypatch.setattr(core, follow.__name__, lambda *_: 820)
     machine.sync(Request("disarm"))
     assert machine.mode is Mode.FROZEN
     assert machine.alarms[-1].code == "InternalError"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fdhil.guard import core
+from fdhil.guard import core, limits
 from fdhil.guard.conditions import known
 from fdhil.guard.interlocks import Alarm
 from fdhil.guard.path import CorrectedPath, rate_between
@@ -153,7 +153,7 @@ def test_a_wrong_frame_is_caught_whatever_made_it(monkeypatch: pytest.MonkeyPatc
     machine = active()
     machine.sync(Request("disarm"))
     count = len(machine.frames)
-    monkeypatch.setattr(core, core.follow.__name__, lambda *_: wrong)
+    monkeypatch.setattr(core, limits.follow.__name__, lambda *_: wrong)
     machine.sync()
     assert machine.state.mode is Mode.FROZEN
     assert machine.alarms[-1].code == "InternalError"

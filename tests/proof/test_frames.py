@@ -14,7 +14,7 @@ from itertools import count
 
 import pytest
 
-from fdhil.guard import core
+from fdhil.guard import core, limits
 from fdhil.guard.interlocks import Alarm
 from fdhil.guard.path import Place
 from fdhil.guard.protocol import ON_PATH, SENDING, Mode
@@ -24,7 +24,7 @@ from tests.guard.machine import settings as guard_settings
 from tests.proof.symbolic import Integer, assume, for_every_path, integers, prove
 from tests.proof.test_motion import Axis
 
-CEILING, NEXT_OFFSETS = core.ceiling.__name__, core._next_offsets.__name__
+CEILING, NEXT_OFFSETS = limits.ceiling.__name__, core._next_offsets.__name__
 
 pytestmark = pytest.mark.usefixtures("long_computation")
 
