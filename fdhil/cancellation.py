@@ -39,6 +39,11 @@ async def run_attempt(device: str, work: Coroutine[Any, Any, Result], end_s: flo
     return attempt.result()
 
 
+def find_first_error(error: BaseException) -> BaseException:
+    """Return the first error inside nested exception groups."""
+    return find_first_error(error.exceptions[0]) if isinstance(error, BaseExceptionGroup) else error
+
+
 async def end_tasks(
     tasks: Iterable[asyncio.Task[Any]], within_s: float, again_s: float = CANCEL_AGAIN_S
 ) -> set[asyncio.Task[Any]]:

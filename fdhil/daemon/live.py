@@ -11,6 +11,7 @@ reading; ``skipped`` counts the lines that this viewer lost; ``alive`` is sent w
 
 import asyncio
 import base64
+import contextlib
 from collections import deque
 from typing import Any
 
@@ -89,7 +90,8 @@ class LiveStream:
         if isinstance(record, AxisSamples) and record.tick.size:
             return encode_line(_samples(record))
         if isinstance(record, VoltageSamples) and record.t_ns.size:
-            return encode_line(_voltage(record))
+            values = {"t_ns": packed(record.t_ns, "<i8"), "values": packed(record.voltage_v, "<f4")}
+            return encode_line({"live": "voltage", "axis": record.axis, **values})
         if isinstance(record, TickTimes) and record.tick.size and self._by_the_clock:
             ends = {"tick": record.tick[[0, -1]].tolist(), "t_ns": record.t_ns[[0, -1]].tolist()}
             return encode_line({"live": "times", **ends})
@@ -110,17 +112,11 @@ class LiveStream:
                 async with asyncio.timeout(DEAD_S):
                     await writer.drain()
                 if not viewer.waiting.is_set():
-                    await _set_within(viewer.waiting, ALIVE_S)
+                    with contextlib.suppress(TimeoutError):
+                        async with asyncio.timeout(ALIVE_S):
+                            await viewer.waiting.wait()
         finally:
             self._viewers.discard(viewer)
-
-
-async def _set_within(event: asyncio.Event, limit_s: float) -> None:
-    try:
-        async with asyncio.timeout(limit_s):
-            await event.wait()
-    except TimeoutError:
-        pass
 
 
 def _samples(block: AxisSamples) -> dict[str, Any]:
@@ -138,11 +134,6 @@ def _samples(block: AxisSamples) -> dict[str, Any]:
         **({} if whole else {"ticks": packed(after, "<i4")}),
         "values": packed(values, "<f4"),
     }
-
-
-def _voltage(block: VoltageSamples) -> dict[str, Any]:
-    values = {"t_ns": packed(block.t_ns, "<i8"), "values": packed(block.voltage_v, "<f4")}
-    return {"live": "voltage", "axis": block.axis, **values}
 
 
 def packed(values: np.ndarray[Any, Any], kind: str) -> str:

@@ -57,11 +57,6 @@ def raw_scales(config: MachineConfig, axis: str) -> Scales:
     }
 
 
-def _point(window: StoredWindow) -> Point:
-    values, stds = (_numbers(window, key) for key in ("value", "std"))
-    return Point(values, stds, window.start_tick, window.direction)
-
-
 def _numbers(window: StoredWindow, key: str) -> Float:
     """Return a figure (6,) of each parameter of a stored window, NaN where it is missing."""
     figures = window.parameters or {}
@@ -190,7 +185,10 @@ class OutcomeStore:
             for direction, window in self._history.first_windows(axis).items()
         }
         windows = [window for window in self._history.windows(axis, limit=2 * HISTORY) if window.accepted][-HISTORY:]
-        points = tuple(map(_point, windows[-4 * POOL_WINDOWS :]))
+        points = tuple(
+            Point(_numbers(window, "value"), _numbers(window, "std"), window.start_tick, window.direction)
+            for window in windows[-4 * POOL_WINDOWS :]
+        )
         published = newest[0].set if newest else None
         loops = newest_loops(self._history, axis, self._config.digest)
         return Known(first, published, points, _members(windows), loops)

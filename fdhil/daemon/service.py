@@ -15,6 +15,7 @@ from fdhil.arming.answers import Answer, refusal
 from fdhil.arming.desk import ArmingDesk
 from fdhil.arming.guard_link import TRIPPED, VOIDING
 from fdhil.arming.standing import ADOPT, START_AND_ADOPT, Standing
+from fdhil.cancellation import find_first_error
 from fdhil.commissioning.void import void_record
 from fdhil.config import MachineConfig, unlikely
 from fdhil.daemon import alarms, blackbox, heap, journal
@@ -392,7 +393,7 @@ def run(config: MachineConfig, open_source: OpenSource, method: str | None = Non
     try:
         return asyncio.run(_served(service))
     except ExceptionGroup as group:
-        first = _first(group)
+        first = find_first_error(group)
         if isinstance(first, FdhilError):
             raise first from None
         for line in "".join(traceback.format_exception(group)).splitlines():
@@ -407,7 +408,3 @@ async def _served(service: Service) -> Standing:
     stands = await service.run()
     service.shutdown.leave_overrun()
     return stands
-
-
-def _first(error: BaseException) -> BaseException:
-    return _first(error.exceptions[0]) if isinstance(error, BaseExceptionGroup) else error

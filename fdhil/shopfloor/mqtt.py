@@ -19,7 +19,7 @@ from typing import NoReturn
 import aiomqtt
 from aiomqtt.exceptions import MqttConnectError
 
-from fdhil.cancellation import GivenUp, end_tasks, run_attempt
+from fdhil.cancellation import GivenUp, end_tasks, find_first_error, run_attempt
 from fdhil.config import MachineConfig
 from fdhil.config.credentials import password_of, tls_of
 from fdhil.config.publish import MqttBroker
@@ -89,7 +89,7 @@ async def _stay_connected(session: Session, settings: MqttBroker) -> NoReturn:
         try:
             await run_attempt(f"broker {where}", _serve_connection(session, settings, where))
         except* (aiomqtt.MqttError, GivenUp) as errors:
-            cause = _cause(_first(errors))
+            cause = _cause(find_first_error(errors))
             if cause != logged:
                 journal.write_line(f"nothing is published to the broker {where}: {cause}; retrying", "minor")
             logged = cause
@@ -105,10 +105,6 @@ async def _serve_connection(session: Session, settings: MqttBroker, where: str) 
     async with _client(settings, session) as broker:
         journal.write_line(f"connected to the broker {where}")
         await session.run(broker)
-
-
-def _first(error: BaseException) -> BaseException:
-    return _first(error.exceptions[0]) if isinstance(error, BaseExceptionGroup) else error
 
 
 def _cause(error: BaseException) -> str:

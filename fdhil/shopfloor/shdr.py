@@ -81,11 +81,8 @@ def shown(item: Item, value: Plain) -> str:
         return str(value).upper()
     if isinstance(value, str):
         return _plain(value)
-    return f"{value * _factor(item):.12g}"
-
-
-def _factor(item: Item) -> float:
-    return 100.0 if item.name in IN_PERCENT else UNITS.get(item.unit, ("", 1.0))[1]
+    factor = 100.0 if item.name in IN_PERCENT else UNITS.get(item.unit, ("", 1.0))[1]
+    return f"{value * factor:.12g}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +121,8 @@ def lines(before: Picture | None, now: Picture) -> list[str]:
     changed = [(key, text) for key, text in now.items.items() if sent.get(key) != text]
     result = [f"{stamp(now.stamps.get(key, now.now_ms))}|{key}|{text}" for key, text in changed]
     for key, active in now.conditions.items():
-        texts = _condition(None, active) if before is None else _changed(before.conditions[key], active)
+        past = None if before is None else before.conditions[key]
+        texts = [] if before is not None and past == active else _condition(past, active)
         result += [f"{stamp(now.now_ms)}|{key}|{text}" for text in texts]
     return result
 
@@ -132,10 +130,6 @@ def lines(before: Picture | None, now: Picture) -> list[str]:
 def notice(event: Event) -> str:
     """Return the line of a notice: a message with the class as its native code."""
     return f"{stamp(event.stamp_ms)}|{key_of(NOTICE, event.axis)}|{event.code}|{_plain(event.text)}"
-
-
-def _changed(past: Mapping[str, str] | None, active: Mapping[str, str] | None) -> list[str]:
-    return [] if past == active else _condition(past, active)
 
 
 def _condition(past: Mapping[str, str] | None, active: Mapping[str, str] | None) -> list[str]:

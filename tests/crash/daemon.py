@@ -1,4 +1,4 @@
-"""The daemon itself as a kind of record: it hears rapids, and what its store took without a fault is acknowledged."""
+"""The daemon as a kind of record: it receives rapids; those its store took without a fault are acknowledged."""
 
 from __future__ import annotations
 
@@ -23,19 +23,15 @@ SETS = 100_000  # what a revision is numbered from, so that it is no rapid
 
 
 class Daemon:
-    """What a daemon left in its store."""
-
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.said: list[str] = []
 
     def keep(self, number: int) -> None:
-        """Run a daemon until it has heard its rapids; ``number`` is not the daemon's."""
         del number
         _run(self.folder, lambda **_: None)
 
     def found(self) -> set[int]:
-        """Return the rapids, whole with their files, and the published sets."""
         if not (self.folder / FILE_NAME).exists():
             return set()
         with History.read(self.folder) as history:
@@ -52,7 +48,6 @@ class Daemon:
 
 
 def run_daemon(folder: Path, tell: Callable[..., None]) -> None:
-    """Run a daemon in this process; what it refuses, its start included, is told."""
     try:
         _run(folder, tell)
     except InternalError as error:
@@ -66,7 +61,6 @@ def _run(folder: Path, tell: Callable[..., None]) -> None:
 
 
 async def _served(config: MachineConfig, tell: Callable[..., None]) -> None:
-    """Run a daemon until it has heard its rapids; no signal stops it, whose byte to the loop would be a write too."""
     daemon, loop, heard = Service(config, Machine(rapids(config, count=RAPIDS)).open), asyncio.get_running_loop(), 0
     before = OutcomeStore.keep
 

@@ -1,4 +1,4 @@
-"""What was acknowledged is there after any call failed or was the last, and on full and read-only disks."""
+"""Acknowledged records are there after any failing or final call, and on full and read-only disks."""
 
 from __future__ import annotations
 
@@ -34,15 +34,11 @@ def test_what_was_acknowledged_outlives_any_call_that_fails_or_is_the_last(name:
 
 
 class Careless(Plain):
-    """Numbers in a file that is emptied before it is written anew."""
-
     def keep(self, number: int) -> None:
-        """Write all numbers so far."""
         numbers = {*self.found(), number}
         (self.folder / "numbers").write_text(" ".join(map(str, sorted(numbers))))
 
     def found(self) -> set[int]:
-        """Return the numbers."""
         file = self.folder / "numbers"
         return set(map(int, file.read_text().split())) if file.exists() else set()
 
@@ -98,12 +94,9 @@ def test_steps_that_cannot_be_read_now_are_not_written_over(tmp_path: Path, monk
 @pytest.mark.fault("F9")
 def test_the_newest_black_box_stays_whatever_the_clock_shows(tmp_path: Path) -> None:
     class BackwardClock(Clock):
-        """A clock that goes back a day each time."""
-
         shown_s = datetime(2026, 11, 23, tzinfo=UTC).timestamp()
 
         def wall_s(self) -> float:
-            """Return what it shows."""
             self.shown_s -= timedelta(days=1).total_seconds()
             return self.shown_s
 

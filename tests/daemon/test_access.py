@@ -1,4 +1,4 @@
-"""Who may ask the daemon for what, by the kernel's word, and what of it is in the audit."""
+"""Rights of the daemon's clients, as identified by the kernel, and the audit of their requests."""
 
 from __future__ import annotations
 
@@ -57,8 +57,6 @@ def test_what_is_not_listed_needs_the_most_and_whoever_may_look_may_disarm() -> 
 
 
 class Desk:
-    """Counts what reaches it."""
-
     def __init__(self) -> None:
         self.done: list[str] = []
 
@@ -198,7 +196,6 @@ async def test_requests_of_ever_new_and_long_names_fill_neither_the_disk_nor_the
 
 @pytest.fixture
 def open_folder() -> Iterator[Path]:
-    """A folder that every user may enter."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         folder.chmod(0o755)

@@ -1,4 +1,4 @@
-"""What an operator should know waits until somebody answers for it; who did, and when, is kept and told everywhere."""
+"""Notices stay open until an operator acknowledges them; name and time are stored and reported everywhere."""
 
 from __future__ import annotations
 

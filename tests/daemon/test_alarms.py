@@ -1,4 +1,4 @@
-"""Alarms begin, end, chatter and are acknowledged as ISA-18.2 has it; they are made of notices alone."""
+"""Alarms begin, end, chatter and are acknowledged as in ISA-18.2; they derive from notices alone."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ def at(second: int) -> Stamp:
 
 
 def table(*notices: Notice) -> AlarmTable:
-    """Return the alarms of notices one second apart, numbered from 1."""
     return AlarmTable(StoredNotice(k, notice, at(k)) for k, notice in enumerate(notices, 1))
 
 

@@ -1,4 +1,4 @@
-"""The black box: the frames before a trip are kept, in a form that other tools read, and never in the way."""
+"""The black box: frames before a trip are stored in a standard format, without delaying anything."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A clock that is set or behind is told once, and the daemon says so at its start and while it runs."""
+"""A clock that is set or behind is reported once, at start and while running."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From the twin's bus to the history: warm slide-ways have their slopes, a loaded table is seen at its first rapid."""
+"""From the simulated bus to the history: slopes of warm slide-ways, and a loaded table at its first rapid."""
 
 from __future__ import annotations
 
@@ -33,7 +33,6 @@ time_constant_s = 1e9
 
 @pytest.fixture
 def shop(tmp_path: Path) -> Iterator[Shop]:
-    """A twin of one axis whose friction falls with the temperature, which its sensor tells."""
     bench = HEAD + AXIS + TWIN
     (tmp_path / "twin.toml").write_text(f'{bench}[bus.can0]\ninterface = "socketcand"\n')
     with Twin(tmp_path / "twin.toml", tmp_path / "twin.log") as twin:
@@ -70,12 +69,10 @@ def test_warming_and_load(shop: Shop, capsys: pytest.CaptureFixture[str]) -> Non
 
 
 def _is_read(celsius: float, status: dict[str, Any]) -> bool:
-    """Whether the daemon has read the temperature."""
     return bool(abs(status["axes"]["X"].get("slideway_c", math.nan) - celsius) < 0.01)
 
 
 def _shuttle(shop: Shop) -> None:
-    """Play the shuttle and wait until its rapids are analysed."""
     before = _analysed(shop.status() or {})
     shop.play("shuttle.ngc", SHUTTLE)
     shop.status_when(lambda status: _analysed(status) >= before + 2)

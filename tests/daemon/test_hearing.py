@@ -1,4 +1,4 @@
-"""What is heard now, and what is not as the config says: told with its reason, in the status and as a notice."""
+"""Reception and deviations from the config: reported with the reason, in the status and as a notice."""
 
 from __future__ import annotations
 
@@ -34,8 +34,6 @@ WIRED = 2400  # SYNCs, again and again: a busy host's daemon hears them whenever
 
 
 class Line:
-    """A hub that sends what a wire shows: SYNC every 2 ms and the frames of node 1, until it is cut."""
-
     def __init__(self) -> None:
         self._cut = threading.Event()
         self._listener = socket.create_server(("127.0.0.1", 0))
@@ -71,18 +69,15 @@ class Line:
             time.sleep(0.05)
 
     def cut(self) -> None:
-        """Send nothing more."""
         self._cut.set()
 
     def close(self) -> None:
-        """End the connection."""
         self.cut()
         self._listener.close()
 
 
 @pytest.fixture
 def line() -> Iterator[Line]:
-    """A bus with SYNC and one drive."""
     made = Line()
     yield made
     made.close()
@@ -94,15 +89,12 @@ def _quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def shown(status: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> str:
-    """Return the status as a person sees it."""
     capsys.readouterr()
     show(status, open_console())
     return " ".join(capsys.readouterr().out.split())
 
 
 class Opens:
-    """The real drivers, as ``serving`` wants a machine."""
-
     open = staticmethod(open_machine)
 
 
@@ -110,7 +102,6 @@ class Opens:
 async def test_a_wrong_period_a_node_never_heard_and_a_dead_bus_are_told(
     line: Line, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Over the hub: SYNC at half the rate of the config, one drive of two; then nothing more."""
     monkeypatch.setattr("fdhil.daemon.hearing.PERIOD_S", 3.0)
     bus = {"can0": {"interface": "socketcand", "port": line.port}}
     config = config_of(tmp_path, ("X", "Y"), bus=bus)
@@ -186,7 +177,7 @@ def test_period_is_judged_by_a_minute_and_gets_a_number_only_where_it_is_steady(
 
 
 def test_two_buses_that_show_the_same_ticks_twice_are_no_rate(tmp_path: Path) -> None:
-    """On a busy host a bus was drained long after another: the newest tick was the oldest one known, too."""
+    """On a busy host a bus was read long after another: its newest tick was also the oldest."""
     hearing = Hearing(config_of(tmp_path), 0.0)
     hearing.source_opened(0.0)
     for late_ns in (0, 300_000_000):
@@ -230,7 +221,6 @@ def test_a_drive_that_is_never_heard_may_be_one_without_a_heartbeat(synced: bool
 
 
 def fed(config: MachineConfig, records: list[Record], windows: int = 0) -> dict[tuple[str, str], str]:
-    """Return the troubles that a machine of ``config`` sees in the records of another."""
     hearing = Hearing(config, 0.0)
     hearing.source_opened(0.0)
     now_s = 0.0
@@ -242,7 +232,6 @@ def fed(config: MachineConfig, records: list[Record], windows: int = 0) -> dict[
 
 
 def other(folder: Path, **axis: Any) -> MachineConfig:
-    """Return the bench's config but for the keys of axis X."""
     document = {"machine": {"name": "bench"}, "axis": {"X": bench_axis(**axis)}}
     return machine_config.parse(document, "test", folder)
 

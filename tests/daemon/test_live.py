@@ -1,4 +1,4 @@
-"""The daemon's stream of samples: what passes is told to who looks, and nobody who looks can hold the daemon up."""
+"""The daemon's stream of samples: viewers receive records, and none can delay the daemon."""
 
 from __future__ import annotations
 
@@ -42,8 +42,6 @@ def block(tick: Any, axis: str = "X", voltage: bool = True) -> AxisSamples:
 
 @asynccontextmanager
 async def streaming(stream: LiveStream, folder: Path) -> AsyncIterator[Path]:
-    """Serve a stream alone on a control socket."""
-
     async def handle(_request: Any, _peer: Any) -> Any:
         return stream.begin()
 
@@ -52,14 +50,12 @@ async def streaming(stream: LiveStream, folder: Path) -> AsyncIterator[Path]:
 
 
 async def ask_live(path: Path) -> tuple[Line, asyncio.StreamReader, asyncio.StreamWriter]:
-    """Ask for the stream; return the answer and the connection."""
     reader, writer = await asyncio.open_unix_connection(str(path), limit=2**22)
     writer.write(b'{"request": "live"}\n')
     return json.loads(await reader.readline()), reader, writer
 
 
 async def line_of(reader: asyncio.StreamReader, kind: str) -> Line:
-    """Return the next line of a kind."""
     while True:
         line: Line = json.loads(await asyncio.wait_for(reader.readline(), 60.0))
         if line["live"] == kind:
@@ -67,7 +63,6 @@ async def line_of(reader: asyncio.StreamReader, kind: str) -> Line:
 
 
 def values_of(line: Line) -> Any:
-    """Return the signals (7, n) of a block."""
     return unpacked(line["values"], "<f4").reshape(len(SIGNALS), -1)
 
 

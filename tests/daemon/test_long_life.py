@@ -1,4 +1,4 @@
-"""The daemon works for long: once its rings are full, a rapid more, or a client more, takes no memory more."""
+"""Long operation of the daemon: once its buffers are full, further rapids and clients use no more memory."""
 
 from __future__ import annotations
 
@@ -29,7 +29,6 @@ EMERGENCY = 0x081
 
 
 def later(records: Sequence[Record], ticks: int, period_s: float) -> list[Record]:
-    """Return the same rapids so many SYNC later."""
     shifted: list[Record] = []
     for record in records:
         if isinstance(record, AxisSamples):
@@ -44,7 +43,6 @@ def later(records: Sequence[Record], ticks: int, period_s: float) -> list[Record
 
 
 def look_on_and_leave(path: Path) -> None:
-    """Ask for the live stream and be gone in the middle of a line; say half a request and be gone."""
     for said in (b'{"request": "live"}\n', b'{"request": "sta'):
         with socket.socket(socket.AF_UNIX) as client:
             client.connect(str(path))

@@ -1,4 +1,4 @@
-"""What the NC says of itself is shown, and what is unusual about it is told once, and once that it is over."""
+"""The NC's state is shown; unusual states are reported once, and once when they end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every class of notice has its effect and its next action, each said in one place."""
+"""Every class of notice has its effect and next action in exactly one table."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ CALLED = re.compile(r'\b(?:Notice|_notice|_tell)\(\s*"([^"]*)"')
 
 
 def codes() -> set[str]:
-    """Return the classes that the code gives notices, as far as its text names them."""
     found = {"BusOff", "BusRestarted", "TransceiverFault", "NotAcknowledged", "ErrorPassive", "NcSilent", "LoadChanged"}
     for path in Path(fdhil.__file__).parent.rglob("*.py"):
         found.update(CALLED.findall(path.read_text("utf-8")))

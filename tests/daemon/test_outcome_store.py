@@ -1,4 +1,4 @@
-"""The store under the daemon: full, read-only, damaged or foreign, the daemon goes on in shadow and says so."""
+"""The daemon's store when full, read-only, damaged or foreign: the daemon continues in shadow and reports it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,6 @@ from tests.store.made import BENCH, outcome, published, window
 
 
 def opened(folder: Path) -> tuple[OutcomeStore, list[Notice]]:
-    """Return an open store of a store in ``folder``, and what it said."""
     store = OutcomeStore(config_of(folder))
     return store, store.open()
 

@@ -1,4 +1,4 @@
-"""What the daemon uses of its computer is known, and told before it is used up."""
+"""The daemon measures its resources and reports them before they are exhausted."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ print(*(b - a for a, b in zip(before, after)))
 @pytest.mark.usefixtures("processes")
 @pytest.mark.fault("F10")
 def test_what_grows_is_seen_to_grow() -> None:
-    """In a process of its own: what other tests left behind may end just then."""
+    """Runs in its own process: what other tests left behind may end at that moment."""
     told = subprocess.run([sys.executable, "-c", GROW], capture_output=True, text=True, check=True)
     memory, descriptors, threads = map(int, told.stdout.split())
     assert 15e6 < memory < 40e6
@@ -120,7 +120,6 @@ async def test_the_status_says_what_is_used(tmp_path: Path) -> None:
 
 
 async def fill_the_pool() -> None:
-    """Have the event loop's pool start all its threads: how many it has by itself depends on how fast they are."""
     most = min(32, (os.cpu_count() or 1) + 4)  # as of ThreadPoolExecutor
     met = threading.Barrier(most)
     await asyncio.gather(*(asyncio.to_thread(met.wait, 60.0) for _ in range(most)))
@@ -129,7 +128,6 @@ async def fill_the_pool() -> None:
 @pytest.mark.usefixtures("real_time")
 @pytest.mark.fault("F10")
 async def test_clients_that_come_and_go_leave_descriptors_and_threads_as_they_were(tmp_path: Path) -> None:
-    """Two hundred clients, of which half leave without a word."""
     config = config_of(tmp_path)
     machine = Machine(rapids(config, count=2))
     async with serving(config, machine) as path:

@@ -1,4 +1,4 @@
-"""The daemon on a made-up machine: what comes in is identified, kept, told; what goes wrong is told and survived."""
+"""The daemon on a simulated machine: records are identified, stored and reported; faults are reported and survived."""
 
 from __future__ import annotations
 
@@ -34,7 +34,6 @@ from tests.daemon.shop import fdhil
 
 @pytest.fixture(autouse=True)
 def _quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave the compiling to the first rapid: most of these tests never see one."""
     monkeypatch.setattr("fdhil.daemon.service.warm", lambda config, method: None)
 
 
@@ -48,7 +47,6 @@ async def _exists(path: Path) -> None:
 
 @asynccontextmanager
 async def serving(config: MachineConfig, machine: Machine) -> AsyncIterator[Path]:
-    """Run a daemon in this process until the block is left; yield its control socket."""
     task = asyncio.create_task(Service(config, machine.open).run())
     assert config.store.run_directory is not None
     path = config.store.run_directory / "daemon.sock"
@@ -62,7 +60,6 @@ async def serving(config: MachineConfig, machine: Machine) -> AsyncIterator[Path
 
 
 async def status_when(path: Path, ready: Any) -> dict[str, Any]:
-    """Ask for the status until ``ready(status)``."""
     while True:
         status = await asyncio.to_thread(ask, path, {"request": "status"})
         if ready(status):
@@ -234,7 +231,6 @@ async def test_a_drive_that_boots_voids_its_record(tmp_path: Path, capsys: pytes
 
 @pytest.mark.fault("A23", "F12")
 async def test_a_boot_that_a_flood_or_a_full_queue_holds_back_voids_its_record_all_the_same(tmp_path: Path) -> None:
-    """X boots again and again, Y once; and no notice can be stored, as where the disk hangs."""
     config = config_of(tmp_path, ("X", "Y"))
     service = Service(config, Machine().open)
     for k in range(300):

@@ -1,4 +1,4 @@
-"""The real processes: the twin with its NC on a bus of its own, guard and daemon beside it, the command line on top."""
+"""The real processes: the simulator with its NC on its own bus, guard, daemon and command line."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ pytestmark = [pytest.mark.timeout(1500), pytest.mark.usefixtures("processes")]
 
 @pytest.fixture
 def shop(tmp_path: Path) -> Iterator[Shop]:
-    """A twin whose tables are heavier than the data sheet says, commissioned."""
     with opened(tmp_path) as shop:
         shop.commission()
         yield shop
@@ -105,7 +104,6 @@ def _cuts_corrected(shop: Shop, capsys: Capture) -> None:
 
 
 def _refuses_a_drive_that_was_written_to_until_it_is_compared(shop: Shop, capsys: Capture) -> None:
-    """Another master writes the following error window, to what it was: nobody knows that until it is compared."""
     place = shop.config.bus["can0"]
     with can.Bus(interface="socketcand", channel=place.channel, host=place.host, port=place.port) as bus:
         written = struct.pack("<BHBI", 0x23, 0x6065, 0, 32768)
@@ -123,7 +121,6 @@ def _refuses_a_drive_that_was_written_to_until_it_is_compared(shop: Shop, capsys
 
 
 def _cut(shop: Shop, name: str, program: str = "corner.ngc", text: str = CORNER) -> float:
-    """Let the NC cut the program; return the RMS of the contour error in um."""
     trace = shop.folder / f"{name}.csv"
     shop.play(program, text, trace=trace)
     rows = np.genfromtxt(trace, delimiter=",", names=True)

@@ -1,4 +1,4 @@
-"""Corners of the core that no single fault leads to."""
+"""Details of the core that no single fault reaches."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ def active() -> Bench:
 
 
 def inputs_of(machine: Bench, withdrawn: tuple[Alarm, ...] = ()) -> Inputs:
-    """The inputs of the next SYNC."""
     machine.counter = machine.counter % 240 + 1
     seen, bus = machine.listener.at_sync(bytes([machine.counter]), 0.0, 0.0)
     return Inputs(True, seen, bus, path=machine.path, withdrawn=withdrawn)
@@ -229,7 +228,7 @@ def test_a_hold_lasts_ten_cycles_each_time_anew() -> None:
 
 
 def test_one_good_cycle_between_two_gaps_is_enough() -> None:
-    """What was found again may be lost again for as long: the gaps do not add up."""
+    """Gaps do not add up: each may last as long as a single one."""
     machine = active()
     for _ in range(4):
         for _ in range(10):  # the first of them latches what was streamed before: it is the good one

@@ -1,4 +1,4 @@
-"""The guard hears order, age, length and origin of frames, and the regularity of SYNC."""
+"""The frame monitor tracks order, age, length and origin of frames, and the regularity of SYNC."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_read_back_is_told_once() -> None:
 
 
 def test_a_frame_that_was_not_due_spoils_the_read_back_beside_it() -> None:
-    """TPDO3 is due every tenth SYNC: what comes within half of that, or twice in one, shows nothing for sure."""
+    """TPDO3 is due every tenth SYNC: one within half of that, or two in one, prove nothing."""
     heard = listener()
     shown, ages = [], []
     for k in range(1, 60):
@@ -164,7 +164,7 @@ def test_sync_without_counter_is_not_judged() -> None:
 
 
 def regular(intervals: list[tuple[float, float]], period_s: float = 0.001) -> list[bool]:
-    """Whether each SYNC was regular, for (stamp, arrival) intervals in monotonic time."""
+    """Return whether each SYNC was regular, for (stamp, arrival) intervals in monotonic time."""
     heard = listener(clock="monotonic", sync_period_s=period_s)
     stamp = arrival = 100.0
     told = [heard.at_sync(b"", stamp, arrival)[1].sync_regular]

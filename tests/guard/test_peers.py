@@ -1,4 +1,4 @@
-"""Who may ask the guard for what, by the kernel's word: a watcher may look and disarm, only the daemon may arm."""
+"""Rights of the guard's clients, as identified by the kernel: watchers may disarm, only the daemon may arm."""
 
 from __future__ import annotations
 
@@ -40,7 +40,6 @@ def shop(tmp_path: Path) -> Iterator[Shop]:
 
 
 def become(monkeypatch: pytest.MonkeyPatch, uid: int) -> None:
-    """Have who connects from now on be another user, as far as the kernel says."""
     monkeypatch.setattr("fdhil.guard.control.credentials", lambda _: (99, uid))
 
 

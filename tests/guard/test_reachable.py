@@ -1,4 +1,4 @@
-"""The guard can be asked for zero although its run directory was cleaned away, or it ramps to zero by itself."""
+"""After its run directory was cleaned the guard stays reachable, or ramps to zero."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What clients send, as bytes: a request, or nothing that harms."""
+"""Any bytes of clients parse into a request, or into a harmless refusal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Off, the guard shows what it would send; it sends nothing."""
+"""While off, the guard shows what it would send, and sends nothing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from tests.guard.machine import DIGEST
 
 
 def followed(made: machine.Bench, shadow: Shadow, cycles: int) -> list[tuple[int, ...] | None]:
-    """Run so many SYNC and return what the shadow says after each."""
     said = []
     for _ in range(cycles):
         made.sync()
@@ -22,7 +21,6 @@ def followed(made: machine.Bench, shadow: Shadow, cycles: int) -> list[tuple[int
 
 
 def test_it_says_what_an_armed_guard_sends() -> None:
-    """Row by row from the path's first move on, to its end; no frame leaves."""
     watched, armed, shadow = machine.bench(), machine.bench(), Shadow()
     assert set(followed(watched, shadow, 130)) == {None}
     armed.settle()

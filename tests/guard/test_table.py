@@ -1,4 +1,4 @@
-"""The table that is handed over: what is not as it must be is no table, and one class says so."""
+"""Correction tables: every invalid one is refused with its class."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_a_table_is_handed_over_in_sealed_memory() -> None:
 
 
 def test_what_is_no_sealed_memory_is_not_read(tmp_path: Path) -> None:
-    """Neither opened, nor waited for, nor read: a FIFO, a socket, a file, memory that can still change, nothing."""
+    """A FIFO, a socket, a file, writable memory, nothing: neither opened nor read, and nothing waits."""
     os.mkfifo(tmp_path / "fifo")
     (tmp_path / "file").write_bytes(body())
     near, far = socket.socketpair()
@@ -193,7 +193,6 @@ def test_a_header_may_have_4096_bytes() -> None:
 
 
 def decoded(whole: bytes) -> object:
-    """The class that refuses it, or axes and rows."""
     try:
         names, path = table.decode(whole)
     except TableRefused as refusal:
@@ -202,7 +201,7 @@ def decoded(whole: bytes) -> object:
 
 
 def test_a_program_named_by_no_text_is_told_in_plain_letters() -> None:
-    """A lone surrogate is text to JSON: it is carried along, and what is told of it can be encoded."""
+    """JSON accepts a lone surrogate: messages that contain it must still be encodable."""
     raw = json.dumps({**HEAD, "program": "\ud800"}).encode()
     _, path = table.decode(struct.pack("<I", len(raw)) + raw + bytes(16))
     assert json.dumps(path.program_digest) == '"\\ud800"'
@@ -253,7 +252,6 @@ def test_a_table_has_the_number_under_which_it_came() -> None:
 
 
 def test_rows_are_let_go_that_no_check_and_no_machine_needs_any_more() -> None:
-    """Behind the machine, and a second and three rows before what is added, whatever the axes' windows."""
     limits = (OffsetLimits(819, 65, 6, 9830, 5), OffsetLimits(819, 65, 6, 9830, 2))
     rows = {"X": [0] * 40, "Y": [0] * 40}
     whole = table.begin(table.encode("XY", rows, rows, "p", 0, False), 1, "XY", limits, None, 0).joined
@@ -290,7 +288,6 @@ def test_a_stream_begins_with_row_0() -> None:
     "what", [{"axes": "YX"}, {"axes": "X"}, {"first": 1}, {"program": "other"}, {"loaded": None}, {"rows": 5}]
 )
 def test_first_rows_take_the_place_of_those_of_the_same_table_alone(what: dict[str, object]) -> None:
-    """Of the same axes, from row 0, no more than are loaded."""
     limits = (LIMITS,) * 2
     loaded = None if "loaded" in what else table.begin(body(), 1, "XY", limits, None, 0).joined
     rows = {axis: [*values, *values[:1]][: int(str(what.get("rows", 4)))] for axis, values in ROWS.items()}
@@ -345,7 +342,6 @@ def test_of_a_renewed_table_the_rows_are_checked_that_may_differ_and_a_second_be
 
 
 def test_a_second_of_travel_may_be_all_that_is_allowed_wherever_it_begins() -> None:
-    """Any five moves in a row, however many rows are checked at a time, and from one piece to the next."""
     limits = OffsetLimits(819, 65, 60, variation=100, window=5)
     swinging = [20 * (row % 2) for row in range(30)]
     assert table.check_rows(limits, swinging, 0, 30) is None
@@ -367,7 +363,6 @@ def test_a_second_of_travel_may_be_all_that_is_allowed_wherever_it_begins() -> N
 
 
 def test_rows_that_were_checked_are_not_checked_again() -> None:
-    """Only what is new, and what it moves away from, is judged."""
     jump = [0, 0, 0, 800, 800, 800, 800]
     assert table.check_rows(LIMITS, jump, 0, 7) == "OffsetRate"
     assert table.check_rows(LIMITS, jump, 3, 7) == "OffsetRate"
@@ -391,7 +386,6 @@ TINY = OffsetLimits(offset=10, rate=5, acceleration=2, variation=1000, window=10
 
 
 def loaded_within(travel: tuple[int, int] | None, demand: list[int]) -> CorrectedPath:
-    """Load a resting table of one axis with these software limits."""
     body = table.encode("X", {"X": demand}, {"X": [0] * len(demand)}, "p")
     loading = table.begin(body, 1, ["X"], (TINY,), None, 0, (travel,))
     while not loading.done:
@@ -415,7 +409,7 @@ def test_a_path_that_comes_nearer_is_no_table(demand: list[int]) -> None:
 
 @pytest.mark.parametrize("end", [2**31 - 1 - 9, 2**31 - 1, -(2**31) + 9, -(2**31)])
 def test_no_offset_on_a_path_leaves_32_bits(end: int) -> None:
-    """The largest offset is 10 here: one increment nearer to the end and the drive would wrap around."""
+    """The largest offset is 10 here: one increment nearer to the end the drive would wrap around."""
     with pytest.raises(
         TableRefused, match="path comes nearer to the end of the 32-bit range than the largest"
     ) as caught:
@@ -429,7 +423,6 @@ def test_a_path_up_to_the_largest_offset_from_the_end_of_32_bits_is_a_table(end:
 
 
 def test_a_piece_that_comes_nearer_is_no_part_of_a_table() -> None:
-    """Of the rows behind those that were let go, each at its own place."""
     limits = (OffsetLimits(10, 5, 2, 1000, 2),)
     for row in (0, 1, 2, 3):
         demand = [0] * 4
@@ -467,7 +460,6 @@ def test_rows_are_little_endian_wherever_they_are_made(monkeypatch: pytest.Monke
 
 
 def test_a_streamed_table_does_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Piece after piece, while nothing runs that would let the first ones go."""
     monkeypatch.setattr(table, "MAX_TABLE_BYTES", 8 * 2 * 10)
     loaded = table.begin(body("p", 0, False), 1, "XY", (TINY, TINY), None, 0).joined
     loaded = table.begin(body("p", 4, False), 2, "XY", (TINY, TINY), loaded, 0).joined

@@ -1,4 +1,4 @@
-"""A bus that cannot be opened, and a peer that is no hub, are told in one sentence."""
+"""An unusable bus and a peer that is not a hub are reported in one sentence."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_hub_that_is_not_there() -> None:
 
 
 class RawSocket:
-    """Stands for CAN_RAW where the kernel has none; tests/socketcan has the real one."""
+    """Replaces CAN_RAW where the kernel has none; tests/socketcan uses the real one."""
 
     def __init__(self, *family: int, up: bool) -> None:
         self.calls: list[Any] = [family]
@@ -93,7 +93,6 @@ def test_a_raw_socket_hears_nothing_before_the_guard_listens_and_is_closed_when_
 
 
 def run_main(monkeypatch: pytest.MonkeyPatch, settings: Path, descriptor: int) -> int:
-    """Run the guard's program in this process with these arguments."""
     monkeypatch.setattr("sys.argv", ["fdhil.guard", "--settings", str(settings), "--descriptor", str(descriptor)])
     return guard_main.main()
 

@@ -1,4 +1,4 @@
-"""How late the guard is: counted, named where it explains what a drive shows, refused above a stated share."""
+"""Lateness of the guard: counted, reported as a cause, and refused above a stated share."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A sample of the study of kills, hangs, restarts and faults at random times, and that its judges see what is wrong."""
+"""A sample of the study of kills, hangs, restarts and faults, and a check that its judges detect errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""fdhil play in the place of the NC, and a guard that corrects what it plays."""
+"""fdhil play instead of the NC, with a guard that corrects the played program."""
 
 from __future__ import annotations
 
@@ -30,13 +30,11 @@ main()
 
 @pytest.fixture
 def transport() -> str:
-    """Three processes of fdhil and the twin: on an interface of the kernel."""
     return "socketcan"
 
 
 @pytest.fixture
 def sections() -> dict[str, Any]:
-    """All count time in SYNCs, as the twin does, whose computer they share."""
     limits = {"setpoints": {"travel_mm": [-1.0, 20.0]}}
     axes = {name: axis | limits for name, axis in bench_document()["axis"].items()}
     return {

@@ -1,8 +1,8 @@
-"""Proves that no step of the guard's core hands out an offset beyond the limits, whatever else goes wrong in it.
+"""Proves that no step of the guard's core outputs an offset beyond the limits, whatever else fails in it.
 
-The offsets that the core would send are replaced by any integers at all: the check before the frame is handed out is
-what is proven first. Then it is proven that the check stops nothing that the core itself computes from a safe state,
-so that a ramp to zero always leaves.
+The offsets that the core would send are replaced by arbitrary integers: the check before the output is proven first.
+Then it is proven that the check stops nothing that the core itself computes from a safe state, so that a ramp to zero
+always leaves.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ MODES = sorted(SENDING)
 
 
 class AnyPath:
-    """A table of which nothing is known, not even that it is smooth."""
+    """A table with arbitrary offsets, not even smooth."""
 
     def offsets_at(self, row: int) -> tuple[Integer]:
         return (integers(f"table_{row}")[0],)
 
 
 class Core:
-    """The core with one axis, its limits, offset and rate unknown; axes are stepped one by one, and one stands for all.
+    """The core with one axis, its limits, offset and rate unknown; axes are stepped one by one with the same code.
 
-    Settings are refused (``settings._check_limits``) where the largest offset is beyond the compiled ceiling.
+    Settings are refused where the largest offset exceeds the compiled ceiling.
     """
 
     def __init__(self, mode: Mode, monkeypatch: pytest.MonkeyPatch) -> None:

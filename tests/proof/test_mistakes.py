@@ -1,4 +1,4 @@
-"""The proof fails where a limit or a transition is put wrong: else it would prove nothing."""
+"""The proof fails for a wrong limit or transition; otherwise it would prove nothing."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Shows by every case there is that each fault ends what is sent, and that only arming or adopting begins it.
+"""Shows by exhaustive cases that each fault ends sending, and that only arming or adopting starts it.
 
-The core looks at alarms by their classes alone, so that all of them, in pairs, are all it can meet: the worst reaction
+The core evaluates only the classes of alarms, so that all classes, in pairs, cover every case: the worst reaction
 counts, and whether ``OffsetHijack`` and ``NodeRebooted`` are among them.
 """
 

@@ -1,7 +1,7 @@
-"""Proves for all limits and all integers that the motion of an offset keeps its limits and comes to zero.
+"""Proves for all limits and all integers that the motion of an offset keeps its limits and reaches zero.
 
-What is proven is the code of ``fdhil.guard.limits`` as it stands. ``stopping`` and ``approach`` multiply unknowns; they
-are proven to keep their promises first, and stand for those in what follows.
+The proven code is ``fdhil.guard.limits``, unchanged. ``stopping`` and ``approach`` multiply unknowns; their contracts
+are proven first and replace them in later proofs.
 """
 
 from __future__ import annotations

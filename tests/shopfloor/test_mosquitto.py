@@ -1,4 +1,4 @@
-"""``fdhil publish mqtt`` as a process, a real daemon behind it and a real broker before it."""
+"""``fdhil publish mqtt`` as a process, with a real daemon and a real broker."""
 
 from __future__ import annotations
 
@@ -32,7 +32,6 @@ def _quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def written(folder: Path, port: int, more: str = "") -> Path:
-    """Return a machine's configuration that is told to the broker at ``port`` ten times a second."""
     file = folder / "machine.toml"
     file.write_text(f"{BENCH}[publish.mqtt]\nport = {port}\nperiod_s = 0.1\n{more}")
     return file
@@ -40,7 +39,6 @@ def written(folder: Path, port: int, more: str = "") -> Path:
 
 @asynccontextmanager
 async def publisher(file: Path) -> AsyncIterator[asyncio.subprocess.Process]:
-    """Run ``fdhil publish mqtt`` until the block is left; what it says goes to publish.log."""
     with (file.parent / "publish.log").open("ab") as log:
         arguments = ("-m", "fdhil", "publish", "mqtt", file)
         process = await asyncio.create_subprocess_exec(sys.executable, *arguments, stdout=log, stderr=log)
@@ -53,13 +51,10 @@ async def publisher(file: Path) -> AsyncIterator[asyncio.subprocess.Process]:
 
 
 class Listening:
-    """A host application on a real broker."""
-
     def __init__(self, client: aiomqtt.Client) -> None:
         self.client, self.host = client, Host()
 
     async def until(self, so: Callable[[Host], object]) -> None:
-        """Take what the edge node says until it is ``so``."""
         async with asyncio.timeout(120):
             while not so(self.host):
                 message = await anext(aiter(self.client.messages))
@@ -69,13 +64,11 @@ class Listening:
                     self.host.take(message.topic.value, message.payload)
 
     async def command(self, name: str) -> None:
-        """Send the edge node a command."""
         await self.client.publish("spBv1.0/fdhil/NCMD/bench", command(name, True))
 
 
 @asynccontextmanager
 async def host_application(port: int, **more: object) -> AsyncIterator[Listening]:
-    """Listen to everything that is Sparkplug's until the block is left."""
     async with aiomqtt.Client("127.0.0.1", port, timeout=120.0, **more) as client:  # type: ignore[arg-type]
         await client.subscribe("spBv1.0/#", qos=1)
         yield Listening(client)
@@ -177,7 +170,6 @@ async def _state(client: aiomqtt.Client, online: bool, stamp_ms: int) -> None:
 
 
 async def _said(folder: Path, words: str) -> None:
-    """Wait until the publisher has said ``words``."""
     log = folder / "publish.log"
     for _ in range(2400):
         if log.exists() and words in log.read_text():

@@ -1,4 +1,4 @@
-"""A session with a broker: births, changes, silence, commands, a primary host; the broker is a list here."""
+"""A broker session: births, changes, silence, commands, a primary host; the broker is a list."""
 
 from __future__ import annotations
 
@@ -34,8 +34,6 @@ def _no_rest(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Broker:
-    """Stands in for the client of a broker: keeps what is published for a host application to hear."""
-
     def __init__(self) -> None:
         self.host = Host()
         self.subscribed: list[str] = []
@@ -57,11 +55,9 @@ class Broker:
             yield await self._commands.get()
 
     def send(self, topic: str, payload: bytes) -> None:
-        """Send a message to the edge node."""
         self._commands.put_nowait(SimpleNamespace(topic=aiomqtt.Topic(topic), payload=payload))
 
     async def until(self, so: Callable[[Host], bool]) -> None:
-        """Wait until it is ``so``."""
         async with asyncio.timeout(60):
             while not so(self.host):
                 await self._heard.wait()
@@ -74,7 +70,6 @@ def session_of(**settings: Any) -> Session:
 
 @asynccontextmanager
 async def connected(session: Session) -> AsyncIterator[Broker]:
-    """Serve one connection until the block is left."""
     broker = Broker()
     task = asyncio.create_task(session.run(cast(aiomqtt.Client, broker)))
     try:

@@ -1,4 +1,4 @@
-"""The MTConnect adapter, read by an agent of the tests over TCP; its Devices.xml, by the words of the standard."""
+"""The MTConnect adapter, read by a test agent over TCP; its Devices.xml against the standard."""
 
 from __future__ import annotations
 
@@ -159,7 +159,6 @@ def test_any_text_stays_in_its_line_and_its_field(text: str) -> None:
 
 @asynccontextmanager
 async def adapting() -> AsyncIterator[tuple[Adapter, int]]:
-    """Serve an adapter on a free port."""
     adapter = Adapter()
     listening = socket.create_server(("127.0.0.1", 0))
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)  # else a deaf agent's queue is megabytes

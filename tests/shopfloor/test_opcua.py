@@ -1,4 +1,4 @@
-"""The OPC UA server, read by asyncua's own client: values with quality, unit and time, alarms, and who may do what."""
+"""The OPC UA server, read by asyncua's client: values with quality, unit and time, alarms, and rights."""
 
 from __future__ import annotations
 
@@ -39,14 +39,11 @@ MACHINE_TOOL = "http://opcfoundation.org/UA/MachineTool/"
 
 
 class Stage:
-    """A server of the bench without a daemon: the tests say what the daemon would."""
-
     def __init__(self, config: MachineConfig, served: Served) -> None:
         self.served, self.listener = served, Listener(config)
         self.url = f"opc.tcp://127.0.0.1:{served.port}"
 
     async def say(self, answer: dict[str, Any] | None, now_ms: int = NOW_MS) -> None:
-        """Let the daemon answer, or be silent."""
         await self.served.tell(self.listener.news(answer, now_ms, "" if answer else "the daemon is not running"))
 
 
@@ -70,13 +67,10 @@ async def own(client: Client, name: str) -> Node:
 
 
 async def told_of(node: Node) -> Any:
-    """Read a value with its quality and time."""
     return await node.read_data_value(raise_on_bad_status=False)
 
 
 class Heard:
-    """What a subscription was told."""
-
     def __init__(self) -> None:
         self.events: list[Any] = []
         self.values: list[Any] = []
@@ -243,7 +237,6 @@ async def test_a_client_is_told_each_change_of_what_it_was_told_last(
 
 
 async def subscribed(client: Client, heard: Heard, at: str = "messages") -> Any:
-    """Subscribe to the machine's messages: alarms of AlertType, notices of NotificationEventType."""
     tool = await client.get_namespace_index(MACHINE_TOOL)
     subscription = await client.create_subscription(20, heard)
     types = [client.get_node(f"ns={tool};i=39"), client.get_node(f"ns={tool};i=35")]
@@ -341,7 +334,6 @@ async def test_connections_of_one_address_keep_no_other_out(stage: Stage) -> Non
 
 @asynccontextmanager
 async def guarded(folder: Path, **keys: Any) -> AsyncIterator[str]:
-    """Serve with a certificate and a user; yield the address."""
     theirs = await certificates(folder, "server", "urn:fdhil:bench")
     users = folder / "users.json"
     write_users(users, {"scada": hashed(PASSWORD, "watch")})
@@ -352,7 +344,6 @@ async def guarded(folder: Path, **keys: Any) -> AsyncIterator[str]:
 
 
 async def entered(url: str, folder: Path, name: str, user: str | None, password: str = "") -> Any:
-    """Enter by a certificate of this name, read the state, and return its quality."""
     ours = await certificates(folder, name, f"urn:{name}") if not (folder / f"{name}.der").exists() else None
     certificate, key = ours or (folder / f"{name}.der", folder / f"{name}.pem")
     client = Client(url, PATIENCE_S)
@@ -457,7 +448,6 @@ async def test_a_real_daemon_is_read_and_its_end_is_seen(tmp_path: Path, capsys:
 
 
 async def read_when(node: Node, value: Any) -> None:
-    """Read until it is so."""
     async with asyncio.timeout(PATIENCE_S):
         while True:
             if (await told_of(node)).Value.Value == value:

@@ -1,4 +1,4 @@
-"""What is published: every name has a value when everything is known, and none when nothing is."""
+"""Published items: every one has a value when everything is known, and none when nothing is."""
 
 from __future__ import annotations
 

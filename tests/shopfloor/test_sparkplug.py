@@ -1,4 +1,4 @@
-"""An edge node's messages, read by a host application that was written from the specification alone."""
+"""An edge node's messages, read by a host application written from the specification alone."""
 
 from __future__ import annotations
 
@@ -32,7 +32,6 @@ def metric(name: str, value: bool | float | str | None, datatype: int = DOUBLE, 
 
 
 def heard(host: Host, messages: Sequence[Message]) -> list[str]:
-    """Hand messages to the host; return their verbs, with the device."""
     before = len(host.verbs)
     for message in messages:
         host.take(message.topic, message.payload)
@@ -40,7 +39,6 @@ def heard(host: Host, messages: Sequence[Message]) -> list[str]:
 
 
 def begun(node: Sequence[Metric], **devices: Sequence[Metric]) -> tuple[EdgeNode, Host]:
-    """Return an edge node that has connected and is born, and the host that heard it."""
     edge, host = EdgeNode("works", "mill"), Host()
     edge.will(NOW)
     assert heard(host, edge.births(node, devices, NOW)) == ["NBIRTH", *(f"DBIRTH/{name}" for name in devices)]

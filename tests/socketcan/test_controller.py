@@ -1,4 +1,4 @@
-"""A controller that counts errors, goes off and is unplugged: genuine error frames of the kernel's slcan driver."""
+"""A controller that counts errors, goes off and is unplugged: real error frames of the kernel's slcan driver."""
 
 from __future__ import annotations
 
@@ -66,8 +66,6 @@ def test_a_controller_that_is_unplugged_ends_the_bus(adapter: SerialAdapter) -> 
 
 
 def test_a_full_transmit_queue_is_told_at_once(adapter: SerialAdapter) -> None:
-    """Nobody reads the far end of the line, as when no node acknowledges."""
-
     def pour(bus: TransmitBus) -> None:
         for _ in range(100_000):
             bus.send(0x601, bytes(8))

@@ -1,4 +1,4 @@
-"""The raw socket on a real SocketCAN interface (vcan0): order, stamps, nothing lost, and every drop counted."""
+"""The raw socket on a real SocketCAN interface (vcan0): order, stamps, no loss, and every drop counted."""
 
 from __future__ import annotations
 
@@ -74,7 +74,6 @@ def sender() -> Iterator[socket.socket]:
 
 
 def surely_held(bus: CanBus) -> int:
-    """Frames that find room in the socket's buffer while nobody reads."""
     assert isinstance(bus._port, SocketCanPort)
     granted = bus._port._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
     return max(FULL_BUS, min(5_000, granted // FRAME_BYTES - FULL_BUS))
@@ -107,7 +106,6 @@ def test_frames_come_in_order_with_stamps_of_the_kernel(sender: socket.socket) -
 
 
 def test_of_a_full_bus_no_frame_is_lost(tmp_path: Path) -> None:
-    """Forty seconds of a full bus of 1 Mbit/s, in order; on a busy computer the bus waits."""
     file = tmp_path / "heard"
     file.write_bytes(bytes(8))
     numbers: list[int] = []
@@ -126,7 +124,6 @@ def test_of_a_full_bus_no_frame_is_lost(tmp_path: Path) -> None:
 
 @pytest.mark.fault("A6")
 def test_what_the_kernel_dropped_is_counted_exactly(sender: socket.socket) -> None:
-    """At once, and not only when another frame finds room."""
     port = SocketCanPort("can0", SETTINGS)
     port._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     ring, drops = FrameRing(1 << 14), []
