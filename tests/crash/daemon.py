@@ -41,7 +41,11 @@ class Daemon:
             if (window := believed(self.folder / WINDOWS_FOLDER / row.file)) is not None:
                 assert window.start_tick == row.start_tick
                 whole.append(row.start_tick)
-        return {*whole, *(row.start_tick for row in windows[:-RAPIDS]), *(SETS + told.set.revision for told in sets)}
+        return {
+            *whole,
+            *(row.start_tick for row in windows[:-RAPIDS]),
+            *(SETS + result.set.revision for result in sets),
+        }
 
     def close(self) -> None:
         """Nothing is open."""
@@ -61,11 +65,11 @@ def _run(folder: Path, tell: Callable[..., None]) -> None:
 
 
 async def _served(config: MachineConfig, tell: Callable[..., None]) -> None:
-    daemon, loop, heard = Service(config, Machine(rapids(config, count=RAPIDS)).open), asyncio.get_running_loop(), 0
+    daemon, loop, received = Service(config, Machine(rapids(config, count=RAPIDS)).open), asyncio.get_running_loop(), 0
     before = OutcomeStore.keep
 
     def keep(self: OutcomeStore, outcomes: Sequence[Outcome]) -> list[Notice]:
-        nonlocal heard
+        nonlocal received
         notices = before(self, outcomes)
         for number in map(_number, outcomes) if self.fault is None else ():
             if number is not None:
@@ -73,8 +77,8 @@ async def _served(config: MachineConfig, tell: Callable[..., None]) -> None:
         for notice in notices:
             if notice.severity == "MAJOR":
                 tell(refused=notice.text)
-        heard += sum(isinstance(outcome, WindowOutcome) for outcome in outcomes)
-        if heard >= RAPIDS:
+        received += sum(isinstance(outcome, WindowOutcome) for outcome in outcomes)
+        if received >= RAPIDS:
             loop.call_soon_threadsafe(daemon._stop.set)
         return notices
 

@@ -173,14 +173,14 @@ def _traced(pid: int, inject: str | None, trace: Path) -> Iterator[None]:
 
 
 def _heard(ours: socket.socket) -> Told:
-    told = Told()
-    while not told.wrong and (message := _message(ours)):
+    result = Told()
+    while not result.wrong and (message := _message(ours)):
         for key, value in json.loads(message).items():
             if key == "ended":
-                told.ended = True
+                result.ended = True
             else:
-                getattr(told, key).append(value)
-    return told
+                getattr(result, key).append(value)
+    return result
 
 
 def _message(ours: socket.socket) -> bytes:

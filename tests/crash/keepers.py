@@ -124,11 +124,11 @@ class Sets(OfTheDaemon):
     def found(self) -> set[int]:
         with History.read(self.folder) as history:
             sets = [row.set for row in history.revisions("X")]
-        for told in sets:
-            kept = published(told.revision)
-            equal = told.parameters == kept.parameters and told.covariance.tobytes() == kept.covariance.tobytes()
-            assert equal, f"revision {told.revision} is another"
-        return in_order(told.revision for told in sets)
+        for result in sets:
+            kept = published(result.revision)
+            equal = result.parameters == kept.parameters and result.covariance.tobytes() == kept.covariance.tobytes()
+            assert equal, f"revision {result.revision} is another"
+        return in_order(result.revision for result in sets)
 
 
 class Notices(OfTheDaemon):
@@ -255,15 +255,22 @@ def _checked(body: BinaryIO, number: int) -> dict[str, Any]:
     body.write(_rows(number))
     blocks = [[100, hashlib.sha256(_rows(number)).hexdigest()]]
     errors = {"rms_um": float(number), "max_um": 1.0}
-    told: dict[str, Any] = {"schema": program_check.SCHEMA, "code": CODE, "refused": [], "files": {}}
-    return told | {"axes": ["X"], "rows": 100, "blocks": blocks, "before": errors, "after": errors, "largest_um": 1.0}
+    refused: dict[str, Any] = {"schema": program_check.SCHEMA, "code": CODE, "refused": [], "files": {}}
+    return refused | {
+        "axes": ["X"],
+        "rows": 100,
+        "blocks": blocks,
+        "before": errors,
+        "after": errors,
+        "largest_um": 1.0,
+    }
 
 
 class Boxes(Plain):
     def keep(self, number: int) -> None:
-        told = blackbox.dump(self.folder, f"Tested{number}", lambda: {"can0": _log(number)})
-        if told.code != "BlackBox":
-            raise Refused(told.text)
+        result = blackbox.dump(self.folder, f"Tested{number}", lambda: {"can0": _log(number)})
+        if result.code != "BlackBox":
+            raise Refused(result.text)
 
     def found(self) -> set[int]:
         numbers = []

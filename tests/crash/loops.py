@@ -65,9 +65,9 @@ def tried(name: str, folder: Path, most: int | None = None) -> Found:
         store, trace = folder / "store", folder / "trace"
         shutil.rmtree(store, ignore_errors=True)
         shutil.copytree(begun, store)
-        told = kept_under(kind.work, store, injection(*fault_at), trace)
+        result = kept_under(kind.work, store, injection(*fault_at), trace)
         if was_injected(trace):
-            _judged(fault_at, told, looked_at(kind.make, store, kind.later), found)
+            _judged(fault_at, result, looked_at(kind.make, store, kind.later), found)
     return found
 
 
@@ -87,9 +87,9 @@ def _begun(kind: Kind, folder: Path, before: bool) -> Path:
 def _faults(begun: Path, kind: Kind, folder: Path, found: Found, most: int | None) -> Iterator[tuple[str, int, str]]:
     store, trace = folder / "first", folder / "first.trace"
     shutil.copytree(begun, store)
-    told = kept_under(kind.work, store, None, trace)
-    assert told.ended, told
-    assert not told.refused, told
+    result = kept_under(kind.work, store, None, trace)
+    assert result.ended, result
+    assert not result.refused, result
     threads = calls_of(trace)
     found.calls = sum(threads, Counter())
     every = [

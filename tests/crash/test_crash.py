@@ -59,22 +59,24 @@ def test_a_store_that_empties_a_file_before_it_writes_it_is_found_out(
 @pytest.mark.fault("F3")
 def test_a_full_disk_takes_nothing_back(name: str, tmp_path: Path) -> None:
     make = KEEPERS[name]
-    told = disks.filled(make, tmp_path, free_bytes=0)
-    assert (told.wrong, told.ended) == ([], True)
-    assert set(told.kept) - {9} <= set(told.found)
-    assert 1 in told.found
-    assert all("the disk is full" in text or "No space left" in text or "told before" in text for text in told.refused)
-    assert told.refused or name == "audit"  # a line may still fit into the page that the file has
+    result = disks.filled(make, tmp_path, free_bytes=0)
+    assert (result.wrong, result.ended) == ([], True)
+    assert set(result.kept) - {9} <= set(result.found)
+    assert 1 in result.found
+    assert all(
+        "the disk is full" in text or "No space left" in text or "told before" in text for text in result.refused
+    )
+    assert result.refused or name == "audit"  # a line may still fit into the page that the file has
 
 
 @pytest.mark.usefixtures("processes")
 @pytest.mark.parametrize("name", KEEPERS)
 @pytest.mark.fault("F5")
 def test_a_read_only_disk_takes_nothing_and_loses_nothing(name: str, tmp_path: Path) -> None:
-    told = disks.read_only(KEEPERS[name], tmp_path)
-    assert (told.wrong, told.ended) == ([], True)
-    assert (told.kept, {1, 2} <= set(told.found)) == ([1, 2, 9], True)
-    (text,) = told.refused
+    result = disks.read_only(KEEPERS[name], tmp_path)
+    assert (result.wrong, result.ended) == ([], True)
+    assert (result.kept, {1, 2} <= set(result.found)) == ([1, 2, 9], True)
+    (text,) = result.refused
     assert any(words in text for words in ("it may not be written", "Read-only file system", "told before"))
 
 

@@ -137,5 +137,5 @@ def fdhil(*arguments: str | Path, capsys: pytest.CaptureFixture[str]) -> tuple[i
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", ["fdhil", *map(str, arguments)])
         code = run_safely(cli)
-    said = capsys.readouterr()
-    return code, said.out, said.err
+    output = capsys.readouterr()
+    return code, output.out, output.err

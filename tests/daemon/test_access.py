@@ -78,10 +78,10 @@ async def test_every_request_without_the_role_is_refused_has_no_effect_and_is_in
         assert answer["ok"] == peer.may(what) == (what in desk.done)
         assert answer["ok"] or answer["code"] == "AuthRequired"
         await audited.written()
-    told = [(entry.get("asked") or entry["answered"], entry.get("result")) for entry, _ in audit.entries(tmp_path)]
-    refused = [what for what, result in told if result == "AuthRequired"]
+    reported = [(entry.get("asked") or entry["answered"], entry.get("result")) for entry, _ in audit.entries(tmp_path)]
+    refused = [what for what, result in reported if result == "AuthRequired"]
     assert refused == [what for what in (*NEEDS, "stop") if not peer.may(what)]
-    assert {what for what, result in told if result == "done"} == set(desk.done) - {"status", "live"}
+    assert {what for what, result in reported if result == "done"} == set(desk.done) - {"status", "live"}
     assert b"SECRET" not in b"".join(path.read_bytes() for path in tmp_path.iterdir())
 
 
@@ -163,8 +163,8 @@ async def test_of_who_may_not_ask_there_is_a_short_line_a_minute_whatever_he_ask
         for what in (*NEEDS, "stop", "anything"):
             for _ in range(10):
                 assert (await audited.of({**long, "request": what}, stranger))["code"] == "AuthRequired"
-    told = [entry.get("not_written", 0) for entry, _ in audit.entries(tmp_path)]
-    assert told == [0, 69, 69]
+    result = [entry.get("not_written", 0) for entry, _ in audit.entries(tmp_path)]
+    assert result == [0, 69, 69]
     await audited.written()
     assert sum(1 + entry.get("not_written", 0) for entry, _ in audit.entries(tmp_path)) == 210
     assert (tmp_path / audit.FILE_NAME).stat().st_size < 4000
@@ -179,8 +179,8 @@ async def test_what_ends_in_an_error_is_in_the_audit_too(tmp_path: Path) -> None
         with pytest.raises(ZeroDivisionError):
             await audited.of({"request": what}, owner)
     await audited.written()
-    told = [(entry["answered"], entry["result"]) for entry, _ in audit.entries(tmp_path) if "answered" in entry]
-    assert told == [("arm", "ZeroDivisionError"), ("disarm", "ZeroDivisionError")]
+    result = [(entry["answered"], entry["result"]) for entry, _ in audit.entries(tmp_path) if "answered" in entry]
+    assert result == [("arm", "ZeroDivisionError"), ("disarm", "ZeroDivisionError")]
 
 
 @pytest.mark.fault("F12")

@@ -48,11 +48,11 @@ def test_no_daemon_is_one_sentence_with_the_next_action(tmp_path: Path) -> None:
 def test_a_socket_that_may_not_be_used_is_no_daemon_that_is_away(code: int) -> None:
     """The advice to start a daemon would start a second one."""
     denied = OSError(code, os.strerror(code))
-    told = str(ConnectError.of_socket("daemon", denied, "is not running; start it"))
-    assert told.startswith(
+    result = str(ConnectError.of_socket("daemon", denied, "is not running; start it"))
+    assert result.startswith(
         f"daemon: does not accept this user ({os.strerror(code)}), so that it is unknown whether it runs"
     )
-    assert "start it" not in told
+    assert "start it" not in result
 
 
 async def test_what_could_not_be_read_is_told_with_its_exit_code(tmp_path: Path) -> None:
@@ -101,11 +101,11 @@ async def test_what_takes_its_time_tells_its_progress_and_ends_when_nobody_waits
             free.set()
         return {"checked_s": turn["count"]}
 
-    told: list[Mapping[str, Any]] = []
+    result: list[Mapping[str, Any]] = []
     async with ControlServer(handle, progress, abandoned.set, Access()).serving(tmp_path / "c"):
-        answer = await asyncio.to_thread(ask, tmp_path / "c", {"request": "arm"}, 10.0, told.append)
+        answer = await asyncio.to_thread(ask, tmp_path / "c", {"request": "arm"}, 10.0, result.append)
         assert answer == {"ok": True}
-        assert told == [{"checked_s": 1}, {"checked_s": 2}]
+        assert result == [{"checked_s": 1}, {"checked_s": 2}]
         with pytest.raises(DeviceTimeout):
             await asyncio.to_thread(ask, tmp_path / "c", {"request": "arm", "of": "one who leaves"}, 0.01)
         await asyncio.wait_for(abandoned.wait(), 30.0)  # also where no progress was asked for
@@ -125,20 +125,20 @@ async def test_a_check_is_told_to_and_abandoned_by_whom_it_is_for_alone(
     monkeypatch.setattr("fdhil.daemon.control.PROGRESS_S", 0.01)
     roles = iter([Role.OPERATE, role])
     monkeypatch.setattr("fdhil.daemon.control.peer_of", lambda *_: Peer("somebody", 4711, 1, next(roles)))
-    heard, free, abandoned = asyncio.Semaphore(0), asyncio.Event(), asyncio.Event()
+    received, free, abandoned = asyncio.Semaphore(0), asyncio.Event(), asyncio.Event()
 
     async def handle(request: Mapping[str, Any], peer: Peer) -> Mapping[str, Any]:
-        heard.release()
+        received.release()
         await free.wait()
         return {"ok": True}
 
     server = ControlServer(handle, lambda: {"program": "secret.ngc"}, abandoned.set, Access())
     async with server.serving(tmp_path / "c"):
         operator = await asking(tmp_path / "c", {"request": "arm"})
-        await heard.acquire()
+        await received.acquire()
         reader, other = await asyncio.open_unix_connection(str(tmp_path / "c"))
         other.write(b'{"request": "arm", "progress": true}\n')
-        await heard.acquire()
+        await received.acquire()
         with pytest.raises(TimeoutError):
             await asyncio.wait_for(reader.readline(), 0.3)
         other.close()
@@ -162,10 +162,10 @@ def test_who_has_no_descriptor_left_is_told_so(tmp_path: Path, listener: socket.
 
 
 async def test_who_left_before_the_daemon_came_to_it_arms_nothing(tmp_path: Path) -> None:
-    heard: list[str] = []
+    received: list[str] = []
 
     async def handle(request: Mapping[str, Any], peer: Peer) -> Mapping[str, Any]:
-        heard.append(f"{request['request']} {request['of']}")
+        received.append(f"{request['request']} {request['of']}")
         return {"ok": True}
 
     async with ControlServer(handle, dict, lambda: None, Access()).serving(tmp_path / "c"):
@@ -178,7 +178,7 @@ async def test_who_left_before_the_daemon_came_to_it_arms_nothing(tmp_path: Path
         writer.write_eof()
         assert json.loads(await reader.readline()) == {"ok": True}
         writer.close()
-    assert heard == ["disarm one who left", "stop one who left", "arm one who stays"]
+    assert received == ["disarm one who left", "stop one who left", "arm one who stays"]
 
 
 async def test_idle_connections_make_room_and_those_that_wait_leave_some_for_disarm(tmp_path: Path) -> None:
@@ -269,10 +269,10 @@ def test_a_log_that_nobody_reads_holds_nothing_up_and_what_it_lacks_is_told(monk
         monkeypatch.setattr(sys, "stderr", stream)
         for _ in range(2_000):
             journal.write_line("x" * 100)
-        told = read.read(1 << 20).count(b"\n")
+        result = read.read(1 << 20).count(b"\n")
         journal.write_line("last")
         lines = read.read(1 << 20).decode().splitlines()
-        assert lines[0].endswith(f" {2_000 - told} lines could not be written before this one")
+        assert lines[0].endswith(f" {2_000 - result} lines could not be written before this one")
         assert lines[1].endswith(" last")
         read.close()
         journal.write_line("said to nobody")

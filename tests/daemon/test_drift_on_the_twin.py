@@ -37,10 +37,10 @@ def shop(tmp_path: Path) -> Iterator[Shop]:
     (tmp_path / "twin.toml").write_text(f'{bench}[bus.can0]\ninterface = "socketcand"\n')
     with Twin(tmp_path / "twin.toml", tmp_path / "twin.log") as twin:
         bus, sensor = twin.ready["buses"]["can0"], twin.ready["modbus"]["X"]
-        told = "\n".join(f"{key} = {json.dumps(value)}" for key, value in {**sensor, "period_s": 0.05}.items())
+        expected = "\n".join(f"{key} = {json.dumps(value)}" for key, value in {**sensor, "period_s": 0.05}.items())
         place = "\n".join(f"{key} = {json.dumps(bus[key])}" for key in ("channel", "host", "port"))
         machine = tmp_path / "machine.toml"
-        machine.write_text(f'{bench}[axis.X.temperature]\n{told}\n[bus.can0]\ninterface = "socketcand"\n{place}\n')
+        machine.write_text(f'{bench}[axis.X.temperature]\n{expected}\n[bus.can0]\ninterface = "socketcand"\n{place}\n')
         yield Shop(tmp_path, twin, machine, machine_config.load(machine))
 
 

@@ -50,8 +50,8 @@ def test_an_identified_machine_follows_without_a_program(shop: Shop, capsys: Cap
         for axis, (_, smaller) in CASES.items():
             assert before[axis] / after[axis] >= smaller, (before, after)
         assert fdhil("disarm", shop.path, capsys=capsys)[0] == 0
-        told = shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
-        assert feed_of(told)["applied"] == {"X": [0, 0], "Y": [0, 0]}
+        status = shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
+        assert feed_of(status)["applied"] == {"X": [0, 0], "Y": [0, 0]}
         assert largest_errors_um(shop, "again") == pytest.approx(before, rel=0.1)
         fades_out_on_an_emergency(shop, capsys)
         assert daemon.stop() == 0
@@ -69,8 +69,8 @@ def fed_forward(shop: Shop, capsys: Capture) -> dict[str, float]:
     switch_on(shop, capsys)
     shop.status_when(lambda s: s["state"] == "FEEDFORWARD")
     errors_um = largest_errors_um(shop, "after")
-    told = shop.status_when(lambda s: s["guard"])
-    assert told["state"] == "FEEDFORWARD", told["guard"]
+    status = shop.status_when(lambda s: s["guard"])
+    assert status["state"] == "FEEDFORWARD", status["guard"]
     return errors_um
 
 
@@ -78,13 +78,13 @@ def fades_out_on_an_emergency(shop: Shop, capsys: Capture) -> None:
     switch_on(shop, capsys)
     shop.status_when(lambda s: s["state"] == "FEEDFORWARD")
     shop.twin.command("fault", fault="frame", can_id=0x081, data="1043080000000000")
-    told = shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
-    assert feed_of(told)["cause"]["code"] == "DriveEmergency"
+    status = shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
+    assert feed_of(status)["cause"]["code"] == "DriveEmergency"
     boxes = shop.config.store.directory / "blackbox"
     shop.wait(lambda: any(boxes.glob("*-DriveEmergency.log")))
     (box,) = boxes.glob("*-DriveEmergency.log")
     shop.wait(lambda: "can0 081#1043080000000000" in box.read_text())
-    assert feed_of(told)["applied"] == {"X": [0, 0], "Y": [0, 0]}
+    assert feed_of(status)["applied"] == {"X": [0, 0], "Y": [0, 0]}
 
 
 def feed_of(status: dict[str, Any]) -> dict[str, Any]:

@@ -106,22 +106,22 @@ async def test_a_wrong_period_a_node_never_heard_and_a_dead_bus_are_told(
     bus = {"can0": {"interface": "socketcand", "port": line.port}}
     config = config_of(tmp_path, ("X", "Y"), bus=bus)
     async with serving(config, Opens()) as path:  # type: ignore[arg-type]
-        told = await status_when(path, lambda s: {t["code"] for t in s["troubles"]} >= WRONG)
-        assert told["source"]["state"] == "listening"
-        assert told["sync"]["rate_hz"] == pytest.approx(500.0, rel=0.01)
-        troubles = {(each["code"], each["axis"]): each["text"] for each in told["troubles"]}
+        status = await status_when(path, lambda s: {t["code"] for t in s["troubles"]} >= WRONG)
+        assert status["source"]["state"] == "listening"
+        assert status["sync"]["rate_hz"] == pytest.approx(500.0, rel=0.01)
+        troubles = {(each["code"], each["axis"]): each["text"] for each in status["troubles"]}
         expected = r"SYNC runs at (499\.\d|500(\.\d)?) Hz instead of 1000 Hz .* set sync_period_s = 0\.00(2|1999)"
         assert re.search(expected, troubles["SyncPeriodSuspect", ""])
         assert "the drive (node 2 on can0) has never sent a frame" in troubles["NodeNeverHeard", "Y"]
-        assert {notice["code"] for notice in told["notices"]} >= WRONG
-        text = shown(told, capsys)
+        assert {notice["code"] for notice in status["notices"]} >= WRONG
+        text = shown(status, capsys)
         assert re.search(r"listening, SYNC (499|500)\.\d Hz of 1000", text)
         assert "Y: NodeNeverHeard: the drive (node 2 on can0) has never sent a frame" in text
         line.cut()
-        told = await status_when(path, lambda s: s["source"]["state"] == "silent" and s["sync"]["rate_hz"] is None)
-        assert told["source"]["heard_s_ago"] > 1.0
-        assert told["sync"]["heard_s_ago"] >= 1.0  # told in whole milliseconds
-        text = shown(told, capsys)
+        status = await status_when(path, lambda s: s["source"]["state"] == "silent" and s["sync"]["rate_hz"] is None)
+        assert status["source"]["heard_s_ago"] > 1.0
+        assert status["sync"]["heard_s_ago"] >= 1.0  # told in whole milliseconds
+        text = shown(status, capsys)
         assert "silent for" in text
         assert "no SYNC for" in text
         assert "Hz of" not in text
@@ -145,7 +145,7 @@ def test_the_rate_is_of_what_is_heard_now(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("periods_us", "told"),
+    ("periods_us", "expected"),
     [
         ((1000,), None),
         ((1200,), "set sync_period_s = 0.0012"),
@@ -156,7 +156,7 @@ def test_the_rate_is_of_what_is_heard_now(tmp_path: Path) -> None:
     ],
 )
 def test_period_is_judged_by_a_minute_and_gets_a_number_only_where_it_is_steady(
-    periods_us: tuple[int, ...], told: str | None, tmp_path: Path
+    periods_us: tuple[int, ...], expected: str | None, tmp_path: Path
 ) -> None:
     hearing = Hearing(config_of(tmp_path), 0.0)
     hearing.source_opened(0.0)
@@ -169,9 +169,9 @@ def test_period_is_judged_by_a_minute_and_gets_a_number_only_where_it_is_steady(
         found = {code: text for (code, _), text in hearing.troubles({}, now_s).items()}
         if "SyncPeriodSuspect" in found and first_s is None:
             first_s = now_s
-    assert (first_s is None) is (told is None)
-    if told is not None:
-        assert told in found["SyncPeriodSuspect"]
+    assert (first_s is None) is (expected is None)
+    if expected is not None:
+        assert expected in found["SyncPeriodSuspect"]
         assert first_s is not None
         assert first_s > 59.0
 
@@ -190,7 +190,7 @@ def test_two_buses_that_show_the_same_ticks_twice_are_no_rate(tmp_path: Path) ->
 def test_a_drive_that_answers_but_does_not_sample_is_told_once_and_its_end_too(tmp_path: Path) -> None:
     watch = Watch(config_of(tmp_path), 0.0)
     watch.hearing.source_opened(0.0)
-    told: list[tuple[float, Notice]] = []
+    result: list[tuple[float, Notice]] = []
     for k in range(1, 120):
         now_s, ticks = k * 0.25, np.arange(k * 250, k * 250 + 250)
         watch.hearing.record_came(TickTimes(frozen_ints(ticks), frozen_ints(ticks * 1_000_000)), now_s)
@@ -200,9 +200,12 @@ def test_a_drive_that_answers_but_does_not_sample_is_told_once_and_its_end_too(t
             still, tick = frozen(np.zeros(whole)), frozen_ints(ticks[:whole])
             samples = AxisSamples("X", tick, still, still, still, still, None, still, tick)
             watch.hearing.record_came(samples, now_s)
-        told += [(now_s, notice) for notice in watch.troubles(now_s)]
-    assert [(n.code, n.severity, n.axis) for _, n in told] == [("NoSamples", "MAJOR", "X"), ("NoSamples", "info", "X")]
-    assert 10.0 <= told[0][0] <= 11.0
+        result += [(now_s, notice) for notice in watch.troubles(now_s)]
+    assert [(n.code, n.severity, n.axis) for _, n in result] == [
+        ("NoSamples", "MAJOR", "X"),
+        ("NoSamples", "info", "X"),
+    ]
+    assert 10.0 <= result[0][0] <= 11.0
 
 
 @pytest.mark.parametrize(
@@ -216,8 +219,8 @@ def test_a_drive_that_is_never_heard_may_be_one_without_a_heartbeat(synced: bool
         if synced:
             hearing.record_came(TickTimes(frozen_ints(ticks), frozen_ints(ticks * 1_000_000)), k * 0.25)
         hearing.counted({"frames": k, "can0.frames": k, "can0.X.heard": 0}, k * 0.25)
-        told = hearing.troubles({}, k * 0.25)
-    assert words in told["NodeNeverHeard", "X"]
+        result = hearing.troubles({}, k * 0.25)
+    assert words in result["NodeNeverHeard", "X"]
 
 
 def fed(config: MachineConfig, records: list[Record], windows: int = 0) -> dict[tuple[str, str], str]:
@@ -281,9 +284,9 @@ async def test_the_daemon_tells_moves_it_cannot_use_instead_of_0_accepted_0_refu
 ) -> None:
     records = rapids(config_of(tmp_path), count=3)
     async with serving(other(tmp_path, rapid_speed_mm_s=1000.0), Machine(records)) as path:
-        told = await status_when(path, lambda s: s["troubles"] and s["axes"]["X"]["moves"]["seen"] == 3)
-        text = shown(told, capsys)
-    assert [notice["code"] for notice in told["notices"]].count("MovesNotUsed") == 1
+        status = await status_when(path, lambda s: s["troubles"] and s["axes"]["X"]["moves"]["seen"] == 3)
+        text = shown(status, capsys)
+    assert [notice["code"] for notice in status["notices"]].count("MovesNotUsed") == 1
     assert "X 0/0" in text
     assert "X: MovesNotUsed: 3 moves recorded, none used" in text
     assert "X: 3 moves seen; not used: 3 slower than a rapid (the fastest of all reached 5" in text

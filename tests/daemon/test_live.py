@@ -78,10 +78,10 @@ async def test_a_running_daemon_tells_its_samples_as_they_pass(tmp_path: Path, m
         records = rapids(config, count=1)
         machine.give(*records)
         sent = [record for record in records if isinstance(record, AxisSamples)]
-        told = [await line_of(reader, "samples") for _ in sent]
+        result = [await line_of(reader, "samples") for _ in sent]
         writer.close()
-    assert [line["tick"] for line in told] == [int(record.tick[0]) for record in sent]
-    current = np.concatenate([values_of(line)[SIGNALS.index("current_a")] for line in told])
+    assert [line["tick"] for line in result] == [int(record.tick[0]) for record in sent]
+    current = np.concatenate([values_of(line)[SIGNALS.index("current_a")] for line in result])
     np.testing.assert_allclose(current, np.concatenate([record.current_a for record in sent]), atol=1e-4)
 
 
@@ -167,7 +167,7 @@ async def test_viewers_are_few_and_who_leaves_makes_room(tmp_path: Path) -> None
 
 
 def test_nobody_looks_nothing_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fdhil.daemon.live.encode_line", lambda told: pytest.fail("a line was made for nobody"))
+    monkeypatch.setattr("fdhil.daemon.live.encode_line", lambda result: pytest.fail("a line was made for nobody"))
     LiveStream(config_of(tmp_path)).take(block([1, 2, 3]))
 
 

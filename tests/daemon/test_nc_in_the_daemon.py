@@ -16,9 +16,9 @@ from tests.daemon.test_service import serving, status_when
 
 
 def said(records: Sequence[Record], moves: Sequence[NcMove]) -> list[Record]:
-    told = iter(moves)
+    result = iter(moves)
     return [
-        replace(record, nc=next(told)) if isinstance(record, MoveEvent) and record.kind is MoveKind.RAPID else record
+        replace(record, nc=next(result)) if isinstance(record, MoveEvent) and record.kind is MoveKind.RAPID else record
         for record in records
     ]
 

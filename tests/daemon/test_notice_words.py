@@ -35,8 +35,8 @@ def test_a_class_of_notice_has_effect_and_action(code: str) -> None:
 
 def test_what_the_guard_stopped_has_the_guards_own_words() -> None:
     alarm = Alarm("EchoMismatch", "X")
-    told = words_of(Notice("GuardTripped", "MAJOR", f"EchoMismatch: {alarm.sentence()}", "X"))
-    assert told == (EFFECT[Reaction.RAMP_DOWN], CATALOGUE["EchoMismatch"][2])
+    notices = words_of(Notice("GuardTripped", "MAJOR", f"EchoMismatch: {alarm.sentence()}", "X"))
+    assert notices == (EFFECT[Reaction.RAMP_DOWN], CATALOGUE["EchoMismatch"][2])
 
 
 def test_what_a_late_pc_caused_has_the_action_against_a_late_pc() -> None:

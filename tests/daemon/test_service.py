@@ -77,9 +77,9 @@ async def test_rapids_become_parameters_with_intervals_in_status_and_history(tmp
     assert status["sync"]["expected_hz"] == 1000.0
     assert (axis["refused"], axis["revision"]) == (0, 2)
     for name, true in NOMINAL.items():
-        told = axis["parameters"][name]
-        assert told["low"] < told["value"] < told["high"]
-        assert told["value"] == pytest.approx(true, rel=0.1), name
+        result = axis["parameters"][name]
+        assert result["low"] < result["value"] < result["high"]
+        assert result["value"] == pytest.approx(true, rel=0.1), name
     with History.read(config.store.directory) as history:
         assert [r.set.revision for r in history.revisions("X")] == [1, 2]
         assert history.revisions("X")[1].window_ids == (1, 2)
@@ -103,8 +103,8 @@ async def test_a_configuration_that_was_edited_while_the_daemon_runs_is_reported
         answers = [await asyncio.to_thread(fdhil, command, file, *more, capsys=capsys) for command, *more in asked]
         (trouble,) = await asyncio.to_thread(lambda: list(examine_daemon(load(file))))
     assert trouble.code == "ConfigDiffers"
-    said = [" ".join((out + err).split()) for _, out, err in answers]
-    assert [("configuration file has changed" in text, "X 250 um" in text) for text in said] == [(True, True)] * 4
+    output = [" ".join((out + err).split()) for _, out, err in answers]
+    assert [("configuration file has changed" in text, "X 250 um" in text) for text in output] == [(True, True)] * 4
     assert json.loads(answers[1][1])["limits"]["X"]["max_offset_um"] == 250.0
 
 
@@ -207,13 +207,13 @@ async def test_systemd_hears_ready_the_watchdog_and_the_end(tmp_path: Path, monk
         monkeypatch.setenv("WATCHDOG_USEC", "100000")
         machine = Machine()
         async with serving(config_of(tmp_path), machine):
-            heard = [await asyncio.get_running_loop().sock_recv(manager, 200) for _ in range(2)]
+            received = [await asyncio.get_running_loop().sock_recv(manager, 200) for _ in range(2)]
         with contextlib.suppress(BlockingIOError):
             while True:
-                heard.append(manager.recv(200))
-    assert any(message.startswith(b"READY=1") for message in heard)
-    assert b"WATCHDOG=1" in heard
-    assert b"STOPPING=1" in heard
+                received.append(manager.recv(200))
+    assert any(message.startswith(b"READY=1") for message in received)
+    assert b"WATCHDOG=1" in received
+    assert b"STOPPING=1" in received
 
 
 async def test_a_drive_that_boots_voids_its_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

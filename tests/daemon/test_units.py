@@ -69,7 +69,7 @@ def exposure(name: str, folder: Path) -> float:
     verified = subprocess.run(["systemd-analyze", "verify", str(unit)], capture_output=True, text=True)
     assert (verified.returncode, verified.stderr.strip()) == (0, ""), name
     judged = ["systemd-analyze", "security", "--offline=yes", str(unit)]
-    said = subprocess.run(judged, capture_output=True, text=True).stdout
-    found = re.search(r"exposure level for \S+: ([0-9.]+) ", said)
-    assert found, said
+    output = subprocess.run(judged, capture_output=True, text=True).stdout
+    found = re.search(r"exposure level for \S+: ([0-9.]+) ", output)
+    assert found, output
     return float(found[1])

@@ -34,12 +34,12 @@ def test_from_the_bus_to_the_history_to_a_corrected_cut_and_back(shop: Shop, cap
         _refuses_what_is_not_known(shop, capsys)
         shop.nc(on=True)
         shop.play("shuttle.ngc", SHUTTLE)
-        told = shop.status_when(
+        refused = shop.status_when(
             lambda s: (
                 s["sync"]["rate_hz"] and all(s["axes"][a]["accepted"] + s["axes"][a]["refused"] >= 4 for a in "XY")
             )
         )
-        _knows_the_drives(told)
+        _knows_the_drives(refused)
         _refuses_a_second_daemon(shop)
         _cuts_corrected(shop, capsys)
         _refuses_a_drive_that_was_written_to_until_it_is_compared(shop, capsys)
@@ -77,9 +77,9 @@ def _knows_the_drives(status: dict[str, object]) -> None:
         assert (axis["accepted"], axis["refused"]) == (4, 0), axis
         assert axis["skill"]["rms_um"] < 0.1 * axis["skill"]["measured_rms_um"]
         for name, true in REAL.items():
-            told = axis["parameters"][name]
-            assert told["value"] == pytest.approx(true, rel=0.1 if name in {"ft", "Cd"} else 0.02), name
-            assert told["low"] < told["high"]
+            result = axis["parameters"][name]
+            assert result["value"] == pytest.approx(true, rel=0.1 if name in {"ft", "Cd"} else 0.02), name
+            assert result["low"] < result["high"]
 
 
 def _refuses_a_second_daemon(shop: Shop) -> None:
@@ -141,12 +141,12 @@ def _replays_bit_by_bit(shop: Shop, capsys: Capture) -> None:
     for file, window, revision, skill in zip(document["files"], stored, revisions, skills, strict=True):
         of = {outcome["kind"]: outcome for outcome in file["outcomes"]}
         unitless = {
-            name: {key: value for key, value in told.items() if key != "unit"}
-            for name, told in of["window"]["parameters"].items()
+            name: {key: value for key, value in result.items() if key != "unit"}
+            for name, result in of["window"]["parameters"].items()
         }
         assert unitless == window.parameters
         assert of["window"]["fit_percent"] == window.fit_percent
-        values = {name: told["value"] for name, told in of["parameters"]["parameters"].items()}
+        values = {name: result["value"] for name, result in of["parameters"]["parameters"].items()}
         assert values == revision.set.parameters.as_dict()
         assert of["skill"]["rms_um"] == skill.rms_um
 

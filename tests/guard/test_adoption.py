@@ -68,7 +68,7 @@ def test_a_believed_offset_is_ramped_from_its_value() -> None:
 
 
 @pytest.mark.parametrize(
-    ("machine", "told"),
+    ("machine", "expected"),
     [
         (holding(820, 0), "250.2 um may still be applied: beyond the ceiling"),
         (holding(0, -327680), "-100000.0 um may still be applied: beyond the ceiling"),
@@ -76,14 +76,14 @@ def test_a_believed_offset_is_ramped_from_its_value() -> None:
         (holding(500, 0, record_void=True), "152.6 um may still be applied: axis X: the drive has rebooted"),
     ],
 )
-def test_what_may_not_be_believed_is_frozen_and_told(machine: Bench, told: str) -> None:
+def test_what_may_not_be_believed_is_frozen_and_told(machine: Bench, expected: str) -> None:
     machine.run(150)
     assert machine.mode is Mode.FROZEN
     assert machine.frames == []
     assert machine.heartbeats == []
     assert machine.state.cause is not None
     assert machine.state.cause.code == "OffsetDoubtful"
-    assert told in machine.state.cause.sentence()
+    assert expected in machine.state.cause.sentence()
     assert may_stand(machine.state) == tuple(drive.offset for drive in machine.drives)
     assert codes(machine.sync(ADOPT).refused) & {"OffsetDoubtful", "NotCommissioned", "RecordVoid"}
     assert "NotOff" in codes(machine.sync(arm_request()).refused)
@@ -313,8 +313,8 @@ def test_what_may_stand_while_it_sends_is_what_was_sent_or_shown() -> None:
     machine.drives[0].scale = 0.5
     while not machine.state.axes[0].echo_misses:
         machine.sync()
-    told = may_stand(machine.state)
-    assert told[0] == machine.state.axes[0].read_back != machine.frames[-1][1][0]
+    result = may_stand(machine.state)
+    assert result[0] == machine.state.axes[0].read_back != machine.frames[-1][1][0]
 
 
 def test_a_zero_that_was_shown_at_the_end_stays_known() -> None:
@@ -409,11 +409,11 @@ def test_a_drive_that_was_touched_after_it_was_compared_stays_void(touched: Mapp
     restart(machine)
     machine.settle()
     asked = Request("compared", True, compared={"X": RECORD}, touched=touched)
-    told = Alarm("RecordVoid", "X", "after it was compared")
-    assert machine.sync(asked).refused == (told,)
+    expected = Alarm("RecordVoid", "X", "after it was compared")
+    assert machine.sync(asked).refused == (expected,)
     assert codes(machine.arm()) == {"RecordVoid"}
     restart(machine)  # in the very cycle in which the guard is told
-    assert machine.sync(replace(asked, touched={"X": 2})).refused == (told,)
+    assert machine.sync(replace(asked, touched={"X": 2})).refused == (expected,)
     assert machine.sync(replace(asked, touched={"X": 3})).refused == ()
 
 

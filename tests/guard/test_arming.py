@@ -109,9 +109,9 @@ def test_every_vector_of_the_interlocks(settled: tuple[Bench, Inputs]) -> None:
             axis = AXIS_CHANGES[code](axis)
         for code in broken & BUS_CHANGES.keys():
             bus = bus._replace(**BUS_CHANGES[code])
-        told = refusals(machine, inputs._replace(axes=(axis,), bus=bus, request=arm_request()))
-        assert broken <= told
-        assert bool(told) is bool(broken)
+        answer = refusals(machine, inputs._replace(axes=(axis,), bus=bus, request=arm_request()))
+        assert broken <= answer
+        assert bool(answer) is bool(broken)
 
 
 @pytest.mark.parametrize("value", [None, 1, "true", 0, [], {"commissioned": True}])
@@ -237,13 +237,13 @@ def test_every_vector_of_an_axis_is_told_exactly() -> None:
 
 def test_every_vector_of_the_bus_is_told_exactly() -> None:
     states = {"active": "", "warning": "", "passive": "ErrorPassive", "off": "BusOff", "down": "BusDown"}
-    told = set()
+    result = set()
     for state, regular, silent, lost in itertools.product(states, (True, False), (True, False), (0, 1)):
         expected = {states[state]} - {""} | ({"SyncLost"} if silent else set()) | ({"RxOverflow"} if lost else set())
         expected |= set() if regular else {"SyncJitter"}
         assert {alarm.code for alarm in failing(BusView(state, regular, silent, lost), (GOOD,))} == expected
-        told |= expected
-    assert told == {code for code, _ in BUS_INTERLOCKS}
+        result |= expected
+    assert result == {code for code, _ in BUS_INTERLOCKS}
 
 
 @pytest.mark.parametrize(

@@ -147,9 +147,9 @@ def test_neither_garbage_nor_floods_nor_signals_cost_a_running_correction_one_sy
             thread.join()
         for descriptor in (*wrong, piece, whole):
             os.close(descriptor)
-    told = rig.events()
-    assert not any(event["event"] == "failed" for event in told)
-    assert [event["missed"] for event in told if event.get("state") == "OFF"] == [missed]
+    events = rig.events()
+    assert not any(event["event"] == "failed" for event in events)
+    assert [event["missed"] for event in events if event.get("state") == "OFF"] == [missed]
     ticks = [tick for tick, _ in rig.peer.offsets_sent() if tick > armed_at]
     assert ticks == list(range(ticks[0], ticks[0] + len(ticks)))
     rows = {target: k for k, target in enumerate(DEMAND[0])}
@@ -218,14 +218,14 @@ def test_a_second_request_waits_for_the_answer_to_the_first(rig: Rig) -> None:
     idle = [connection(rig) for _ in range(2 * MAX_CLIENTS)]
     with connection(rig) as client:
         client.send(b'{"request": "arm", "id": 1}\n{"request": "arm", "id": 2}\n')
-        told = answer(client)
-        assert (told["id"], told["code"]) == (2, "GuardBusy")
+        reply = answer(client)
+        assert (reply["id"], reply["code"]) == (2, "GuardBusy")
         client.send(b'{"request": "disarm", "id": 3}\n')
-        told = answer(client)
-        assert (told["id"], told["code"]) == (1, "DisarmedSince")
+        reply = answer(client)
+        assert (reply["id"], reply["code"]) == (1, "DisarmedSince")
         rig.peer.syncing = True
-        told = answer(client)
-        assert (told["id"], told["ok"]) == (3, True)
+        reply = answer(client)
+        assert (reply["id"], reply["ok"]) == (3, True)
         client.send(b'{"request": "sing", "id": "4"}\n{"request": ["status"], "id": 5.5}\n')
         assert [answer(client)["code"] for _ in range(1)] == ["BadRequest"]
     for each in idle:

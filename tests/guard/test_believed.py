@@ -88,9 +88,9 @@ def test_doubt_lasts_six_readings_in_a_row_and_then_freezes_for_good() -> None:
     assert started(unheard, "StaleData").unknown_for == 0
     state = started(state, "StaleData")
     assert (state.mode, state.adopt_checked) == (Mode.FROZEN, True)
-    told = "axis X: the offset that the drive reports cannot be trusted (152.6 um may still be applied: the drive's"
+    expected = "axis X: the offset that the drive reports cannot be trusted (152.6 um may still be applied: the drive's"
     assert state.cause is not None
-    assert state.cause.sentence().startswith(told)
+    assert state.cause.sentence().startswith(expected)
 
 
 def test_after_a_foreign_offset_the_drives_have_six_readings_to_agree() -> None:
@@ -109,7 +109,7 @@ def test_after_a_foreign_offset_the_drives_have_six_readings_to_agree() -> None:
 
 
 @pytest.mark.parametrize(
-    ("axis", "told"),
+    ("axis", "expected"),
     [
         ({"off_demand": 2.0}, ""),
         ({"off_demand": 2.5}, "152.6 um may still be applied: its demand (0x6062) contradicts it"),
@@ -121,11 +121,11 @@ def test_after_a_foreign_offset_the_drives_have_six_readings_to_agree() -> None:
     ],
 )
 def test_a_value_is_believed_that_was_shown_three_times_and_fits_ceiling_and_demand(
-    axis: Mapping[str, Any], told: str
+    axis: Mapping[str, Any], expected: str
 ) -> None:
     state = held(500, 0)
     state = state._replace(axes=(state.axes[0]._replace(**axis), state.axes[1]))
-    assert doubts(views(state), ()) == ((Alarm("OffsetDoubtful", "X", told),) if told else ())
+    assert doubts(views(state), ()) == ((Alarm("OffsetDoubtful", "X", expected),) if expected else ())
 
 
 def test_a_value_is_believed_of_a_drive_that_is_as_it_was_commissioned() -> None:
@@ -142,8 +142,8 @@ def test_who_is_told_of_a_doubt_is_told_the_axis_the_offset_and_the_reason() -> 
     doubtful: Alarms = (Alarm("RecordVoid", "Y"),)
     reason = "axis Y: the drive has rebooted or its settings have changed since it was commissioned"
     for shown, axis, um in (((500, 0), "X", "152.6"), ((0, -500), "Y", "-152.6"), ((0, 0), "X", "0.0")):
-        told = Alarm("OffsetDoubtful", axis, f"{um} um may still be applied: {reason}")
-        assert in_doubt(views(held(*shown)), doubtful) == told
+        expected = Alarm("OffsetDoubtful", axis, f"{um} um may still be applied: {reason}")
+        assert in_doubt(views(held(*shown)), doubtful) == expected
     own = Alarm("OffsetDoubtful", "X", "its own")
     assert in_doubt(views(held(None, 0)), (*doubtful, Alarm("OffsetDoubtful", "Y", "another's"), own)) == own
 
@@ -223,8 +223,8 @@ def test_adopting_and_comparing_are_refused_while_it_sends(mode: Mode) -> None:
 
 
 def test_a_drive_that_is_another_is_told_by_its_axis() -> None:
-    told = Alarm("RecordVoid", "Y", "it differs from the guard's record")
-    for found, refused in (({"X": RECORD, "Y": "another"}, (told,)), ({"X": RECORD}, ())):
+    expected = Alarm("RecordVoid", "Y", "it differs from the guard's record")
+    for found, refused in (({"X": RECORD, "Y": "another"}, (expected,)), ({"X": RECORD}, ())):
         state, answer = compared(
             held(0, 0), Request("compared", True, compared=found, touched=dict.fromkeys("XY", 0)), MADE
         )

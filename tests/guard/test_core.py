@@ -85,8 +85,8 @@ def test_the_last_row_is_sent_and_the_ramp_begins_behind_it(armed: Bench) -> Non
 def test_what_ended_it_is_told_once_and_by_its_own_name(armed: Bench) -> None:
     for kind, code in (("stop", "Stopped"), ("disarm", "Disarmed")):
         machine = copy.deepcopy(armed)
-        told = [machine.sync().transition for _ in range(5)]
-        assert told == [None] * 5
+        result = [machine.sync().transition for _ in range(5)]
+        assert result == [None] * 5
         assert machine.sync(Request("stop" if kind == "stop" else "disarm")).transition == (
             *(Mode.ARMED, Mode.RAMP_DOWN),
             Alarm(code),

@@ -44,8 +44,8 @@ def test_status_tells_what_is_not_good() -> None:
     assert core.standing(machine.state, inputs_of(machine), machine.settings) == ()
     machine.drives[0].mode = 1
     machine.settle(20)
-    told = core.standing(machine.state, inputs_of(machine), machine.settings)
-    assert ("NotCsp", "X") in {(alarm.code, alarm.axis) for alarm in told}
+    result = core.standing(machine.state, inputs_of(machine), machine.settings)
+    assert ("NotCsp", "X") in {(alarm.code, alarm.axis) for alarm in result}
 
 
 def test_adopting_is_for_off_and_frozen_alone() -> None:
@@ -60,9 +60,9 @@ def test_who_arms_in_frozen_is_told_to_adopt_and_not_to_disarm() -> None:
     machine = active()
     machine.listener.error("off")
     machine.until(Mode.FROZEN)
-    told = next(alarm for alarm in machine.arm() if alarm.code == "NotOff")
-    assert "adopt" in told.action
-    assert "armed or ramping" not in told.cause
+    result = next(alarm for alarm in machine.arm() if alarm.code == "NotOff")
+    assert "adopt" in result.action
+    assert "armed or ramping" not in result.cause
 
 
 def test_adopting_waits_for_the_drives_own_word() -> None:

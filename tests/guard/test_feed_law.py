@@ -32,9 +32,9 @@ from tests.guard.fed import LAW, LIMITS, ONE
 @given(
     st.lists(st.tuples(st.integers(-(2**31), 2**31 - 1), st.booleans()), min_size=5, max_size=80), st.integers(1, 50)
 )
-def test_limits_hold_for_any_targets(heard: list[tuple[int, bool]], ending: int) -> None:
+def test_limits_hold_for_any_targets(expected: list[tuple[int, bool]], ending: int) -> None:
     feed: Feed = armed((LAW,))
-    for k, (target, lost) in enumerate(heard):
+    for k, (target, lost) in enumerate(expected):
         if k == ending:
             feed = end(feed, Alarm("Disarmed"))
         before = feed.applied
@@ -151,8 +151,8 @@ def test_a_limit_that_takes_something_away_is_counted() -> None:
 
 def test_nothing_but_zeros_until_every_target_was_heard() -> None:
     feed = armed((LAW,))
-    for heard in (5, 1005):
-        feed = move(hear(feed, [heard]), [LIMITS], 10)
+    for received in (5, 1005):
+        feed = move(hear(feed, [received]), [LIMITS], 10)
         assert (feed.applied, feed.share) == (((0, 0),), 0)
     feed = move(hear(feed, [2005]), [LIMITS], 10)
     assert feed.share == 1

@@ -227,9 +227,9 @@ def test_zeros_that_do_not_leave_are_none() -> None:
     for _ in range(100):
         bench.sync(unsent=(0, 1))
     assert mode_of(bench) is FeedMode.OFF
-    told = status.document(bench.state, bench.settings, None, ())["feedforward"]
-    assert told["confirmed"] is False
-    assert told["cause"]["text"].endswith("(no zero was read back)")
+    shown_status = status.document(bench.state, bench.settings, None, ())["feedforward"]
+    assert shown_status["confirmed"] is False
+    assert shown_status["cause"]["text"].endswith("(no zero was read back)")
     assert bench.state.feed.applied[0][0] > before[0][0] // 2
     bench.run(150)
     for wanted in (request(), arm_request()):
@@ -283,9 +283,11 @@ def test_a_guard_that_ends_over_a_torque_says_so(tmp_path: Path) -> None:
         assert shop.guard.status()["feedforward"]["confirmed"] is False
         shop.stop.send(b"x")
         assert shop.guard.run() == 3
-        told = [event for event in shop.events() if event["event"] in ("feedforward", "stopped")][-2:]
-        assert told[0]["text"].startswith("speed and torque offsets may still be applied; hold the feed")
-        assert told[1]["text"].startswith("the guard has stopped; speed and torque offsets may still be applied; hold")
+        events = [event for event in shop.events() if event["event"] in ("feedforward", "stopped")][-2:]
+        assert events[0]["text"].startswith("speed and torque offsets may still be applied; hold the feed")
+        assert events[1]["text"].startswith(
+            "the guard has stopped; speed and torque offsets may still be applied; hold"
+        )
 
 
 def test_a_drive_that_holds_a_torque_at_start_gets_zeros() -> None:
@@ -370,8 +372,8 @@ def test_a_change_is_told_in_the_cycle_in_which_it_happens() -> None:
     bench = switched_on()
     bench.sync(Request("disarm"))
     bench.run(120)
-    told = [output.feed_transition for output in bench.outputs if output.feed_transition is not None]
-    assert told == [(FeedMode.OFF, FeedMode.ON), (FeedMode.ON, FeedMode.ENDING), (FeedMode.ENDING, FeedMode.OFF)]
+    result = [output.feed_transition for output in bench.outputs if output.feed_transition is not None]
+    assert result == [(FeedMode.OFF, FeedMode.ON), (FeedMode.ON, FeedMode.ENDING), (FeedMode.ENDING, FeedMode.OFF)]
     bench = switched_on()
     bench.silence()
     assert bench.outputs[-1].feed_transition == (FeedMode.ON, FeedMode.ZEROING)

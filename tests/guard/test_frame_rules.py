@@ -45,8 +45,8 @@ def test_a_frame_may_be_at_the_ceiling_and_no_increment_beyond(sign: int) -> Non
     settings = replace(MADE, axes=(replace(MADE.axes[0], limits=wide),))
     state = one(offset=sign * (CEILING - 1), rate=sign)
     assert core._wrong_frame(state, (sign * CEILING,), settings) is None
-    told = f"{sign * (CEILING - 1)} + {sign} -> {sign * (CEILING + 1)}"
-    assert core._wrong_frame(state, (sign * (CEILING + 1),), settings) == Alarm("InternalError", "X", told)
+    expected = f"{sign * (CEILING - 1)} + {sign} -> {sign * (CEILING + 1)}"
+    assert core._wrong_frame(state, (sign * (CEILING + 1),), settings) == Alarm("InternalError", "X", expected)
 
 
 def test_a_table_that_asks_for_more_than_the_motion_gives_is_told_by_what_it_breaks() -> None:

@@ -74,8 +74,8 @@ def test_the_guard_leaves_nothing_behind_that_only_a_collector_would_find(tmp_pa
 @pytest.mark.fault("F10")
 def test_a_life_more_takes_no_memory_and_no_descriptor_more(tmp_path: Path) -> None:
     """Runs in its own process, where nothing else allocates."""
-    told = subprocess.run([sys.executable, "-m", __name__, tmp_path], stdout=subprocess.PIPE, check=True).stdout
-    blocks, containers, descriptors = zip(*json.loads(told), strict=True)
+    output = subprocess.run([sys.executable, "-m", __name__, tmp_path], stdout=subprocess.PIPE, check=True).stdout
+    blocks, containers, descriptors = zip(*json.loads(output), strict=True)
     assert blocks[-1] - blocks[0] < BLOCKS_A_LIFE * LIVES, blocks
     assert containers[-1] - containers[0] < LIVES, containers
     assert descriptors[-1] - descriptors[0] < LIVES - 2, descriptors  # a thread closes them, a moment later

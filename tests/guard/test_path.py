@@ -195,7 +195,7 @@ def test_another_rate_is_told_from_another_path(rate: float, code: str) -> None:
 
 def test_another_rate_is_told_in_percent_of_the_planned_from_none_to_the_highest() -> None:
     path = CorrectedPath(0, tuple([axis[2:] for axis in (X, Y)]), ([0] * 61,) * 2, True, "p")
-    for targets, told in (
+    for targets, result in (
         (((80, -48), (0, 0)), Alarm("OverrideChanged", detail="160 % of the planned rate")),
         (((85, -51), (0, 0)), Alarm("Misaligned")),
         (((25, -15), (25, -15)), Alarm("OverrideChanged", detail="0 % of the planned rate")),
@@ -203,7 +203,7 @@ def test_another_rate_is_told_in_percent_of_the_planned_from_none_to_the_highest
         (((80, -48), None), Alarm("Misaligned")),
         (((75, -45), (25, -15)), Alarm("Misaligned")),  # at the planned rate, half a row beside
     ):
-        assert track(state_at(0, *targets), path)[1] == told, targets
+        assert track(state_at(0, *targets), path)[1] == result, targets
 
 
 def test_targets_that_stand_at_the_last_row_are_a_feed_hold() -> None:

@@ -107,8 +107,8 @@ def test_the_daemon_arms_but_vouches_for_no_drive(shop: Shop, monkeypatch: pytes
 def test_a_stranger_is_told_and_let_go_and_takes_nobodys_place(shop: Shop, monkeypatch: pytest.MonkeyPatch) -> None:
     become(monkeypatch, STRANGER)
     client = shop.connect()
-    told = shop.answer(client)
-    assert (told["code"], "has no access to the guard" in told["text"]) == ("AuthRequired", True)
+    answer = shop.answer(client)
+    assert (answer["code"], "has no access to the guard" in answer["text"]) == ("AuthRequired", True)
     assert shop.guard.control.clients == []
     assert [(e["request"], e["uid"]) for e in shop.events() if e["event"] == "refused"] == [("to talk", STRANGER)]
 
@@ -131,9 +131,9 @@ def test_who_is_refused_often_is_counted_and_fills_no_journal(shop: Shop, monkey
 def test_a_wrong_token_is_written_down_too(shop: Shop) -> None:
     client = shop.connect()
     assert "AuthRequired" in str(shop.ask(client, {"request": "adopt", "token": "guessed"}))
-    told = [event for event in shop.events() if event["event"] == "refused"]
-    assert [(event["request"], event["uid"]) for event in told] == [("adopt", os.getuid())]
-    assert "guessed" not in json.dumps(told)
+    events = [event for event in shop.events() if event["event"] == "refused"]
+    assert [(event["request"], event["uid"]) for event in events] == [("adopt", os.getuid())]
+    assert "guessed" not in json.dumps(events)
 
 
 ASK = """

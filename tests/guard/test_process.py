@@ -336,7 +336,7 @@ def test_what_is_forged_foreign_or_silent_makes_no_step(rig: Rig, cob_id: int) -
         peer.wait(lambda: peer.tick > tick + 300, "SYNC")
         with GuardClient(rig.run_directory, timeout_s=ENDS_S) as other:
             refused = other.arm(TOKEN, DIGEST, FACTS_GIVEN)["refused"]
-            assert "ReadBackStale" in {told["code"] for told in refused}
+            assert "ReadBackStale" in {result["code"] for result in refused}
             assert not other.adopt(TOKEN)["ok"]
         assert len(peer.sent) == count
     finally:

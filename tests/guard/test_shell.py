@@ -71,9 +71,9 @@ def test_told_to_stop_it_ramps_reads_zero_back_and_ends_with_0(make: Make) -> No
         shop.cycle()
     assert shop.guard.run() == 0
     inside(shop.offsets())
-    told = shop.events()[-1]
-    assert (told["event"], told["may_stand_um"]) == ("stopped", {"X": 0.0, "Y": 0.0})
-    assert "text" not in told
+    event = shop.events()[-1]
+    assert (event["event"], event["may_stand_um"]) == ("stopped", {"X": 0.0, "Y": 0.0})
+    assert "text" not in event
 
 
 def test_frozen_it_ends_with_3_and_says_what_stands(make: Make) -> None:
@@ -86,11 +86,11 @@ def test_frozen_it_ends_with_3_and_says_what_stands(make: Make) -> None:
     shop.stop.send(b"\x0f")
     shop.guard._last_sync_s -= 10.0
     assert shop.guard.run() == 3
-    told = shop.events()[-1]
-    assert told["may_stand_um"]["X"] != 0.0
-    assert "um on X" in told["text"]
-    assert "may still be applied" in told["text"]
-    assert "Network" not in told["text"]
+    result = shop.events()[-1]
+    assert result["may_stand_um"]["X"] != 0.0
+    assert "um on X" in result["text"]
+    assert "may still be applied" in result["text"]
+    assert "Network" not in result["text"]
     assert [event["text"] for event in shop.events() if event["event"] == "bus_down"] == ["the cable is cut"]
 
 
@@ -293,10 +293,10 @@ def test_an_offset_that_left_before_the_bus_went_down_stands(make: Make, ends_at
         shop.turn()
     shop.stop.send(b"\x0f")
     assert shop.guard.run() == 3
-    told = shop.events()[-1]["may_stand_um"]
+    event = shop.events()[-1]["may_stand_um"]
     per_um = shop.settings.axes[0].increments_per_mm / 1000
-    assert told["X"] == pytest.approx(shop.offsets(1)[-1] / per_um, abs=0.06)
-    assert told["X"] != 0.0
+    assert event["X"] == pytest.approx(shop.offsets(1)[-1] / per_um, abs=0.06)
+    assert event["X"] != 0.0
 
 
 def test_a_fault_of_the_program_ramps_from_what_left(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -347,10 +347,10 @@ def test_without_sync_it_steps_by_the_local_timer_and_hears_frames_first(make: M
 def test_a_node_that_babbles_does_not_hide_that_no_sync_comes(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     shop = make()
     shop.into_the_cut()
-    heard = shop.wire.receive
+    received = shop.wire.receive
 
     def babbling() -> list[Frame]:
-        frames = heard()
+        frames = received()
         shop.wire.feed([(0x701, b"\x05", 0.0)])
         return frames
 
@@ -439,11 +439,11 @@ def test_one_decision_of_a_client_waits_but_a_disarm_takes_its_place(make: Make)
     shop.run(5)
     client.send(b"".join(b'{"request": "%s", "id": %d}\n' % (kind, k) for k, kind in enumerate(
         [b"arm", b"adopt", b"disarm", b"disarm"])))  # fmt: skip
-    told = [shop.answer(client, syncing=False)]
-    while len(told) < 3:
-        told.append(shop.answer(client, syncing=False))
+    reply = [shop.answer(client, syncing=False)]
+    while len(reply) < 3:
+        reply.append(shop.answer(client, syncing=False))
     codes = [(1, "GuardBusy"), (0, "DisarmedSince"), (3, "GuardBusy")]
-    assert [(answer["id"], answer["code"]) for answer in told] == codes
+    assert [(answer["id"], answer["code"]) for answer in reply] == codes
     assert shop.answer(client)["ok"]
 
 

@@ -91,10 +91,10 @@ def test_what_is_no_sealed_memory_is_not_read(tmp_path: Path) -> None:
     os.truncate(long, table.MAX_TABLE_BYTES + 1)
     fcntl.fcntl(long, fcntl.F_ADD_SEALS, table.SEALED)
     for descriptor in [*wrong, long]:
-        told = "did not come as a descriptor of sealed memory, and it was not read; load it again$"
+        expected = "did not come as a descriptor of sealed memory, and it was not read; load it again$"
         if descriptor == long:
-            told = f"^a correction table of {table.MAX_TABLE_BYTES + 1} bytes is too long; stream it in pieces$"
-        with pytest.raises(TableRefused, match=told) as refusal:
+            expected = f"^a correction table of {table.MAX_TABLE_BYTES + 1} bytes is too long; stream it in pieces$"
+        with pytest.raises(TableRefused, match=expected) as refusal:
             table.read_sealed(descriptor)
         assert refusal.value.code == "CorruptFile"
         if descriptor not in (None, 1 << 20):
@@ -155,7 +155,7 @@ def test_whatever_the_header_holds_it_is_one_class(head: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "expected"),
     [
         ({"rows": 1.5}, "its header counts no rows, or names no program"),
         ({"first": -1}, "its header counts no rows, or names no program"),
@@ -172,14 +172,14 @@ def test_whatever_the_header_holds_it_is_one_class(head: str) -> None:
         ({"program": "p" * 4096}, "its header is too long"),
     ],
 )
-def test_what_is_wrong_with_a_body_is_told_and_what_to_do(changes: dict[str, object], told: str) -> None:
+def test_what_is_wrong_with_a_body_is_told_and_what_to_do(changes: dict[str, object], expected: str) -> None:
     head = {**HEAD, **changes}
     raw = json.dumps(head).encode()
     whole = struct.pack("<I", len(raw)) + raw + bytes(16 if head["rows"] else 0)
-    if told:
+    if expected:
         with pytest.raises(TableRefused) as refusal:
             table.decode(whole)
-        assert str(refusal.value) == f"the correction table cannot be read ({told}); plan it again"
+        assert str(refusal.value) == f"the correction table cannot be read ({expected}); plan it again"
     else:
         assert table.decode(whole)[1].first == head["first"]
 
@@ -270,10 +270,10 @@ def test_a_piece_that_does_not_belong_is_refused(changed: dict[str, object], axe
     limits = (LIMITS,) * 2
     path = table.begin(body(final=False), 1, "XY", limits, None, 0).joined
     piece = table.encode("XY", ROWS, OFFSETS, str(changed.get("program", "p")), int(str(changed.get("first", 0))))
-    told = f"^row {changed.get('first')} does not continue the loaded table; load it again$"
+    expected = f"^row {changed.get('first')} does not continue the loaded table; load it again$"
     if not changed:
-        told = f"^the table is for axes X, Y, not {', '.join(axes)}$"
-    with pytest.raises(TableRefused, match=told) as refusal:
+        expected = f"^the table is for axes X, Y, not {', '.join(axes)}$"
+    with pytest.raises(TableRefused, match=expected) as refusal:
         table.begin(piece, 2, axes, limits, path, 0)
     assert refusal.value.code == "ProgramMismatch"
 
@@ -293,8 +293,8 @@ def test_first_rows_take_the_place_of_those_of_the_same_table_alone(what: dict[s
     rows = {axis: [*values, *values[:1]][: int(str(what.get("rows", 4)))] for axis, values in ROWS.items()}
     zeros = {axis: [0] * len(rows["X"]) for axis in "XY"}
     piece = table.encode("XY", rows, zeros, str(what.get("program", "p")), int(str(what.get("first", 0))))
-    told = "^the rows are not the first ones of the loaded table; load it again$"
-    with pytest.raises(TableRefused, match=told) as refusal:
+    expected = "^the rows are not the first ones of the loaded table; load it again$"
+    with pytest.raises(TableRefused, match=expected) as refusal:
         table.renew(piece, 2, str(what.get("axes", "XY")), limits, loaded)
     assert refusal.value.code == "ProgramMismatch"
 
@@ -302,8 +302,8 @@ def test_first_rows_take_the_place_of_those_of_the_same_table_alone(what: dict[s
 def test_first_rows_of_another_way_are_those_of_another_path() -> None:
     loaded = table.begin(body(), 1, "XY", (LIMITS,) * 2, None, 0).joined
     other = table.encode("XY", ROWS | {"Y": [5, 5, 5, 6]}, OFFSETS, "p")
-    told = "^the rows are those of another path than the loaded one; load it again$"
-    with pytest.raises(TableRefused, match=told) as refusal:
+    expected = "^the rows are those of another path than the loaded one; load it again$"
+    with pytest.raises(TableRefused, match=expected) as refusal:
         table.renew(other, 2, "XY", (LIMITS,) * 2, loaded)
     assert refusal.value.code == "ProgramMismatch"
 
@@ -401,8 +401,10 @@ def test_a_path_keeps_twice_the_largest_offset_from_the_software_limits(demand: 
 
 @pytest.mark.parametrize("demand", [[0, 0, 0, 0, 81], [-81, 0], [0] * 50 + [120], [-(2**31)]])
 def test_a_path_that_comes_nearer_is_no_table(demand: list[int]) -> None:
-    told = "^the path comes nearer to a software limit of the drive than twice the largest offset; lower max_offset_um"
-    with pytest.raises(TableRefused, match=told) as caught:
+    expected = (
+        "^the path comes nearer to a software limit of the drive than twice the largest offset; lower max_offset_um"
+    )
+    with pytest.raises(TableRefused, match=expected) as caught:
         loaded_within((-100, 100), demand)
     assert caught.value.code == "SoftwareLimit"
 

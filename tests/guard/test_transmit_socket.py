@@ -116,6 +116,6 @@ def test_a_descriptor_that_is_no_socket_is_one_sentence(
     (tmp_path / "guard.json").write_text(to_json(replace(settings, run_directory=str(tmp_path))))
     with (tmp_path / "a file").open("wb") as file:
         assert run_main(monkeypatch, tmp_path / "guard.json", file.fileno()) == 3
-    told = capsys.readouterr().err
-    assert "cannot be used" in told
-    assert "nothing was sent; start the guard with fdhil-guard" in told
+    output = capsys.readouterr().err
+    assert "cannot be used" in output
+    assert "nothing was sent; start the guard with fdhil-guard" in output

@@ -47,16 +47,16 @@ def test_late_offsets_explain_what_a_drive_shows_soon_after_them_and_nothing_els
     assert turns.blame("LimitActive", 0.0) == ""
     turns.add(0.009, False, 5.0)
     turns.add(0.0002, True, 5.001)
-    told = "this PC was late (2 offsets, worst 9.0 ms)"
-    assert turns.blame("LimitActive", 5.5) == told
+    expected = "this PC was late (2 offsets, worst 9.0 ms)"
+    assert turns.blame("LimitActive", 5.5) == expected
     assert turns.blame("SoftwareLimit", 5.5) == ""
     assert turns.blame("LimitActive", 5.001 + RECENT_S + 0.1) == ""
     turns.begin()
     assert turns.blame("LimitActive", 5.5) == ""
-    alarm = Alarm("LimitActive", "X", late=told)
-    assert alarm.cause == f"{told}, therefore axis X: an internal limit is active (statusword bit 11)"
+    alarm = Alarm("LimitActive", "X", late=expected)
+    assert alarm.cause == f"{expected}, therefore axis X: an internal limit is active (statusword bit 11)"
     assert "take load off this PC" in alarm.action
-    assert "adopt" in Alarm("SyncLost", late=told).action  # what was frozen needs what it always needs
+    assert "adopt" in Alarm("SyncLost", late=expected).action  # what was frozen needs what it always needs
 
 
 @pytest.mark.parametrize(("clock", "refused"), [("monotonic", True), ("sync", False)])

@@ -168,9 +168,9 @@ def _pictured(machine: subprocess.Popen[str], disk: Path, folder: Path, kept: Nu
     subprocess.run(["debugfs", "-R", f"rdump /store {folder}", picture], check=True, capture_output=True)
     there = {}
     for name, make in KEEPERS.items():
-        told = looked_at(make, folder / "store" / place_of(name), MUCH_LATER)
-        there[name] = set(told.found)
-        found.damage += [f"picture {found.pictures}: {name}: {text}" for text in (*told.wrong, *told.said)]
+        result = looked_at(make, folder / "store" / place_of(name), MUCH_LATER)
+        there[name] = set(result.found)
+        found.damage += [f"picture {found.pictures}: {name}: {text}" for text in (*result.wrong, *result.said)]
     _compare(there, kept, found)
 
 

@@ -108,7 +108,7 @@ def test_the_largest_tracking_error_shrinks(bench: Bench, client: GuardClient, t
     deadline = time.monotonic() + PATIENCE_S
     while client.status()["feedforward"]["state"] != "OFF" and time.monotonic() < deadline:
         time.sleep(0.02)
-    told = client.status()["feedforward"]
-    assert told["state"] == "OFF"
-    assert told["cause"]["code"] == "Disarmed"
-    assert told["applied"] == {"X": [0, 0], "Y": [0, 0]}
+    status = client.status()["feedforward"]
+    assert status["state"] == "OFF"
+    assert status["cause"]["code"] == "Disarmed"
+    assert status["applied"] == {"X": [0, 0], "Y": [0, 0]}

@@ -76,7 +76,7 @@ class Shop:
 
     def refused(self, client: GuardClient) -> set[tuple[str, str]]:
         answer = client.arm(read_token(self.run), "0" * 64, dict.fromkeys(FACTS, True))
-        return {(told["code"], told["axis"]) for told in answer["refused"]} - {
+        return {(result["code"], result["axis"]) for result in answer["refused"]} - {
             ("ProgramMismatch", ""),
             ("MainLost", ""),
         }

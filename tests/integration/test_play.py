@@ -62,13 +62,13 @@ def test_a_correction_works_beside_it(bench: Bench, tmp_path: Path) -> None:
             text=True,
         ) as play:
             assert play.stderr is not None
-            told = []
+            result = []
             for line in play.stderr:
-                told.append(line)
+                result.append(line)
                 if "press Enter" in line:
                     break
             else:
-                pytest.fail("".join(told))
+                pytest.fail("".join(result))
             loaded = guard.load(("X", "Y"), {"X": increments, "Y": increments}, {"X": bump, "Y": bump}, DIGEST)
             assert loaded["ok"], loaded
             run = bench.config.store.run_directory
@@ -87,8 +87,8 @@ def test_a_correction_works_beside_it(bench: Bench, tmp_path: Path) -> None:
                     while (frame := bus.recv(0)) is not None:
                         if frame.arbitration_id == 0x301:
                             offsets.append(struct.unpack("<i", frame.data)[0])
-            said, err = play.communicate()
-        assert play.returncode == 0, said + err
+            output, err = play.communicate()
+        assert play.returncode == 0, output + err
         assert max(offsets) == 100, guard.status()
         assert offsets[-1] == 0
         assert guard.status()["state"] == "OFF"

@@ -121,12 +121,12 @@ def test_rows_end_before_a_place_that_is_refused(bench: Bench, client: GuardClie
 
 
 def grow(checked: CheckedProgram, demand: Path, rows: Path, config: MachineConfig) -> None:
-    def hear(told: Mapping[str, Any]) -> None:
-        if "block" in told:
-            end, sha256 = told["block"]
-            checked.take(Block(end, sha256, told["last"]), told["errors"])
-        elif "refused" in told:
-            checked.refused += (Reason(**told["refused"]),)
+    def hear(result: Mapping[str, Any]) -> None:
+        if "block" in result:
+            end, sha256 = result["block"]
+            checked.take(Block(end, sha256, result["last"]), result["errors"])
+        elif "refused" in result:
+            checked.refused += (Reason(**result["refused"]),)
 
     with rows.open("r+b") as body:
         check(demand, program_digest(demand), nominal_models(config), config, body, hear)

@@ -108,11 +108,11 @@ def test_the_resonance_is_found_in_each_rapid_and_the_rapid_believed(axis: str) 
 
 @pytest.mark.usefixtures("long_computation")
 def test_the_model_with_it_knows_what_the_motors_encoder_does_not_see() -> None:
-    for told in (o.at_table for o in recorded()["X"]):
-        assert told is not None
-        assert told.unseen_rms_um > 15.0
-        assert told.left_rms_um is not None
-        assert told.left_rms_um < told.unseen_rms_um / 4
+    for result in (o.at_table for o in recorded()["X"]):
+        assert result is not None
+        assert result.unseen_rms_um > 15.0
+        assert result.left_rms_um is not None
+        assert result.left_rms_um < result.unseen_rms_um / 4
     assert all(o.at_table is None for o in recorded()["Y"])  # it has no encoder
 
 

@@ -24,8 +24,8 @@ class Daemon:
 
     def news(self, *outcomes: Any) -> News:
         self._now_s += 1.0
-        for told in outcomes:
-            self._watch.outcome_came(told, self._now_s)
+        for result in outcomes:
+            self._watch.outcome_came(result, self._now_s)
         status = {"ok": True, "state": "OFF(SHADOW)", **self._watch.status(self._now_s), **self.changes}
         return self._listener.news(status, self.now_ms)
 

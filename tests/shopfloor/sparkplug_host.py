@@ -107,9 +107,9 @@ def _properties(data: bytes) -> dict[str, str]:
         if number == 1:
             keys.append(value.decode())
         else:
-            told = dict(fields(value))
-            assert told[1] == STRING
-            values.append(told[8].decode())
+            result = dict(fields(value))
+            assert result[1] == STRING
+            values.append(result[8].decode())
     return dict(zip(keys, values, strict=True))
 
 
@@ -155,19 +155,19 @@ class Host:
             self.alive, self.values = False, {}
 
     def _born(self, device: str, metrics: list[Seen]) -> None:
-        told: dict[str, Any] = {}
+        result: dict[str, Any] = {}
         for metric in metrics:
             assert metric.name
-            assert metric.name not in told
+            assert metric.name not in result
             assert metric.datatype
-            told[metric.name] = metric.value(metric.datatype)
+            result[metric.name] = metric.value(metric.datatype)
             if metric.alias is not None:
                 assert self._types.get(metric.alias, (device, metric.name, 0))[:2] == (device, metric.name)
                 self._types[metric.alias] = (device, metric.name, metric.datatype)
         if not device:
-            self.bd_seq = told.pop("bdSeq")
-            assert told.pop("Node Control/Rebirth") is False
-        self.values[device] = told
+            self.bd_seq = result.pop("bdSeq")
+            assert result.pop("Node Control/Rebirth") is False
+        self.values[device] = result
         self.units[device] = {metric.name: metric.properties.get("engUnit", "") for metric in metrics}
 
     def _changed(self, device: str, metrics: list[Seen]) -> None:

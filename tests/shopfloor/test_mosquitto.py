@@ -90,13 +90,17 @@ async def test_from_birth_to_death_with_a_real_broker(tmp_path: Path) -> None:
                 await listening.until(lambda host: host.values["X"]["revision"] == 2.0)
                 x = listening.host.values["X"]
                 status = await status_when(path, lambda status: status["ok"])
-                told = status["axes"]["X"]["parameters"]["K"]
-                assert (x["K"], x["K_low"], x["K_high"]) == (told["value"], told["low"], told["high"])
+                shown_status = status["axes"]["X"]["parameters"]["K"]
+                assert (x["K"], x["K_low"], x["K_high"]) == (
+                    shown_status["value"],
+                    shown_status["low"],
+                    shown_status["high"],
+                )
                 await listening.command("arm")
                 await listening.command("Node Control/Rebirth")
                 await listening.until(lambda host: host.verbs.count("NBIRTH") == 2)
                 await listening.until(lambda host: {"X", "Y"} <= set(host.values))
-                assert listening.host.values["X"]["K"] == told["value"]
+                assert listening.host.values["X"]["K"] == shown_status["value"]
                 assert (await status_when(path, lambda status: status["ok"]))["armed"] is None
             await listening.until(lambda host: set(host.values) == {""})
             assert listening.host.values[""]["up"] is False
@@ -165,8 +169,8 @@ async def test_a_primary_host_application_is_waited_for(tmp_path: Path) -> None:
 
 
 async def _state(client: aiomqtt.Client, online: bool, stamp_ms: int) -> None:
-    told = json.dumps({"online": online, "timestamp": stamp_ms})
-    await client.publish("spBv1.0/STATE/scada", told, qos=1, retain=True)
+    result = json.dumps({"online": online, "timestamp": stamp_ms})
+    await client.publish("spBv1.0/STATE/scada", result, qos=1, retain=True)
 
 
 async def _said(folder: Path, words: str) -> None:

@@ -89,8 +89,8 @@ async def test_every_value_is_a_metric_in_base_units(everything: News) -> None:
     assert found["fdhil_alarm", (("axis", ""), ("code", "BusSilent"), ("severity", "MAJOR"))] == 1
     assert found["fdhil_notices_total", (("code", "Armed"), ("severity", "info"))] == 1
     assert found["fdhil_armed_info", (("method", "inverse"), ("program", "part.ngc"))] == 1
-    told = {value.item.name for value in everything.values if value.item.kind != "text"}
-    assert len({name for name, _ in found}) >= len(told)
+    result = {value.item.name for value in everything.values if value.item.kind != "text"}
+    assert len({name for name, _ in found}) >= len(result)
 
 
 async def test_a_silent_daemon_leaves_up_and_when_it_was_heard(tmp_path: Path) -> None:
@@ -302,10 +302,10 @@ async def alerts_of(address: str, prometheus: asyncio.subprocess.Process) -> set
     async with httpx.AsyncClient() as client:
         while time.monotonic() < deadline_s and prometheus.returncode is None:
             try:
-                told = (await client.get(f"{address}/api/v1/alerts")).json()["data"]["alerts"]
+                expected = (await client.get(f"{address}/api/v1/alerts")).json()["data"]["alerts"]
             except (httpx.TransportError, ValueError, KeyError):
-                told = []
-            if firing := {alert["labels"]["alertname"] for alert in told if alert["state"] == "firing"}:
+                expected = []
+            if firing := {alert["labels"]["alertname"] for alert in expected if alert["state"] == "firing"}:
                 return firing
             await asyncio.sleep(0.2)
     raise TimeoutError("no alert fired")

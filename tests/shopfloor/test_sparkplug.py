@@ -135,8 +135,8 @@ def test_no_command_but_rebirth_is_one(payload: bytes, wanted: bool) -> None:
 
 @given(st.text(st.characters()), st.floats(), st.integers(-(2**63), 2**63 - 1))
 def test_any_value_arrives_or_is_null(text: str, number: float, count: int) -> None:
-    told = [metric("text", text, STRING), metric("number", number), metric("count", count, INT64)]
-    values = begun(told)[1].values[""]
+    result = [metric("text", text, STRING), metric("number", number), metric("count", count, INT64)]
+    values = begun(result)[1].values[""]
     assert values["text"] == text.encode("utf-8", "replace").decode()
     assert values["number"] == (number if math.isfinite(number) else None)
     assert values["count"] == count

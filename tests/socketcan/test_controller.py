@@ -44,12 +44,12 @@ def wait_for(condition: Callable[[], bool]) -> None:
 
 
 def test_each_state_and_error_of_the_controller_is_told(adapter: SerialAdapter) -> None:
-    watch, heard = ErrorWatch(), 0
+    watch, received = ErrorWatch(), 0
     with CanBus("can0", settings_of(adapter)) as bus:
         for line, expected in SAID:
             adapter.say(line)
-            heard += 1
-            wait_for(lambda: bus.counters()["frames"] >= heard)  # noqa: B023 - it is asked now
+            received += 1
+            wait_for(lambda: bus.counters()["frames"] >= received)  # noqa: B023 - it is asked now
             notices = watch.feed(bus.drain(), time.monotonic_ns())
             assert [(notice.code, notice.severity) for notice in notices] == expected, line
     assert watch.count == len(SAID)
