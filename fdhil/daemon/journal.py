@@ -10,17 +10,7 @@ from datetime import UTC, datetime
 from typing import Literal, TextIO
 
 from fdhil.json_lines import encode_line
-from fdhil.records import (
-    PARAMETERS,
-    UNITS,
-    LoopEstimate,
-    Notice,
-    Outcome,
-    ParameterSet,
-    Skill,
-    WindowOutcome,
-    unit_of,
-)
+from fdhil.records import PARAMETERS, UNITS, LoopEstimate, Notice, Outcome, ParameterSet, Skill, WindowOutcome, unit_of
 from fdhil.system_clock import SYSTEM_CLOCK, Clock
 
 Severity = Literal["info", "minor", "MAJOR"]

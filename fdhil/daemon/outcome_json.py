@@ -6,15 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fdhil.records import (
-    LoopEstimate,
-    Notice,
-    Outcome,
-    ParameterSet,
-    Skill,
-    WindowOutcome,
-    unit_of,
-)
+from fdhil.records import LoopEstimate, Notice, Outcome, ParameterSet, Skill, WindowOutcome, unit_of
 from fdhil.store.history import described, friction_of
 from fdhil.store.set_document import set_document
 

@@ -32,10 +32,7 @@ MOST_CONNECTIONS, MOST_AT_ONCE = 16, 64  # those beyond sixteen are being closed
 ACTIVATION_S = 10.0  # for a client to log in
 MOST_SUBSCRIPTIONS = 64
 MOST_FAILURES, FAILURES_S = 10, 60.0
-REFUSED = {
-    ua.ObjectIds.WriteRequest_Encoding_DefaultBinary,
-    ua.ObjectIds.HistoryReadRequest_Encoding_DefaultBinary,
-}
+REFUSED = {ua.ObjectIds.WriteRequest_Encoding_DefaultBinary, ua.ObjectIds.HistoryReadRequest_Encoding_DefaultBinary}
 POLICIES = [
     ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt,
     ua.SecurityPolicyType.Aes128Sha256RsaOaep_SignAndEncrypt,
