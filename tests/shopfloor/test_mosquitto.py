@@ -158,7 +158,7 @@ async def test_a_primary_host_application_is_waited_for(tmp_path: Path) -> None:
     port = free_port()
     file = written(tmp_path, port, 'primary_host = "scada"\n')
     async with broker(tmp_path, open_to_all(port), port), host_application(port) as listening, publisher(file):
-        await _said(tmp_path, "is there")
+        await _said(tmp_path, "connected to the broker")
         await _state(listening.client, True, 1)
         await listening.until(lambda host: host.alive)
         await _state(listening.client, False, 2)
